@@ -1,0 +1,1 @@
+"""The driving model: language, network, decoding, learning. Knows no HTTP."""

@@ -1,0 +1,265 @@
+"""Scenes: what a planner sees at one instant, and what a labelled scene knows besides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from model.driving.trajectory import (
+    FUTURE_STEPS,
+    HISTORY_STEPS,
+    FloatArray,
+    GeometryError,
+    check_history,
+    check_route,
+    check_trajectory,
+)
+
+FRONT_WIDE: Final = "front_wide_120"
+FRONT_TELE: Final = "front_tele_30"
+CAMERAS: Final = (
+    FRONT_WIDE,
+    FRONT_TELE,
+    "front_left",
+    "front",
+    "front_right",
+    "back_left",
+    "back",
+    "back_right",
+)
+"""Known cameras: the two of CF-VLA, then the six surround cameras of VLA-World."""
+CLIP_FRAMES: Final = 4
+CLIP_PERIOD_S: Final = 0.5
+
+TRACK_STEPS: Final = HISTORY_STEPS + FUTURE_STEPS
+"""Rows of an agent's track: 16 past poses (the last one is now), then 64 future ones."""
+
+Tag = Literal["lead_vehicle", "cut_in", "pedestrian", "lane_change", "turn", "hard_brake"]
+TAGS: Final[tuple[Tag, ...]] = (
+    "lead_vehicle",
+    "cut_in",
+    "pedestrian",
+    "lane_change",
+    "turn",
+    "hard_brake",
+)
+
+AgentKind = Literal["vehicle", "pedestrian", "cone", "barrier"]
+AGENT_KINDS: Final[tuple[AgentKind, ...]] = ("vehicle", "pedestrian", "cone", "barrier")
+
+SemanticClass = Literal["sky", "off_road", "road", "vehicle", "pedestrian", "obstacle"]
+SEMANTIC_CLASSES: Final[tuple[SemanticClass, ...]] = (
+    "sky",
+    "off_road",
+    "road",
+    "vehicle",
+    "pedestrian",
+    "obstacle",
+)
+"""What a pixel of a dense target shows; the position in this tuple is the stored value."""
+
+EGO_LENGTH_M: Final = 4.51
+EGO_WIDTH_M: Final = 1.85
+
+
+class SceneError(ValueError):
+    """A scene that cannot be planned for; the text says what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Four encoded pictures (JPEG, PNG or WebP) of one camera at 2 Hz, oldest first."""
+
+    camera: str
+    images: tuple[bytes, ...]
+
+    def __post_init__(self) -> None:
+        if self.camera not in CAMERAS:
+            raise SceneError(f"unknown camera {self.camera!r}; known are {', '.join(CAMERAS)}")
+        if len(self.images) != CLIP_FRAMES:
+            raise SceneError(
+                f"camera {self.camera} must have {CLIP_FRAMES} frames, got {len(self.images)}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One planning instant.
+
+    Attributes:
+        scene_id: the caller's name for it.
+        clips: one clip per camera, at least one.
+        history: float32 [16, 4] ego poses at 10 Hz, the last row is (0, 0, 0, 0).
+        route: float32 [20, 2] points every 4 m along the way to go, or None.
+    """
+
+    scene_id: str
+    clips: tuple[Clip, ...]
+    history: FloatArray
+    route: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        cameras = [clip.camera for clip in self.clips]
+        if not cameras:
+            raise SceneError("a scene needs at least one camera clip")
+        if len(set(cameras)) != len(cameras):
+            raise SceneError(f"a camera occurs twice: {', '.join(cameras)}")
+        object.__setattr__(self, "history", check_history(self.history))
+        if self.route is not None:
+            object.__setattr__(self, "route", check_route(self.route))
+
+    def clip(self, camera: str) -> Clip:
+        """The clip of ``camera``; raises `SceneError` where the scene has none."""
+        for clip in self.clips:
+            if clip.camera == camera:
+                return clip
+        raise SceneError(f"scene {self.scene_id} has no clip of camera {camera}")
+
+
+@dataclass(frozen=True, eq=False)
+class Agent:
+    """Another road user or obstacle as an oriented box, over past and future.
+
+    Attributes:
+        agent_id: stable within an episode.
+        kind: what it is.
+        length_m, width_m, height_m: the box; length lies along the heading.
+        poses: float32 [80, 3] (x, y, heading) of the box's centre, ego frame of the scene's instant,
+            row 15 is now; NaN where the agent is absent.
+    """
+
+    agent_id: int
+    kind: AgentKind
+    length_m: float
+    width_m: float
+    height_m: float
+    poses: FloatArray
+
+    def __post_init__(self) -> None:
+        if self.poses.shape != (TRACK_STEPS, 3):
+            raise SceneError(f"agent poses must have shape [80, 3], got {list(self.poses.shape)}")
+
+    @property
+    def future(self) -> FloatArray:
+        """float32 [64, 3], aligned with a trajectory's rows."""
+        return self.poses[HISTORY_STEPS:]
+
+    @property
+    def present(self) -> FloatArray:
+        """float32 [3], NaN when absent now."""
+        row: FloatArray = self.poses[HISTORY_STEPS - 1]
+        return row
+
+
+@dataclass(frozen=True, eq=False)
+class LaneTrace:
+    """Which lane the ego was and will be in, at 10 Hz; row 15 is now.
+
+    Attributes:
+        road: int32 [80] id of the road segment within the episode, -1 where unknown.
+        lane: int16 [80] lane number on that segment, 0 is the leftmost; -1 where unknown.
+        offset_m: float32 [80] distance of the ego to the left of the lane's centre line.
+    """
+
+    road: npt.NDArray[np.int32]
+    lane: npt.NDArray[np.int16]
+    offset_m: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("road", "lane", "offset_m"):
+            if getattr(self, name).shape != (TRACK_STEPS,):
+                raise SceneError(f"lane trace: {name} must have shape [80]")
+
+
+@dataclass(frozen=True, eq=False)
+class DenseTarget:
+    """What a camera's latest picture shows, pixel by pixel, on a coarser grid.
+
+    Attributes:
+        camera: whose picture.
+        classes: uint8 [h, w], positions in `SEMANTIC_CLASSES`.
+        range_m: float32 [h, w], distance along the camera's axis; 0 where there is nothing (sky).
+    """
+
+    camera: str
+    classes: npt.NDArray[np.uint8]
+    range_m: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledScene:
+    """A scene with its future and annotations, for training and evaluation.
+
+    Attributes:
+        scene: what a planner is given.
+        episode_id: episodes are the unit of independence (bootstrap, splits).
+        seed: the simulator's seed; it decides the split.
+        future: float32 [64, 4], the expert's trajectory.
+        agents: everything within reach, over past and future.
+        drivable: closed rings, float32 [k, 2] each, ego frame; a point is on the road when an odd number
+            of rings contains it (holes are rings too).
+        lane_lines: centre lines of the lanes around, float32 [k, 2] each.
+        lane_trace: the ego's lanes over time, or None where unknown.
+        tags: what makes the scene difficult.
+        dense: per-pixel targets of the latest pictures; may be empty.
+    """
+
+    scene: Scene
+    episode_id: str
+    seed: int
+    future: FloatArray
+    agents: tuple[Agent, ...] = ()
+    drivable: tuple[FloatArray, ...] = ()
+    lane_lines: tuple[FloatArray, ...] = ()
+    lane_trace: LaneTrace | None = None
+    tags: frozenset[Tag] = frozenset()
+    dense: tuple[DenseTarget, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "future", check_trajectory(self.future))
+        unknown = set(self.tags) - set(TAGS)
+        if unknown:
+            raise SceneError(f"unknown tags: {', '.join(sorted(unknown))}")
+
+    @property
+    def split(self) -> Literal["train", "validation", "test"]:
+        """By simulator seed: train < 500000 <= validation < 600000 <= test < 700000."""
+        return split_of_seed(self.seed)
+
+
+def split_of_seed(seed: int) -> Literal["train", "validation", "test"]:
+    """The split a simulator seed belongs to; raises `SceneError` for seeds that are held back."""
+    if not 0 <= seed < 700_000:
+        raise SceneError(f"seed {seed} is not in use: seeds lie in 0..699999")
+    if seed < 500_000:
+        return "train"
+    return "validation" if seed < 600_000 else "test"
+
+
+__all__ = [
+    "AGENT_KINDS",
+    "CAMERAS",
+    "CLIP_FRAMES",
+    "CLIP_PERIOD_S",
+    "EGO_LENGTH_M",
+    "EGO_WIDTH_M",
+    "FRONT_TELE",
+    "FRONT_WIDE",
+    "SEMANTIC_CLASSES",
+    "TAGS",
+    "TRACK_STEPS",
+    "Agent",
+    "AgentKind",
+    "Clip",
+    "DenseTarget",
+    "GeometryError",
+    "LabelledScene",
+    "LaneTrace",
+    "Scene",
+    "SceneError",
+    "Tag",
+    "split_of_seed",
+]

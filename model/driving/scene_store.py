@@ -1,0 +1,258 @@
+"""Labelled scenes in Parquet files: one row a scene, everything a scene knows in it.
+
+A file carries ``looktwice.scene_version`` in its metadata; readers refuse other versions. Files are written
+to a temporary name beside their place and renamed, so a reader never meets half a file.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from model.driving.images import decode_image, encode_png
+from model.driving.scene import (
+    Agent,
+    AgentKind,
+    Clip,
+    DenseTarget,
+    LabelledScene,
+    LaneTrace,
+    Scene,
+    SceneError,
+    Tag,
+)
+from model.driving.trajectory import GeometryError
+
+SCENE_VERSION: Final = "1"
+_VERSION_KEY: Final = b"looktwice.scene_version"
+ROW_GROUP: Final = 128
+
+_RANGE_FAR_M: Final = 400.0
+"""Ranges of dense targets are stored as 8-bit logarithms: 1.2 % a step up to 400 m."""
+
+_FLOATS = pa.list_(pa.float32())
+_RINGS = pa.list_(_FLOATS)
+_SCHEMA: Final = pa.schema(
+    [
+        ("scene_id", pa.string()),
+        ("episode_id", pa.string()),
+        ("seed", pa.int64()),
+        ("clips", pa.list_(pa.struct([("camera", pa.string()), ("images", pa.list_(pa.binary()))]))),
+        ("history", _FLOATS),
+        ("route", _FLOATS),
+        ("future", _FLOATS),
+        (
+            "agents",
+            pa.list_(
+                pa.struct(
+                    [
+                        ("agent_id", pa.int64()),
+                        ("kind", pa.string()),
+                        ("size_m", _FLOATS),
+                        ("poses", _FLOATS),
+                    ]
+                )
+            ),
+        ),
+        ("drivable", _RINGS),
+        ("lane_lines", _RINGS),
+        (
+            "lane_trace",
+            pa.struct(
+                [("road", pa.list_(pa.int32())), ("lane", pa.list_(pa.int16())), ("offset_m", _FLOATS)]
+            ),
+        ),
+        ("tags", pa.list_(pa.string())),
+        (
+            "dense",
+            pa.list_(
+                pa.struct([("camera", pa.string()), ("classes", pa.binary()), ("range_log", pa.binary())])
+            ),
+        ),
+    ]
+)
+
+
+class SceneFileError(ValueError):
+    """A scene file that is missing, truncated, of another version, or holds a row that is no scene."""
+
+
+def write_scenes(
+    path: Path, scenes: Iterable[LabelledScene], metadata: Mapping[str, str] | None = None
+) -> int:
+    """Write ``scenes`` to one Parquet file and return how many there were; see the module's first lines."""
+    described = {_VERSION_KEY: SCENE_VERSION.encode()} | {
+        key.encode(): value.encode() for key, value in (metadata or {}).items()
+    }
+    schema = _SCHEMA.with_metadata(described)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    count = 0
+    remaining = iter(scenes)
+    try:
+        with pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
+            while rows := [_to_row(scene) for scene in islice(remaining, ROW_GROUP)]:
+                writer.write_table(pa.Table.from_pylist(rows, schema=schema))
+                count += len(rows)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return count
+
+
+def scene_files(path: Path) -> list[Path]:
+    """The Parquet files at ``path``: the file itself, or those in the folder, by name."""
+    if path.is_dir():
+        files = sorted(path.glob("*.parquet"))
+        if not files:
+            raise SceneFileError(f"{path} holds no .parquet scene files")
+        return files
+    if not path.exists():
+        raise SceneFileError(f"{path} does not exist")
+    return [path]
+
+
+def count_scenes(path: Path) -> int:
+    """How many scenes a file or folder holds, from the files' footers alone."""
+    return sum(_open(file).metadata.num_rows for file in scene_files(path))
+
+
+def read_scenes(path: Path, *, dense: bool = True) -> Iterator[LabelledScene]:
+    """Yield the scenes of a file, or of a folder's files by name.
+
+    Args:
+        path: a ``.parquet`` file or a folder of them.
+        dense: also read the dense targets, which planning and evaluation do not need.
+
+    Raises:
+        SceneFileError: see the class.
+    """
+    columns = None if dense else [name for name in _SCHEMA.names if name != "dense"]
+    for file in scene_files(path):
+        parquet = _open(file)
+        try:
+            for group in range(parquet.num_row_groups):
+                for row in parquet.read_row_group(group, columns=columns).to_pylist():
+                    yield _from_row(row)
+        except (pa.ArrowException, OSError) as error:
+            raise SceneFileError(f"{file} is damaged: {error}") from error
+        except (SceneError, GeometryError, KeyError, TypeError, ValueError) as error:
+            raise SceneFileError(f"{file} holds a row that is no scene: {error}") from error
+
+
+def _open(file: Path) -> pq.ParquetFile:
+    try:
+        parquet = pq.ParquetFile(file)
+    except (pa.ArrowException, OSError) as error:
+        raise SceneFileError(f"{file} is not a whole Parquet file (truncated?): {error}") from error
+    version = (parquet.schema_arrow.metadata or {}).get(_VERSION_KEY)
+    if version is None:
+        raise SceneFileError(f"{file} is a Parquet file but holds no LookTwice scenes")
+    if version.decode() != SCENE_VERSION:
+        raise SceneFileError(
+            f"{file} has scene version {version.decode()}, this LookTwice reads version {SCENE_VERSION}"
+        )
+    return parquet
+
+
+def _flat(array: Any) -> list[float]:
+    return cast("list[float]", np.asarray(array, np.float32).ravel().tolist())
+
+
+def _to_row(labelled: LabelledScene) -> dict[str, Any]:
+    scene, trace = labelled.scene, labelled.lane_trace
+    return {
+        "scene_id": scene.scene_id,
+        "episode_id": labelled.episode_id,
+        "seed": labelled.seed,
+        "clips": [{"camera": clip.camera, "images": list(clip.images)} for clip in scene.clips],
+        "history": _flat(scene.history),
+        "route": None if scene.route is None else _flat(scene.route),
+        "future": _flat(labelled.future),
+        "agents": [
+            {
+                "agent_id": agent.agent_id,
+                "kind": agent.kind,
+                "size_m": [agent.length_m, agent.width_m, agent.height_m],
+                "poses": _flat(agent.poses),
+            }
+            for agent in labelled.agents
+        ],
+        "drivable": [_flat(ring) for ring in labelled.drivable],
+        "lane_lines": [_flat(line) for line in labelled.lane_lines],
+        "lane_trace": None
+        if trace is None
+        else {
+            "road": trace.road.tolist(),
+            "lane": trace.lane.tolist(),
+            "offset_m": _flat(trace.offset_m),
+        },
+        "tags": sorted(labelled.tags),
+        "dense": [
+            {
+                "camera": target.camera,
+                "classes": encode_png(target.classes),
+                "range_log": encode_png(_range_to_log(target.range_m)),
+            }
+            for target in labelled.dense
+        ],
+    }
+
+
+def _array(values: list[float], columns: int) -> Any:
+    return np.asarray(values, np.float32).reshape(-1, columns)
+
+
+def _from_row(row: dict[str, Any]) -> LabelledScene:
+    trace = row["lane_trace"]
+    return LabelledScene(
+        scene=Scene(
+            scene_id=row["scene_id"],
+            clips=tuple(Clip(clip["camera"], tuple(clip["images"])) for clip in row["clips"]),
+            history=_array(row["history"], 4),
+            route=None if row["route"] is None else _array(row["route"], 2),
+        ),
+        episode_id=row["episode_id"],
+        seed=row["seed"],
+        future=_array(row["future"], 4),
+        agents=tuple(
+            Agent(
+                agent["agent_id"], cast(AgentKind, agent["kind"]), *agent["size_m"], _array(agent["poses"], 3)
+            )
+            for agent in row["agents"]
+        ),
+        drivable=tuple(_array(ring, 2) for ring in row["drivable"]),
+        lane_lines=tuple(_array(line, 2) for line in row["lane_lines"]),
+        lane_trace=None
+        if trace is None
+        else LaneTrace(
+            np.asarray(trace["road"], np.int32),
+            np.asarray(trace["lane"], np.int16),
+            np.asarray(trace["offset_m"], np.float32),
+        ),
+        tags=frozenset(cast("list[Tag]", row["tags"])),
+        dense=tuple(
+            DenseTarget(
+                target["camera"],
+                decode_image(target["classes"])[..., 0],
+                _log_to_range(decode_image(target["range_log"])[..., 0]),
+            )
+            for target in row.get("dense") or ()
+        ),
+    )
+
+
+def _range_to_log(range_m: Any) -> Any:
+    scaled = 255 * np.log1p(np.clip(range_m, 0, _RANGE_FAR_M)) / np.log1p(_RANGE_FAR_M)
+    return np.round(scaled).astype(np.uint8)
+
+
+def _log_to_range(stored: Any) -> Any:
+    return np.expm1(stored.astype(np.float32) / 255 * np.log1p(np.float32(_RANGE_FAR_M)))

@@ -1,0 +1,141 @@
+"""Trajectories and ego history in the ego frame at the scene's instant.
+
+Ego frame: x forward, y left, z up, metres; heading in radians, counter-clockwise positive.
+Rows are poses ``(x, y, z, heading)`` at 10 Hz.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float32]
+
+STEP_S: Final = 0.1
+HISTORY_STEPS: Final = 16
+"""Rows of an ego history; the last row is the present pose, all zeros (CF-VLA section 7)."""
+FUTURE_STEPS: Final = 64
+"""Rows of a trajectory; the first row lies 0.1 s ahead (CF-VLA section 7)."""
+HORIZON_S: Final = 6.4
+ROUTE_POINTS: Final = 20
+ROUTE_SPACING_M: Final = 4.0
+
+MAX_POSITION_M: Final = 1000.0
+"""No pose within 6.4 s is farther away than this: 156 m/s would be needed."""
+_PRESENT_TOLERANCE: Final = 1e-3
+
+
+class GeometryError(ValueError):
+    """An array that is not a history, trajectory or route; the text says what is wrong."""
+
+
+def _checked(array: npt.ArrayLike, shape: tuple[int, ...], name: str) -> FloatArray:
+    values = np.asarray(array, dtype=np.float32)
+    if values.shape != shape:
+        raise GeometryError(f"{name} must have shape {list(shape)}, got {list(values.shape)}")
+    if not np.isfinite(values).all():
+        raise GeometryError(f"{name} holds values that are not finite")
+    if np.abs(values).max(initial=0.0) > MAX_POSITION_M:
+        raise GeometryError(f"{name} holds values beyond ±{MAX_POSITION_M:g}")
+    values = values.copy()
+    values.flags.writeable = False
+    return values
+
+
+def check_history(array: npt.ArrayLike) -> FloatArray:
+    """An ego history as read-only float32 [16, 4], oldest first, last row (0, 0, 0, 0).
+
+    Raises:
+        GeometryError: wrong shape, not finite, or a last row that is not the present pose.
+    """
+    history = _checked(array, (HISTORY_STEPS, 4), "history")
+    if np.abs(history[-1]).max() > _PRESENT_TOLERANCE:
+        raise GeometryError(
+            "history must end at the present pose (0, 0, 0, 0): give it in the ego frame, oldest first"
+        )
+    return history
+
+
+def check_trajectory(array: npt.ArrayLike) -> FloatArray:
+    """A trajectory as read-only float32 [64, 4]; raises `GeometryError`."""
+    return _checked(array, (FUTURE_STEPS, 4), "trajectory")
+
+
+def check_route(array: npt.ArrayLike) -> FloatArray:
+    """A route as read-only float32 [20, 2], evenly spaced over the next 80 m; raises `GeometryError`."""
+    return _checked(array, (ROUTE_POINTS, 2), "route")
+
+
+def wrap_angle(angle: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Angles in radians brought to (-pi, pi]."""
+    wrapped: npt.NDArray[np.float64] = -(
+        (-np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
+    )
+    return wrapped
+
+
+def to_ego_frame(
+    poses: npt.ArrayLike, present: npt.ArrayLike
+) -> npt.NDArray[np.float64]:
+    """World poses [..., 4] (x, y, z, heading) seen from the pose ``present`` [4].
+
+    Headings are unwrapped along the last time axis by the caller where that matters; here they
+    are relative to the present heading and wrapped to (-pi, pi].
+    """
+    world = np.asarray(poses, dtype=np.float64)
+    x0, y0, z0, heading0 = np.asarray(present, dtype=np.float64)
+    dx, dy = world[..., 0] - x0, world[..., 1] - y0
+    cos, sin = np.cos(heading0), np.sin(heading0)
+    return np.stack(
+        [
+            cos * dx + sin * dy,
+            -sin * dx + cos * dy,
+            world[..., 2] - z0,
+            wrap_angle(world[..., 3] - heading0),
+        ],
+        axis=-1,
+    )
+
+
+def present_speed(history: FloatArray) -> float:
+    """Signed forward speed in m/s at the present, from the last 0.3 s of a history [16, 4]."""
+    return float(-history[-4, 0] / (3 * STEP_S))
+
+
+def speeds(trajectory: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """Signed forward speed in m/s [..., 64] over each step of trajectories [..., 64, 4].
+
+    The sign tells reverse gear: it is that of the displacement along the heading.
+    """
+    xy = np.asarray(trajectory[..., :2], dtype=np.float64)
+    step = np.diff(xy, axis=-2, prepend=np.zeros_like(xy[..., :1, :]))
+    heading = np.asarray(trajectory[..., 3], dtype=np.float64)
+    along = step[..., 0] * np.cos(heading) + step[..., 1] * np.sin(heading)
+    magnitude: npt.NDArray[np.float64] = np.hypot(step[..., 0], step[..., 1]) / STEP_S
+    return np.where(along < 0, -magnitude, magnitude)
+
+
+def constant_velocity(history: FloatArray) -> FloatArray:
+    """The trajectory [64, 4] of an ego that keeps speed and heading: a kinematic baseline."""
+    time_s = STEP_S * np.arange(1, FUTURE_STEPS + 1)
+    baseline = np.zeros((FUTURE_STEPS, 4), np.float32)
+    baseline[:, 0] = present_speed(history) * time_s
+    return baseline
+
+
+def constant_turn_rate(history: FloatArray) -> FloatArray:
+    """The trajectory [64, 4] of an ego that keeps speed and yaw rate: a kinematic baseline."""
+    speed = present_speed(history)
+    yaw_rate = float(-history[-6, 3]) / (5 * STEP_S)
+    time_s = STEP_S * np.arange(1, FUTURE_STEPS + 1)
+    heading = yaw_rate * time_s
+    baseline = np.zeros((FUTURE_STEPS, 4), np.float32)
+    # The exact arc; sinc keeps it well defined for a yaw rate of zero.
+    half = heading / 2
+    chord = speed * time_s * np.sinc(half / np.pi)
+    baseline[:, 0] = chord * np.cos(half)
+    baseline[:, 1] = chord * np.sin(half)
+    baseline[:, 3] = heading
+    return baseline

@@ -1,0 +1,1 @@
+"""Engines that decode responses: the interface, our torch engine, vLLM."""

@@ -1,0 +1,182 @@
+"""The engine interface: submit a scene with controls, receive events per draw, cancel.
+
+Controls are part of the request, not of the engine; every engine gives them the same meaning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+from model.driving.plan import Plan
+from model.driving.scene import Scene
+from model.driving.trajectory import FloatArray
+
+Thinking = Literal["adaptive", "always", "never"]
+Branch = Literal["Action:", "Thinking:"]
+
+MAX_DRAWS = 64
+
+
+class EngineError(RuntimeError):
+    """The engine failed; the request may be tried again."""
+
+
+class RequestError(ValueError):
+    """The request can never be served as it is; the text says what to change."""
+
+
+@dataclass(frozen=True)
+class Controls:
+    """What the caller decides about decoding.
+
+    Attributes:
+        thinking: who decides at the branch: the model, always think, never think.
+        think_threshold: with ``adaptive``: think exactly when the think probability exceeds it;
+            None samples the branch like any other word.
+        prefill: the first plan, given by the caller instead of written by the model.
+        n: draws per scene.
+        temperature: 0 takes the likeliest allowed token.
+        top_p: nucleus mass, 1 keeps all allowed tokens.
+        seed: random numbers depend on (seed, draw, position) only, so a draw is the same alone and in
+            a batch.
+        deadline_ms: milliseconds from submission by which the answer must be there; None for no deadline.
+    """
+
+    thinking: Thinking = "adaptive"
+    think_threshold: float | None = None
+    prefill: Plan | None = None
+    n: int = 6
+    temperature: float = 1.0
+    top_p: float = 1.0
+    seed: int = 0
+    deadline_ms: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.thinking not in ("adaptive", "always", "never"):
+            raise RequestError(f"thinking must be adaptive, always or never, got {self.thinking!r}")
+        if not 1 <= self.n <= MAX_DRAWS:
+            raise RequestError(f"n must lie in 1..{MAX_DRAWS}, got {self.n}")
+        if not 0.0 <= self.temperature <= 2.0:
+            raise RequestError(f"temperature must lie in 0..2, got {self.temperature}")
+        if not 0.0 < self.top_p <= 1.0:
+            raise RequestError(f"top_p must lie in (0, 1], got {self.top_p}")
+        if self.think_threshold is not None:
+            if self.thinking != "adaptive":
+                raise RequestError("think_threshold only has a meaning with thinking: adaptive")
+            if not 0.0 <= self.think_threshold <= 1.0:
+                raise RequestError(f"think_threshold must lie in 0..1, got {self.think_threshold}")
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """One scene to plan for. ``format`` names a response format the checkpoint was trained on."""
+
+    request_id: str
+    scene: Scene
+    format: str = "cf_vla"
+    controls: Controls = field(default_factory=Controls)
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """One finished response.
+
+    Attributes:
+        index: 0..n-1.
+        text: the whole response as written.
+        plan, branch, thinking, revised_plan: its parts; None where the format or the branch has none.
+        think_probability: probability of ``Thinking:`` at the branch, at temperature 1, over the two
+            branch words; None where the format has no branch.
+        trajectory: float32 [64, 4] in the ego frame.
+        codes: the trajectory codes it was decoded from.
+        tokens: tokens per section, forced ones included.
+    """
+
+    index: int
+    text: str
+    plan: Plan | None
+    branch: Branch | None
+    think_probability: float | None
+    thinking: str | None
+    revised_plan: Plan | None
+    trajectory: FloatArray
+    codes: tuple[int, ...]
+    tokens: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class SectionFinished:
+    """A draw has finished a section (`plan`, `branch`, `thinking`, `revised_plan`, `trajectory`)."""
+
+    index: int
+    section: str
+    text: str
+
+
+@dataclass(frozen=True)
+class DrawFinished:
+    """A draw is complete."""
+
+    draw: Draw
+
+
+Event = SectionFinished | DrawFinished
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """What a loaded checkpoint is.
+
+    Attributes:
+        name: e.g. ``looktwice-nano``.
+        revision: changes with the weights.
+        engine: ``torch`` or ``vllm``.
+        formats: response formats it can write.
+        cameras: cameras it looks at; a scene must have these.
+        image_size: width, height in pixels that pictures are resized to.
+        parameters: how many weights.
+        details: anything else worth showing, JSON-like.
+    """
+
+    name: str
+    revision: str
+    engine: str
+    formats: tuple[str, ...]
+    cameras: tuple[str, ...]
+    image_size: tuple[int, int]
+    parameters: int
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Engine(Protocol):
+    """Decodes responses for scenes. One event loop owns an engine; its methods are called from there."""
+
+    @property
+    def card(self) -> ModelCard:
+        """What is loaded."""
+        ...
+
+    async def start(self) -> None:
+        """Load and warm up; returns when the engine can plan. Raises `EngineError`."""
+        ...
+
+    async def stop(self) -> None:
+        """Cancel what is running and free everything."""
+        ...
+
+    def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
+        """Queue a request and iterate over its events; ends after the n-th `DrawFinished`.
+
+        Closing the iterator early cancels the request.
+
+        Raises:
+            RequestError: at the first iteration, when the request cannot be served.
+            EngineError: when decoding failed.
+        """
+        ...
+
+    def cancel(self, request_id: str) -> None:
+        """Drop a request; unknown ids are ignored."""
+        ...
