@@ -1,0 +1,401 @@
+"""Walking a response format token by token: what is forced, what is allowed, where we are.
+
+A `Cursor` is immutable: draws that have written the same tokens may share one, and forking is free.
+No torch here; a vocabulary is anything that satisfies `Vocabulary`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from model.driving.plan import Plan, format_tick
+from model.formats.pieces import (
+    Choice,
+    Codes,
+    Format,
+    FormatError,
+    FreeText,
+    Literal,
+    Piece,
+    PlanTracks,
+    Section,
+    Sequence,
+    Track,
+    Value,
+    Values,
+)
+
+
+class Vocabulary(Protocol):
+    """What a format needs to know about a tokenizer."""
+
+    def encode(self, text: str) -> tuple[int, ...]:
+        """Token ids of ``text`` exactly as given; special tokens are recognised by their spelling."""
+        ...
+
+    def code_ids(self, stage: int) -> range:
+        """Ids of the trajectory codes of one stage."""
+        ...
+
+    def free_text_ids(self) -> npt.NDArray[np.bool_]:
+        """Mask over the vocabulary: ordinary tokens without a line break."""
+        ...
+
+
+class Token(NamedTuple):
+    """A token of a response and the section it belongs to."""
+
+    id: int
+    section: str
+
+
+class _Node:
+    """A node of a trie over tokenised options."""
+
+    __slots__ = ("children", "ids", "option")
+
+    def __init__(self) -> None:
+        self.children: dict[int, _Node] = {}
+        self.option: int | None = None
+        self.ids: npt.NDArray[np.int64] = np.empty(0, np.int64)
+
+    def options(self) -> Iterator[int]:
+        """Positions of the options reachable from here."""
+        if self.option is not None:
+            yield self.option
+        for child in self.children.values():
+            yield from child.options()
+
+
+class _Run(NamedTuple):
+    ids: tuple[int, ...]
+    position: int
+
+
+class _AtChoice(NamedTuple):
+    choice: Choice
+    node: _Node
+
+
+class _InText(NamedTuple):
+    piece: FreeText
+    used: int
+
+
+class _AtCode(NamedTuple):
+    piece: Codes
+    stage: int
+
+
+_Active = _Run | _AtChoice | _InText | _AtCode
+_Rest = tuple[Piece, str, "_Rest"] | None
+"""What comes behind the active piece: a linked list of pieces with the section each stands in."""
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """The tokens allowed at a position where there is something to decide.
+
+    Attributes:
+        ids: int64 [k], k >= 2, ascending.
+        section: the section the token will belong to.
+        choice: the name of the choice that is being decided here, where it has one.
+    """
+
+    ids: npt.NDArray[np.int64]
+    section: str
+    choice: str | None = None
+
+
+class CompiledFormat:
+    """A format over one vocabulary; tries and tokenised literals are kept between responses."""
+
+    def __init__(self, format: Format, vocabulary: Vocabulary) -> None:
+        self.format = format
+        self._vocabulary = vocabulary
+        self._literals: dict[str, tuple[int, ...]] = {}
+        self._tries: dict[tuple[str, ...], _Node] = {}
+        self._expanded: dict[Track | PlanTracks, Sequence] = {}
+        self._codes = tuple(np.arange(ids.start, ids.stop) for ids in map(vocabulary.code_ids, range(6)))
+        self._free_ids: dict[tuple[str, bool], npt.NDArray[np.int64]] = {}
+
+    def start(self, given: Values | None = None) -> Cursor:
+        """A cursor at the beginning; plans of the sections in ``given`` are forced as they are.
+
+        Raises:
+            FormatError: ``given`` names a section without a plan, or a plan beyond the format.
+        """
+        known = self.format.sections()
+        for name in given or {}:
+            if name not in known:
+                raise FormatError(f"format {self.format.name} has no section {name!r}")
+        body = _with_given(self.format.body, given or {}, None)
+        return self._enter((body, "", None))
+
+    def render(self, values: Values) -> list[Token]:
+        """The tokens of a whole response with these values, each with its section.
+
+        Raises:
+            FormatError: a section's value is missing or not writable in this format.
+        """
+        tokens: list[Token] = []
+        cursor = self.start({name: value for name, value in values.items() if isinstance(value, Plan)})
+        while True:
+            forced, cursor = cursor.forced()
+            tokens += forced
+            if cursor.done:
+                return tokens
+            for token in cursor.answer(values):
+                tokens.append(Token(token, cursor.section))
+                cursor = cursor.advance(token)
+
+    def literal(self, text: str) -> tuple[int, ...]:
+        """Token ids of a literal."""
+        if text not in self._literals:
+            self._literals[text] = self._vocabulary.encode(text)
+        return self._literals[text]
+
+    def encode(self, text: str) -> tuple[int, ...]:
+        """Token ids of free text, which is not kept as literals are."""
+        return self._vocabulary.encode(text)
+
+    def free_ids(self, stop: str, *, may_stop: bool) -> npt.NDArray[np.int64]:
+        """Ids allowed within free text; with the stop's first token when it may end here."""
+        key = (stop, may_stop)
+        if key not in self._free_ids:
+            mask = self._vocabulary.free_text_ids().copy()
+            mask[self.literal(stop)[0]] = may_stop
+            self._free_ids[key] = np.flatnonzero(mask)
+        return self._free_ids[key]
+
+    def codes(self, stage: int) -> npt.NDArray[np.int64]:
+        """Ids of one stage's codes."""
+        return self._codes[stage]
+
+    def trie(self, choice: Choice) -> _Node:
+        """The trie over a choice's tokenised options."""
+        texts = tuple(option.text for option in choice.options)
+        if texts not in self._tries:
+            self._tries[texts] = self._build_trie(texts)
+        return self._tries[texts]
+
+    def _build_trie(self, texts: tuple[str, ...]) -> _Node:
+        root = _Node()
+        for position, text in enumerate(texts):
+            node = root
+            for token in self.literal(text):
+                if node.option is not None:
+                    raise FormatError(f"option {texts[node.option]!r} is a beginning of {text!r} in tokens")
+                node = node.children.setdefault(token, _Node())
+            if node.children or node.option is not None:
+                raise FormatError(f"option {text!r} is a beginning of another option in tokens")
+            node.option = position
+        stack = [root]
+        while stack:
+            node = stack.pop()
+            node.ids = np.array(sorted(node.children), np.int64)
+            stack += node.children.values()
+        return root
+
+    def _enter(self, rest: _Rest) -> Cursor:
+        """The cursor at the first token of ``rest``."""
+        while rest is not None:
+            piece, section, after = rest
+            match piece:
+                case Literal(text):
+                    if ids := self.literal(text):
+                        return Cursor(self, _Run(ids, 0), section, after)
+                    rest = after
+                case Sequence(parts):
+                    for part in reversed(parts):
+                        after = (part, section, after)
+                    rest = after
+                case Section(name, body):
+                    rest = (body, name, after)
+                case PlanTracks() | Track():
+                    if piece not in self._expanded:
+                        self._expanded[piece] = piece.expand()
+                    rest = (self._expanded[piece], section, after)
+                case Choice():
+                    return Cursor(self, _AtChoice(piece, self.trie(piece)), section, after)
+                case FreeText():
+                    return Cursor(self, _InText(piece, 0), section, after)
+                case Codes():
+                    return Cursor(self, _AtCode(piece, 0), section, after)
+        return Cursor(self, None, "", None)
+
+
+@dataclass(frozen=True, eq=False)
+class Cursor:
+    """A position in a response. Made by `CompiledFormat.start` and `advance`."""
+
+    compiled: CompiledFormat = field(repr=False)
+    _active: _Active | None
+    section: str
+    """The section the next token belongs to."""
+    _rest: _Rest = field(repr=False)
+
+    @property
+    def done(self) -> bool:
+        """Whether the response is complete."""
+        return self._active is None
+
+    def allowed(self) -> Allowed:
+        """What may come next; a single id means the token is forced. Not to be called when done."""
+        name: str | None = None
+        match self._active:
+            case _Run(ids, position):
+                allowed = np.array([ids[position]], np.int64)
+            case _AtChoice(choice, node):
+                allowed, name = node.ids, choice.name
+            case _InText(piece, used):
+                if used >= piece.max_tokens:
+                    allowed = np.array([self.compiled.literal(piece.stop)[0]], np.int64)
+                else:
+                    allowed = self.compiled.free_ids(piece.stop, may_stop=used > 0)
+            case _AtCode(_, stage):
+                allowed = self.compiled.codes(stage)
+            case None:
+                raise FormatError("the response is complete")
+        return Allowed(allowed, self.section, name)
+
+    def forced(self) -> tuple[list[Token], Cursor]:
+        """The run of forced tokens from here, and the cursor behind it."""
+        run: list[Token] = []
+        cursor = self
+        while not cursor.done:
+            ids = cursor.allowed().ids
+            if len(ids) != 1:
+                break
+            run.append(Token(int(ids[0]), cursor.section))
+            cursor = cursor.advance(int(ids[0]))
+        return run, cursor
+
+    def advance(self, token: int) -> Cursor:
+        """The cursor behind ``token``; raises `FormatError` when it is not allowed here."""
+        match self._active:
+            case _Run(ids, position) if ids[position] == token:
+                if position + 1 < len(ids):
+                    return self._at(_Run(ids, position + 1))
+                return self.compiled._enter(self._rest)
+            case _AtChoice(choice, node) if token in node.children:
+                child = node.children[token]
+                if child.option is None:
+                    return self._at(_AtChoice(choice, child))
+                return self.compiled._enter((choice.options[child.option].then, self.section, self._rest))
+            case _InText(piece, used):
+                stop = self.compiled.literal(piece.stop)
+                if token == stop[0] and used > 0:
+                    if len(stop) > 1:
+                        return self._at(_Run(stop, 1))
+                    return self.compiled._enter(self._rest)
+                ids_allowed = self.compiled.free_ids(piece.stop, may_stop=False)
+                if used < piece.max_tokens and _holds(ids_allowed, token):
+                    return self._at(_InText(piece, used + 1))
+            case _AtCode(piece, stage) if _holds(self.compiled.codes(stage), token):
+                if stage + 1 < piece.count:
+                    return self._at(_AtCode(piece, stage + 1))
+                return self.compiled._enter(self._rest)
+        raise FormatError(f"token {token} is not allowed in section {self.section or 'end'!r}")
+
+    def option_texts(self, token: int) -> tuple[str, ...]:
+        """At a choice: the options still reachable when ``token`` is taken."""
+        if not isinstance(self._active, _AtChoice):
+            raise FormatError("not at a choice")
+        choice, node = self._active
+        return tuple(choice.options[position].text for position in node.children[token].options())
+
+    def answer(self, values: Values) -> tuple[int, ...]:
+        """The tokens that write the current section's value from here; raises `FormatError`."""
+        if self.section not in values:
+            raise FormatError(f"section {self.section!r} needs a value")
+        value = values[self.section]
+        match self._active:
+            case _AtChoice(choice, _):
+                for option in choice.options:
+                    if option.text == value:
+                        return self.compiled.literal(option.text)
+                known = ", ".join(option.text for option in choice.options)
+                raise FormatError(f"{value!r} is none of {known}")
+            case _InText(piece, _) if isinstance(value, str):
+                if not value or piece.stop in value:
+                    raise FormatError(f"section {self.section!r} must be text without {piece.stop!r}")
+                ids = self.compiled.encode(value)
+                if len(ids) > piece.max_tokens:
+                    raise FormatError(
+                        f"section {self.section!r} has {len(ids)} tokens; at most {piece.max_tokens}"
+                    )
+                # At its budget the text stops by itself: the stop's first token is forced then.
+                stop = self.compiled.literal(piece.stop)[:1] if len(ids) < piece.max_tokens else ()
+                return ids + stop
+            case _AtCode(piece, _) if isinstance(value, tuple) and len(value) == piece.count:
+                return tuple(
+                    int(self.compiled.codes(stage)[code]) for stage, code in enumerate(value)
+                )
+        raise FormatError(f"section {self.section!r} cannot be written from {value!r}")
+
+    def _at(self, active: _Active) -> Cursor:
+        return Cursor(self.compiled, active, self.section, self._rest)
+
+
+def _holds(ids: npt.NDArray[np.int64], token: int) -> bool:
+    position = int(np.searchsorted(ids, token))
+    return position < len(ids) and int(ids[position]) == token
+
+
+def _with_given(piece: Piece, given: Mapping[str, Value], section: str | None) -> Piece:
+    """``piece`` with the plans of given sections written out as literals, piece by piece."""
+    match piece:
+        case Section(name, body):
+            return Section(name, _with_given(body, given, name))
+        case Sequence(parts):
+            return Sequence(tuple(_with_given(part, given, section) for part in parts))
+        case Choice(options, name):
+            return Choice(
+                tuple(type(option)(option.text, _with_given(option.then, given, section)) for option in options),
+                name,
+            )
+        case PlanTracks() if section in given:
+            plan = given[section]
+            if not isinstance(plan, Plan):
+                raise FormatError(f"section {section!r} needs a plan")
+            return _written_plan(plan, section)
+        case _:
+            return piece
+
+
+def _written_plan(plan: Plan, section: str) -> Sequence:
+    """The pieces that a plan's text is made of, each as a literal: tokenised as decoding would."""
+    parts: list[Piece] = []
+    for group, track in plan.tracks():
+        rest: Piece = PlanTracks((group,))
+        answers = iter([text for action in track for text in (format_tick(action.end), f" {action.word}")])
+        stack: list[Piece] = [rest]
+        while stack:
+            piece = stack.pop()
+            match piece:
+                case Literal():
+                    parts.append(piece)
+                case Sequence(pieces):
+                    stack += reversed(pieces)
+                case PlanTracks() | Track():
+                    stack.append(piece.expand())
+                case Choice(options):
+                    text = next(answers)
+                    chosen = [option for option in options if option.text == text]
+                    if not chosen:
+                        raise FormatError(
+                            f"section {section!r}: track {group} has more meta-actions than the format allows"
+                        )
+                    parts.append(Literal(text))
+                    stack.append(chosen[0].then)
+                case _:
+                    raise FormatError(f"a plan holds no {type(piece).__name__}")
+    return Sequence(tuple(parts))
+
+

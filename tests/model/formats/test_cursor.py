@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model.driving.plan import Plan, parse_plan
+from model.formats.cf_vla import CF_VLA, FORMATS, MAX_THINKING_TOKENS, TRAJ_ONLY
+from model.formats.cursor import CompiledFormat, Cursor, Token
+from model.formats.pieces import Choice, Format, FormatError, Literal, Option, Values
+from model.formats.text import parse
+from tests.model.formats.strategies import cf_vla_values, plans
+from tests.model.formats.vocabulary import ByteVocabulary
+
+VOCABULARY = ByteVocabulary()
+COMPILED = CompiledFormat(CF_VLA, VOCABULARY)
+PLAN = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n- lateral\n  - 0.0s-6.4s: Straight\n")
+
+
+def walk(cursor: Cursor, seed: int) -> list[Token]:
+    """A response written by uniform random choices."""
+    random = np.random.default_rng(seed)
+    written: list[Token] = []
+    while True:
+        forced, cursor = cursor.forced()
+        written += forced
+        if cursor.done:
+            return written
+        token = int(random.choice(cursor.allowed().ids))
+        written.append(Token(token, cursor.section))
+        cursor = cursor.advance(token)
+
+
+@given(cf_vla_values())
+def test_rendered_values_parse_to_themselves(values: Values) -> None:
+    tokens = COMPILED.render(values)
+    assert parse(CF_VLA, VOCABULARY.decode([token.id for token in tokens])) == values
+
+
+@given(cf_vla_values())
+def test_rendered_tokens_can_be_written_one_by_one(values: Values) -> None:
+    cursor = COMPILED.start()
+    for token in COMPILED.render(values):
+        assert token.id in cursor.allowed().ids
+        assert token.section == cursor.section
+        cursor = cursor.advance(token.id)
+    assert cursor.done
+
+
+@given(st.sampled_from(sorted(FORMATS)), st.integers(0, 2**32 - 1))
+def test_whatever_is_written_parses_and_renders_back(name: str, seed: int) -> None:
+    compiled = CompiledFormat(FORMATS[name], VOCABULARY)
+    tokens = walk(compiled.start(), seed)
+    values = parse(FORMATS[name], VOCABULARY.decode([token.id for token in tokens]))
+    # Free text may be split otherwise by the tokenizer; everything else is the same to the token.
+    rendered = compiled.render(values)
+    keep = [token for token in tokens if token.section != "thinking"]
+    assert [token for token in rendered if token.section != "thinking"] == keep
+
+
+@given(plans(), st.integers(0, 1000))
+def test_a_given_plan_is_forced_and_tokenised_as_the_model_writes_it(plan: Plan, seed: int) -> None:
+    forced, _ = COMPILED.start({"plan": plan}).forced()
+    values = {"plan": plan, "branch": "Action:", "trajectory": (0,) * 6}
+    assert forced == [token for token in COMPILED.render(values) if token.section == "plan"]
+    written = walk(COMPILED.start({"plan": plan}), seed)
+    assert parse(CF_VLA, VOCABULARY.decode([token.id for token in written]))["plan"] == plan
+
+
+def test_a_given_plan_may_lack_a_group() -> None:
+    written = walk(COMPILED.start({"plan": PLAN}), 0)
+    assert parse(CF_VLA, VOCABULARY.decode([token.id for token in written]))["plan"] == PLAN
+
+
+def test_end_times_lie_behind_the_start() -> None:
+    cursor = COMPILED.start()
+    _, cursor = cursor.forced()
+    for character in "6.3":
+        cursor = cursor.advance(VOCABULARY.encode(character)[0])
+    _, cursor = cursor.forced()  # s:
+    assert cursor.option_texts(int(cursor.allowed().ids[-1]))[0].startswith(" ")
+    cursor = cursor.advance(VOCABULARY.encode(" Keep")[0])
+    forced, _ = cursor.forced()
+    text = VOCABULARY.decode([token.id for token in forced])
+    assert text.startswith(" Speed\n  - 6.3s-6.4s:")  # only one end time is left
+
+
+def test_the_last_segment_reaches_the_horizon() -> None:
+    written = [token.id for token in walk(COMPILED.start(), 7)]
+    plan = parse(CF_VLA, VOCABULARY.decode(written))["plan"]
+    assert isinstance(plan, Plan)
+    assert all(len(track) <= 12 for _, track in plan.tracks())
+
+
+def test_free_text_stops_at_its_budget() -> None:
+    _, cursor = COMPILED.start({"plan": PLAN}).forced()
+    cursor = cursor.advance(VOCABULARY.encode("Thinking:")[0])
+    _, cursor = cursor.forced()
+    letter = VOCABULARY.encode("a")[0]
+    newline = VOCABULARY.encode("\n")[0]
+    assert newline not in cursor.allowed().ids  # thinking is never empty
+    for _ in range(MAX_THINKING_TOKENS):
+        assert cursor.section == "thinking"
+        cursor = cursor.advance(letter)
+    assert list(cursor.allowed().ids) == [newline]
+
+
+def test_the_branch_names_its_options() -> None:
+    _, cursor = COMPILED.start({"plan": PLAN}).forced()
+    allowed = cursor.allowed()
+    assert allowed.choice == "branch"
+    texts = {cursor.option_texts(int(token)) for token in allowed.ids}
+    assert texts == {("Action:",), ("Thinking:",)}
+
+
+def test_tokens_out_of_turn_are_refused() -> None:
+    cursor = COMPILED.start()
+    with pytest.raises(FormatError, match="not allowed in section 'plan'"):
+        cursor.advance(VOCABULARY.encode("x")[0])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"plan": PLAN}, "section 'branch' needs a value"),
+        ({"plan": PLAN, "branch": "Action"}, "none of"),
+        ({"plan": PLAN, "branch": "Action:", "trajectory": (1, 2)}, "cannot be written"),
+        ({"plan": PLAN, "branch": "Thinking:", "thinking": "a\nb"}, "must be text without"),
+        ({"plan": PLAN, "branch": "Thinking:", "thinking": "é" * 500 + "a" * 500}, "at most"),
+        ({"speech": "a"}, "needs a value"),
+    ],
+)
+def test_values_that_cannot_be_written_are_refused(values: Values, message: str) -> None:
+    with pytest.raises(FormatError, match=message):
+        COMPILED.render(values)
+
+
+def test_given_sections_must_exist() -> None:
+    with pytest.raises(FormatError, match="has no section"):
+        CompiledFormat(TRAJ_ONLY, VOCABULARY).start({"plan": PLAN})
+
+
+def test_options_must_not_begin_one_another() -> None:
+    choice = Choice((Option("a", Literal("")), Option("ab", Literal(""))))
+    with pytest.raises(FormatError, match="is a beginning of"):
+        CompiledFormat(Format("bad", choice), VOCABULARY).start()
