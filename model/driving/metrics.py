@@ -55,7 +55,7 @@ def displacement_errors(draws: FloatArray, expert: FloatArray) -> DisplacementEr
 
 
 def box_corners(poses: npt.NDArray[np.floating], length_m: float, width_m: float) -> Array:
-    """Corners [..., 4, 2] of boxes centred at poses [..., 3] (x, y, heading), counter-clockwise order kept."""
+    """Corners [..., 4, 2] of boxes centred at poses [..., 3] (x, y, heading), in one sense of turning."""
     centre = np.asarray(poses[..., :2], dtype=np.float64)
     heading = np.asarray(poses[..., 2], dtype=np.float64)
     half = _CORNER_SIGNS * np.array([length_m, width_m]) / 2

@@ -16,6 +16,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
@@ -124,7 +125,7 @@ def format_tick(tick: int) -> str:
 def track_from_words(words: Sequence[str]) -> Track:
     """64 words, one per tick, as a track with equal neighbours joined."""
     edges = [0, *(tick for tick in range(1, len(words)) if words[tick] != words[tick - 1]), len(words)]
-    return tuple(MetaAction(start, end, words[start]) for start, end in zip(edges, edges[1:], strict=False))
+    return tuple(MetaAction(start, end, words[start]) for start, end in pairwise(edges))
 
 
 def plan_from_bins(bins: npt.NDArray[np.integer]) -> Plan:
@@ -261,7 +262,7 @@ class MendedPlan:
 
 _LENIENT_GROUP: Final = re.compile(r"[\s*#\-]*(longitudinal|lateral|lane)\b[\s:*]*", re.IGNORECASE)
 _LENIENT_SEGMENT: Final = re.compile(
-    r"[\s*\-•]*(\d+(?:\.\d+)?)\s*s?\s*(?:-|–|—|to)\s*(\d+(?:\.\d+)?)\s*s?\s*:\s*(.+?)[\s.*]*",
+    r"[\s*\-\u2022]*(\d+(?:\.\d+)?)\s*s?\s*(?:-|\u2013|\u2014|to)\s*(\d+(?:\.\d+)?)\s*s?\s*:\s*(.+?)[\s.*]*",
     re.IGNORECASE,
 )
 
@@ -282,7 +283,8 @@ def parse_plan_leniently(text: str) -> MendedPlan:
         if not line.strip():
             continue
         if found := _LENIENT_GROUP.fullmatch(line):
-            group = next(name for name in GROUPS if name == found[1].lower())
+            named: Group = next(name for name in GROUPS if name == found[1].lower())
+            group = named
             if group in tracks:
                 mends.append(f"line {number}: group {group} again, the later one counts")
             tracks[group] = []
