@@ -41,9 +41,7 @@ def displacement_errors(draws: FloatArray, expert: FloatArray) -> DisplacementEr
     Minima are taken apart: the draw of the smallest ADE need not have the smallest FDE. The corner
     distance is the smallest over the draws, as minADE is.
     """
-    distance = np.linalg.norm(
-        draws[..., :2].astype(np.float64) - expert[..., :2].astype(np.float64), axis=-1
-    )
+    distance = np.linalg.norm(draws[..., :2].astype(np.float64) - expert[..., :2].astype(np.float64), axis=-1)
     ade, fde = distance.mean(axis=-1), distance[..., -1]
     return DisplacementErrors(
         min_ade_m=float(ade.min()),
@@ -95,9 +93,7 @@ def collides(
     reach_m = np.hypot(EGO_LENGTH_M, EGO_WIDTH_M) / 2
     for agent in agents:
         future = agent.future[:steps]
-        apart = np.hypot(
-            trajectories[:, :steps, 0] - future[:, 0], trajectories[:, :steps, 1] - future[:, 1]
-        )
+        apart = np.hypot(trajectories[:, :steps, 0] - future[:, 0], trajectories[:, :steps, 1] - future[:, 1])
         near = apart <= reach_m + np.hypot(agent.length_m, agent.width_m) / 2  # False where absent (NaN)
         rows, times = np.nonzero(near & ~hit[:, None])
         if len(rows) == 0:
@@ -120,8 +116,7 @@ def leaves_road(trajectories: FloatArray, drivable: Sequence[FloatArray]) -> Boo
     """
     corners = ego_corners(trajectories)
     inside = points_inside(corners.reshape(-1, 2), drivable).reshape(corners.shape[:-1])
-    outside: BoolArray = ~inside.all(axis=(-1, -2))
-    return outside
+    return np.asarray(~inside.all(axis=(-1, -2)), dtype=np.bool_)
 
 
 def points_inside(points: npt.NDArray[np.floating], rings: Sequence[FloatArray]) -> BoolArray:
@@ -129,13 +124,14 @@ def points_inside(points: npt.NDArray[np.floating], rings: Sequence[FloatArray])
     x, y = np.asarray(points[:, 0], np.float64), np.asarray(points[:, 1], np.float64)
     crossings = np.zeros(len(x), dtype=np.int64)
     for ring in rings:
-        start, end = np.asarray(ring, np.float64), np.roll(np.asarray(ring, np.float64), -1, axis=0)
-        rise = end[:, 1] - start[:, 1]
-        spans = (start[:, 1] > y[:, None]) != (end[:, 1] > y[:, None])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            crossing_x = start[:, 0] + (y[:, None] - start[:, 1]) / rise * (end[:, 0] - start[:, 0])
-        crossings += (spans & (x[:, None] < crossing_x)).sum(axis=1)
-    return crossings % 2 == 1
+        start = np.asarray(ring, np.float64)
+        end = np.roll(start, -1, axis=0)
+        # Few edges cross the horizontal line through a point; only for those does it matter where.
+        point, edge = np.nonzero((start[:, 1] > y[:, None]) != (end[:, 1] > y[:, None]))
+        slope = (end[edge, 0] - start[edge, 0]) / (end[edge, 1] - start[edge, 1])
+        crossing_x = start[edge, 0] + (y[point] - start[edge, 1]) * slope
+        crossings += np.bincount(point[x[point] < crossing_x], minlength=len(x))
+    return np.asarray(crossings % 2 == 1, dtype=np.bool_)
 
 
 def _axes(heading: Array) -> Array:

@@ -177,7 +177,7 @@ def plan_iou(one: Plan, other: Plan) -> float:
 
 _GROUP_LINE: Final = re.compile(r"- (?P<group>\w+)")
 _SEGMENT_LINE: Final = re.compile(r"  - (?P<start>[^\s:]*?)s-(?P<end>[^\s:]*?)s: (?P<word>.*)")
-_TIME: Final = re.compile(r"\d+\.\d")
+_TIME: Final = re.compile(r"(?:0|[1-9][0-9]{0,3})\.[0-9]")
 
 
 def parse_plan(text: str, first_line: int = 1) -> Plan:
@@ -225,9 +225,7 @@ def _next_group(name: str, previous: Group | None, line: int) -> Group:
     raise PlanError(f"unknown group {name!r}; known are {', '.join(GROUPS)}", line, 3)
 
 
-def _segment(
-    found: re.Match[str], group: Group, before: Sequence[MetaAction], line: int
-) -> MetaAction:
+def _segment(found: re.Match[str], group: Group, before: Sequence[MetaAction], line: int) -> MetaAction:
     ticks = []
     for part in ("start", "end"):
         if not _TIME.fullmatch(found[part]):
@@ -261,8 +259,10 @@ class MendedPlan:
 
 
 _LENIENT_GROUP: Final = re.compile(r"[\s*#\-]*(longitudinal|lateral|lane)\b[\s:*]*", re.IGNORECASE)
+_LENIENT_TIME: Final = r"([0-9]{1,3}(?:\.[0-9]{1,6})?)\s*s?"
 _LENIENT_SEGMENT: Final = re.compile(
-    r"[\s*\-\u2022]*(\d+(?:\.\d+)?)\s*s?\s*(?:-|\u2013|\u2014|to)\s*(\d+(?:\.\d+)?)\s*s?\s*:\s*(.+?)[\s.*]*",
+    # A bullet, two times with a hyphen, a dash or "to" between, a word; full stops and asterisks are trimmed.
+    rf"[\s*\-\u2022]*{_LENIENT_TIME}\s*(?:-|\u2013|\u2014|to)\s*{_LENIENT_TIME}\s*:\s*(.+?)[\s.*]*",
     re.IGNORECASE,
 )
 
@@ -291,15 +291,16 @@ def parse_plan_leniently(text: str) -> MendedPlan:
             if line != f"- {group}":
                 mends.append(f"line {number}: group line rewritten")
         elif (found := _LENIENT_SEGMENT.fullmatch(line)) and group is not None:
-            action = _lenient_segment(found, group, number, mends)
+            action = _lenient_segment(found, group, number)
+            if action.end <= action.start:
+                mends.append(f"line {number}: left out, {action} does not end after it starts")
+                continue
             if line != f"  - {action}":
                 mends.append(f"line {number}: rewritten as '{action}'")
             tracks[group].append(action)
         else:
             mends.append(f"line {number}: left out, not a meta-action")
-    plan = Plan(
-        **{name: _mend_track(name, actions, mends) for name, actions in tracks.items() if actions}
-    )
+    plan = Plan(**{name: _mend_track(name, actions, mends) for name, actions in tracks.items() if actions})
     if not plan.tracks():
         raise PlanError("no meta-actions found")
     if list(tracks) != [name for name in GROUPS if name in tracks]:
@@ -307,9 +308,7 @@ def parse_plan_leniently(text: str) -> MendedPlan:
     return MendedPlan(plan, tuple(mends))
 
 
-def _lenient_segment(
-    found: re.Match[str], group: Group, line: int, mends: list[str]
-) -> MetaAction:
+def _lenient_segment(found: re.Match[str], group: Group, line: int) -> MetaAction:
     for word in WORDS[group]:
         if word.lower() == " ".join(found[3].lower().split()):
             return MetaAction(round(10 * float(found[1])), round(10 * float(found[2])), word)

@@ -80,9 +80,7 @@ class Clip:
         if self.camera not in CAMERAS:
             raise SceneError(f"unknown camera {self.camera!r}; known are {', '.join(CAMERAS)}")
         if len(self.images) != CLIP_FRAMES:
-            raise SceneError(
-                f"camera {self.camera} must have {CLIP_FRAMES} frames, got {len(self.images)}"
-            )
+            raise SceneError(f"camera {self.camera} must have {CLIP_FRAMES} frames, got {len(self.images)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,15 +70,11 @@ def check_route(array: npt.ArrayLike) -> FloatArray:
 
 def wrap_angle(angle: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Angles in radians brought to (-pi, pi]."""
-    wrapped: npt.NDArray[np.float64] = -(
-        (-np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
-    )
+    wrapped: npt.NDArray[np.float64] = -((-np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi)
     return wrapped
 
 
-def to_ego_frame(
-    poses: npt.ArrayLike, present: npt.ArrayLike
-) -> npt.NDArray[np.float64]:
+def to_ego_frame(poses: npt.ArrayLike, present: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """World poses [..., 4] (x, y, z, heading) seen from the pose ``present`` [4].
 
     Headings are unwrapped along the last time axis by the caller where that matters; here they
@@ -127,8 +123,11 @@ def constant_velocity(history: FloatArray) -> FloatArray:
 
 def constant_turn_rate(history: FloatArray) -> FloatArray:
     """The trajectory [64, 4] of an ego that keeps speed and yaw rate: a kinematic baseline."""
-    speed = present_speed(history)
     yaw_rate = float(-history[-6, 3]) / (5 * STEP_S)
+    x, y = float(history[-4, 0]), float(history[-4, 1])
+    chord_s = 3 * STEP_S
+    # The ego came along an arc too, which is longer than its chord.
+    speed = float(np.copysign(np.hypot(x, y), -x) / (chord_s * np.sinc(yaw_rate * chord_s / 2 / np.pi)))
     time_s = STEP_S * np.arange(1, FUTURE_STEPS + 1)
     heading = yaw_rate * time_s
     baseline = np.zeros((FUTURE_STEPS, 4), np.float32)

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model.driving.trajectory import (
+    GeometryError,
+    check_history,
+    check_route,
+    check_trajectory,
+    constant_turn_rate,
+    constant_velocity,
+    present_speed,
+    speeds,
+    to_ego_frame,
+    wrap_angle,
+)
+from tests.model.driving.drives import drive
+
+
+@pytest.mark.parametrize("speed", [0.0, 12.5, -2.0])
+def test_constant_velocity_is_exact_on_a_straight(speed: float) -> None:
+    future, history = drive(speed)
+    assert present_speed(history) == pytest.approx(speed, abs=1e-5)
+    np.testing.assert_allclose(constant_velocity(history), future, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("speed", "yaw_rate"), [(10.0, 0.3), (6.0, -0.6), (15.0, 1e-9), (-2.0, 0.2), (0.0, 0.0)]
+)
+def test_constant_turn_rate_is_exact_on_arcs(speed: float, yaw_rate: float) -> None:
+    future, history = drive(speed, yaw_rate)
+    expected = future.copy()
+    expected[:, 3] = np.unwrap(expected[:, 3])
+    np.testing.assert_allclose(constant_turn_rate(history), expected, atol=5e-4)
+
+
+def test_speeds_are_signed_by_the_gear() -> None:
+    forward, _ = drive(8.0, 0.4)
+    backward, _ = drive(-3.0, 0.4)
+    both = speeds(np.stack([forward, backward]))
+    assert both.shape == (2, 64)
+    np.testing.assert_allclose(both[0], 8.0, atol=1e-2)
+    np.testing.assert_allclose(both[1], -3.0, atol=1e-2)
+
+
+def test_ego_frame_has_x_forward_and_y_left() -> None:
+    present = [10.0, 20.0, 1.0, np.pi / 2]  # looks along the world's y
+    seen = to_ego_frame([[10, 25, 1, np.pi / 2], [9, 20, 1, np.pi], [10, 20, 3, -np.pi / 2]], present)
+    np.testing.assert_allclose(seen[0], [5, 0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(seen[1], [0, 1, 0, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(seen[2], [0, 0, 2, np.pi], atol=1e-12)
+
+
+@given(st.floats(-50, 50))
+def test_wrapped_angles_point_the_same_way_and_lie_in_the_half_open_circle(angle: float) -> None:
+    wrapped = float(wrap_angle(angle))
+    assert -np.pi <= wrapped <= np.pi
+    assert np.cos(wrapped) == pytest.approx(np.cos(angle), abs=1e-9)
+    assert np.sin(wrapped) == pytest.approx(np.sin(angle), abs=1e-9)
+
+
+def test_half_a_turn_is_plus_pi() -> None:
+    np.testing.assert_allclose(wrap_angle([np.pi, -np.pi]), [np.pi, np.pi])
+
+
+def test_checked_arrays_are_read_only_copies() -> None:
+    mine = np.zeros((64, 4), np.float64)
+    checked = check_trajectory(mine)
+    mine[0] = 1
+    assert checked.dtype == np.float32
+    assert not checked.any()
+    with pytest.raises(ValueError, match="read-only"):
+        checked[0] = 1
+
+
+def test_what_is_no_history_trajectory_or_route_is_refused() -> None:
+    history = np.zeros((16, 4))
+    with pytest.raises(GeometryError, match=r"history must have shape \[16, 4\], got \[15, 4\]"):
+        check_history(history[1:])
+    with pytest.raises(GeometryError, match="not finite"):
+        check_history(np.where(np.arange(64).reshape(16, 4) == 5, np.nan, 0.0))
+    with pytest.raises(GeometryError, match="present pose"):
+        check_history(history + np.array([0.1, 0, 0, 0]))
+    with pytest.raises(GeometryError, match=r"beyond ±1000"):
+        check_trajectory(np.full((64, 4), 1e4))
+    with pytest.raises(GeometryError, match=r"route must have shape \[20, 2\]"):
+        check_route(np.zeros((20, 3)))
