@@ -1,0 +1,73 @@
+"""The card of a checkpoint folder: ``looktwice.json``, for people and tools."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from model.network.settings import VlaSettings
+
+CARD_FILE: Final = "looktwice.json"
+CARD_VERSION: Final = 1
+
+
+class CheckpointError(ValueError):
+    """A folder that is not a usable checkpoint; the text says what is missing."""
+
+
+def write_card(folder: Path, settings: VlaSettings, parameters: int, details: Mapping[str, Any]) -> None:
+    """Write the card of a folder whose weights are there already."""
+    card = {
+        "version": CARD_VERSION,
+        "name": settings.name,
+        "revision": weights_revision(folder),
+        "formats": list(settings.formats),
+        "cameras": list(settings.cameras),
+        "image_size": [settings.image_width, settings.image_height],
+        "parameters": parameters,
+        "details": dict(details),
+    }
+    (folder / CARD_FILE).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+
+
+def read_card(folder: Path) -> dict[str, Any]:
+    """The card of a folder, with at least ``name``, ``revision`` and ``details``.
+
+    Raises:
+        CheckpointError: missing, damaged or of another version.
+    """
+    path = folder / CARD_FILE
+    if not path.is_file():
+        raise CheckpointError(f"{folder} is not a LookTwice checkpoint: it has no {CARD_FILE}")
+    try:
+        card: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"{path} is damaged: {error}") from error
+    if card.get("version") != CARD_VERSION:
+        raise CheckpointError(
+            f"{path} has version {card.get('version')}; this LookTwice reads version {CARD_VERSION}"
+        )
+    if missing := {"name", "revision", "details"} - card.keys():
+        raise CheckpointError(f"{path} lacks {', '.join(sorted(missing))}")
+    return card
+
+
+def weight_files(folder: Path) -> list[Path]:
+    """The files with a folder's weights, one or several shards; raises `CheckpointError` for none."""
+    files = sorted(folder.glob("model*.safetensors"))
+    if not files:
+        raise CheckpointError(f"{folder} has no model.safetensors")
+    return files
+
+
+def weights_revision(folder: Path) -> str:
+    """12 hexadecimal digits that change with the weights: SHA-256 over all weight files."""
+    digest = hashlib.sha256()
+    for path in weight_files(folder):
+        with path.open("rb") as file:
+            while block := file.read(1 << 22):
+                digest.update(block)
+    return digest.hexdigest()[:12]

@@ -1,0 +1,280 @@
+"""Checkpoint folders in Hugging Face layout: create, save, load, expand a stock Qwen2.5-VL.
+
+A folder holds ``config.json``, tokenizer files, ``model.safetensors`` (or shards), the trajectory codec and
+``looktwice.json``, a small card for people and tools.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from transformers import AutoTokenizer, Qwen2_5_VLConfig
+from transformers.utils import logging as transformers_logging
+
+from model.engines.engine import ModelCard
+from model.network.card import CheckpointError, read_card, weight_files, write_card
+from model.network.codec import CodecError, TrajectoryCodec
+from model.network.inputs import InputBuilder
+from model.network.settings import CONFIG_KEY, SettingsError, VlaSettings
+from model.network.vla import LookTwiceVla, VlaConfig, nano_config, padded_size, parameters_of, with_settings
+from model.network.vocabulary import Vocabulary, VocabularyError, expand_tokenizer
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """A checkpoint in memory.
+
+    Attributes:
+        model: the network, in evaluation mode.
+        vocabulary: its tokenizer.
+        codec: its trajectory codec.
+        inputs: builds its inputs.
+        card: what it is, for people; ``engine`` is ``torch``.
+    """
+
+    model: LookTwiceVla
+    vocabulary: Vocabulary
+    codec: TrajectoryCodec
+    inputs: InputBuilder
+    card: ModelCard
+
+    @property
+    def settings(self) -> VlaSettings:
+        """Cameras, sizes and formats."""
+        return self.inputs.settings
+
+
+def create_nano(
+    folder: Path,
+    codec: TrajectoryCodec,
+    vocabulary: Vocabulary,
+    seed: int = 0,
+    settings: VlaSettings | None = None,
+) -> None:
+    """Write an untrained nano checkpoint; ``seed`` decides its weights.
+
+    Raises:
+        CheckpointError: codec and vocabulary have different numbers of codes.
+    """
+    _check_sizes(codec, vocabulary)
+    config = nano_config(vocabulary, settings)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        model = LookTwiceVla(config)
+        write_code_embeddings(model, codec, vocabulary)
+    save(folder, model, vocabulary, codec)
+
+
+def save(
+    folder: Path,
+    model: LookTwiceVla,
+    vocabulary: Vocabulary,
+    codec: TrajectoryCodec,
+    *,
+    dtype: torch.dtype | None = None,
+    details: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a checkpoint folder.
+
+    Args:
+        folder: made when missing; files of an earlier save are replaced.
+        model, vocabulary, codec: its parts.
+        dtype: of the stored weights; None keeps the model's. bfloat16 halves the file.
+        details: anything worth showing on the card, JSON-like (recipe, steps, figures).
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    state = model.state_dict()
+    if dtype is not None:
+        state = {
+            name: value.to(dtype) if value.is_floating_point() else value for name, value in state.items()
+        }
+    before = model.config.dtype
+    model.config.dtype = dtype or before
+    try:
+        with _without_progress_bars():
+            model.save_pretrained(folder, state_dict=state)
+    finally:
+        model.config.dtype = before
+    vocabulary.tokenizer.save_pretrained(folder)
+    codec.save(folder)
+    write_card(folder, model.settings, parameters_of(model), details or {})
+
+
+def load(folder: Path, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Loaded:
+    """Read a checkpoint folder; nothing is downloaded.
+
+    Raises:
+        CheckpointError: the folder or one of its parts is missing or does not fit; says which.
+    """
+    card = read_card(folder)
+    config = _read_config(folder)
+    try:
+        vocabulary = Vocabulary(AutoTokenizer.from_pretrained(folder, local_files_only=True))
+        codec = TrajectoryCodec.load(folder)
+        settings = VlaSettings.from_dict(_own_settings(config))
+    except (VocabularyError, CodecError, SettingsError) as error:
+        raise CheckpointError(f"{folder}: {error}") from error
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{folder}: its tokenizer cannot be loaded: {error}") from error
+    _check_sizes(codec, vocabulary)
+    model = _load_model(folder, config, dtype)
+    model.eval()
+    network: Any = model
+    return Loaded(
+        model=network.to(device),
+        vocabulary=vocabulary,
+        codec=codec,
+        inputs=InputBuilder(vocabulary, settings),
+        card=ModelCard(
+            name=card["name"],
+            revision=card["revision"],
+            engine="torch",
+            formats=settings.formats,
+            cameras=settings.cameras,
+            image_size=(settings.image_width, settings.image_height),
+            parameters=parameters_of(model),
+            details=card["details"],
+        ),
+    )
+
+
+def expand_stock(
+    source: Path,
+    target: Path,
+    codec: TrajectoryCodec,
+    settings: VlaSettings,
+    *,
+    seed: int = 0,
+    dtype: torch.dtype = torch.bfloat16,
+) -> None:
+    """Turn a stock Qwen2.5-VL checkpoint folder into a LookTwice checkpoint, ready to be trained.
+
+    Markers and codes are added to its tokenizer, embeddings grow where its spare rows do not suffice, and
+    the encoders start at random. Pictures' patch sizes follow the stock configuration.
+
+    Args:
+        source: a folder as Qwen publishes it.
+        target: where the new checkpoint goes; not ``source``.
+        codec: decides the number of codes.
+        settings: name, cameras, picture size, formats; what must agree with the backbone is overwritten.
+        seed: of the new weights.
+        dtype: of the stored weights.
+
+    Raises:
+        CheckpointError: ``source`` is no Qwen2.5-VL checkpoint; says what is missing.
+    """
+    if source.resolve() == target.resolve():
+        raise CheckpointError("the expanded checkpoint must go to another folder than the stock one")
+    config = _read_config(source)
+    vision = config.vision_config
+    try:
+        tokenizer = AutoTokenizer.from_pretrained(source, local_files_only=True)
+        expand_tokenizer(tokenizer, codec.size)
+        vocabulary = Vocabulary(tokenizer)
+        fitted = replace(
+            settings,
+            codec_size=codec.size,
+            patch_size=vision.patch_size,
+            temporal_patch_size=vision.temporal_patch_size,
+            spatial_merge_size=vision.spatial_merge_size,
+            tokens_per_second=vision.tokens_per_second,
+        )
+    except (VocabularyError, SettingsError) as error:
+        raise CheckpointError(f"{source}: {error}") from error
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{source}: its tokenizer cannot be loaded: {error}") from error
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        model = _load_model(source, with_settings(config, fitted, vocabulary), dtype, new_encoders=True)
+        rows = max(padded_size(vocabulary), config.text_config.vocab_size)
+        model.resize_token_embeddings(rows, mean_resizing=False)
+        write_code_embeddings(model, codec, vocabulary)
+    save(target, model, vocabulary, codec, details={"expanded_from": source.name})
+
+
+@torch.no_grad()
+def write_code_embeddings(model: LookTwiceVla, codec: TrajectoryCodec, vocabulary: Vocabulary) -> None:
+    """Set the embeddings of trajectory codes from the codebook, so that near codes begin near.
+
+    A random projection of the code's vector, scaled per stage to the spread of the embeddings that are
+    there; each stage has a direction of its own besides. Draws from torch's global random state.
+    """
+    network: Any = model
+    for layer in (network.get_input_embeddings(), network.get_output_embeddings()):
+        weight = layer.weight
+        spread = float(weight[: vocabulary.code_ids(0).start].float().std())
+        vectors = torch.from_numpy(codec.code_vectors())
+        projection = torch.randn(vectors.shape[-1], weight.shape[1])
+        for stage, words in enumerate(vectors):
+            projected = words @ projection
+            scaled = projected / projected.std().clamp_min(1e-6) + 0.5 * torch.randn(weight.shape[1])
+            ids = vocabulary.code_ids(stage)
+            weight[ids.start : ids.stop] = (spread * scaled / scaled.std()).to(weight.dtype)
+
+
+def _read_config(folder: Path) -> VlaConfig:
+    path = folder / "config.json"
+    if not path.is_file():
+        raise CheckpointError(f"{folder} has no config.json")
+    try:
+        kind = json.loads(path.read_text(encoding="utf-8")).get("model_type")
+        if kind != Qwen2_5_VLConfig.model_type:
+            raise CheckpointError(f"{path} describes a {kind!r} model, not {Qwen2_5_VLConfig.model_type!r}")
+        return Qwen2_5_VLConfig.from_pretrained(folder, local_files_only=True)
+    except (json.JSONDecodeError, OSError) as error:
+        raise CheckpointError(f"{path} is damaged: {error}") from error
+
+
+def _own_settings(config: VlaConfig) -> dict[str, Any]:
+    extra = getattr(config, CONFIG_KEY, None)
+    if not isinstance(extra, dict):
+        raise SettingsError(f"its config.json has no {CONFIG_KEY!r}: expand a stock checkpoint first")
+    return {key: value for key, value in extra.items() if not key.endswith("_token_id")}
+
+
+def _load_model(
+    folder: Path, config: VlaConfig, dtype: torch.dtype, *, new_encoders: bool = False
+) -> LookTwiceVla:
+    weight_files(folder)
+    try:
+        with _without_progress_bars():
+            loader: Any = LookTwiceVla
+            model, report = loader.from_pretrained(
+                folder, config=config, dtype=dtype, local_files_only=True, output_loading_info=True
+            )
+    except (OSError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f"{folder}: its weights cannot be loaded: {error}") from error
+    absent = [
+        name
+        for name in sorted(report["missing_keys"])
+        if not (new_encoders and name.startswith(("history_encoder.", "route_encoder.")))
+    ]
+    if absent:
+        raise CheckpointError(f"{folder}: its weights lack {', '.join(absent[:5])} ({len(absent)} in all)")
+    return cast("LookTwiceVla", model)
+
+
+@contextlib.contextmanager
+def _without_progress_bars() -> Iterator[None]:
+    """A service's log is no place for them."""
+    logging: Any = transformers_logging
+    shown = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        if shown:
+            logging.enable_progress_bar()
+
+
+def _check_sizes(codec: TrajectoryCodec, vocabulary: Vocabulary) -> None:
+    if codec.size != vocabulary.codec_size:
+        raise CheckpointError(
+            f"the codec has {codec.size} codes per stage, the vocabulary {vocabulary.codec_size}"
+        )

@@ -1,0 +1,142 @@
+"""A scene as the network's inputs: prompt, positions, patches, history, route."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from model.driving.images import decode_image
+from model.driving.scene import Scene
+from model.driving.trajectory import FloatArray
+from model.network.patches import normalise, patchify, resize
+from model.network.prompts import prompt_text
+from model.network.settings import VlaSettings
+from model.network.vocabulary import VIDEO_PAD, Vocabulary
+
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Prompt:
+    """What all scenes with the same format, cameras and presence of a route share.
+
+    Attributes:
+        ids: int64 [t] tokens.
+        position_ids: int64 [3, t] rotary positions (time, row, column).
+        position_offset: the rotary position of the token at place i behind the prompt is
+            i + position_offset: pictures take fewer positions than tokens.
+    """
+
+    ids: IntArray
+    position_ids: IntArray
+    position_offset: int
+
+
+@dataclass(frozen=True, eq=False)
+class ModelInputs:
+    """One scene, ready for the network.
+
+    Attributes:
+        prompt: tokens and positions.
+        patches: uint8 [p, 1176], not yet normalised (the network does it); see `pixel_values_videos`.
+        video_grid_thw: int64 [cameras, 3] slices, rows and columns of patches per clip.
+        history: float32 [16, 4].
+        route: float32 [20, 2] or None.
+    """
+
+    prompt: Prompt
+    patches: npt.NDArray[np.uint8]
+    video_grid_thw: IntArray
+    history: FloatArray
+    route: FloatArray | None
+
+    @property
+    def pixel_values_videos(self) -> npt.NDArray[np.float32]:
+        """The patches normalised, as Qwen2.5-VL's processor gives them: float32 [p, 1176]."""
+        return normalise(self.patches)
+
+
+class InputBuilder:
+    """Builds inputs for one checkpoint. Safe to use from several threads."""
+
+    def __init__(self, vocabulary: Vocabulary, settings: VlaSettings) -> None:
+        self._vocabulary = vocabulary
+        self.settings = settings
+        self._prompts: dict[tuple[str, bool], Prompt] = {}
+
+    @property
+    def video_grid_thw(self) -> IntArray:
+        """int64 [cameras, 3]."""
+        return np.array([self.settings.grid] * len(self.settings.cameras), np.int64)
+
+    def build(self, scene: Scene, format: str) -> ModelInputs:
+        """The inputs of ``scene`` for a response in ``format``.
+
+        Raises:
+            SceneError: a camera is missing.
+            ImageError: a picture cannot be decoded.
+            PromptError: an unknown format.
+        """
+        route = scene.route if self.settings.with_route else None
+        return ModelInputs(
+            prompt=self.prompt(format, route=route is not None),
+            patches=patchify(self.frames(scene), self.settings),
+            video_grid_thw=self.video_grid_thw,
+            history=scene.history,
+            route=route,
+        )
+
+    def frames(self, scene: Scene) -> npt.NDArray[np.uint8]:
+        """The pictures of the checkpoint's cameras, uint8 [cameras x 4, h, w, 3], camera by camera."""
+        return np.stack(
+            [
+                resize(decode_image(image), self.settings)
+                for camera in self.settings.cameras
+                for image in scene.clip(camera).images
+            ]
+        )
+
+    def prompt(self, format: str, *, route: bool) -> Prompt:
+        """The prompt of a format; raises `PromptError` for an unknown one."""
+        key = (format, route)
+        if key not in self._prompts:
+            settings = self.settings
+            text = prompt_text(format, settings.cameras, settings.clip_tokens, route=route)
+            ids = np.array(self._vocabulary.encode(text), np.int64)
+            positions = rotary_positions(ids == self._vocabulary.id_of(VIDEO_PAD), settings)
+            self._prompts[key] = Prompt(ids, positions, int(positions.max()) + 1 - len(ids))
+        return self._prompts[key]
+
+
+def rotary_positions(is_video: npt.NDArray[np.bool_], settings: VlaSettings) -> IntArray:
+    """Rotary positions int64 [3, t] of a sequence whose video placeholders are marked.
+
+    Text counts on in all three rows; a clip's tokens count slices (spaced by real time), rows and
+    columns from its beginning, and the text behind goes on after its larger side
+    (transformers, `Qwen2_5_VLModel.get_rope_index`).
+
+    Raises:
+        ValueError: the placeholders are not whole clips.
+    """
+    slices, rows, columns = settings.grid
+    merge = settings.spatial_merge_size
+    spacing = settings.tokens_per_second * settings.seconds_per_slice
+    time = (np.arange(slices) * spacing).astype(np.int64)
+    clip = np.stack(
+        np.meshgrid(time, np.arange(rows // merge), np.arange(columns // merge), indexing="ij")
+    ).reshape(3, -1)
+    positions = np.zeros((3, len(is_video)), np.int64)
+    place, now = 0, 0
+    while place < len(is_video):
+        if not is_video[place]:
+            positions[:, place] = now
+            place, now = place + 1, now + 1
+            continue
+        end = place + settings.clip_tokens
+        if not is_video[place:end].all() or len(is_video) < end:
+            raise ValueError(f"a clip must have {settings.clip_tokens} placeholders in a row")
+        positions[:, place:end] = clip + now
+        place, now = end, now + max(rows, columns) // merge
+    return positions

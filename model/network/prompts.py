@@ -1,0 +1,62 @@
+"""The text around the pictures: Qwen's chat layout, our own words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from model.network.vocabulary import (
+    HISTORY,
+    HISTORY_END,
+    HISTORY_START,
+    IM_END,
+    IM_START,
+    ROUTE,
+    ROUTE_END,
+    ROUTE_START,
+    VIDEO_PAD,
+    VISION_END,
+    VISION_START,
+)
+
+TASKS: Final = {
+    "cf_vla": "Propose meta-actions; only if they are wrong, reflect and correct them. Then give the "
+    "trajectory.",
+    "traj_only": "Give the trajectory.",
+}
+"""What is asked for, by response format."""
+
+_SYSTEM: Final = "You plan how this car drives."
+
+
+class PromptError(ValueError):
+    """No prompt is known for a response format."""
+
+
+def prompt_text(format: str, cameras: Sequence[str], clip_tokens: int, *, route: bool) -> str:
+    """The whole prompt, placeholders included, up to where the response begins.
+
+    What all scenes share comes first and the history after the pictures, so that caches of common
+    beginnings hold as long as possible.
+
+    Args:
+        format: the response format's name; it decides the task.
+        cameras: in this order.
+        clip_tokens: placeholders per clip.
+        route: whether the scene has a route.
+
+    Raises:
+        PromptError: ``format`` has no task.
+    """
+    if format not in TASKS:
+        raise PromptError(f"no prompt is known for format {format!r}; known are {', '.join(TASKS)}")
+    clips = "".join(f"{camera}:{VISION_START}{VIDEO_PAD * clip_tokens}{VISION_END}\n" for camera in cameras)
+    way = f"route:{ROUTE_START}{ROUTE}{ROUTE_END}\n" if route else ""
+    return (
+        f"{IM_START}system\n{_SYSTEM}{IM_END}\n"
+        f"{IM_START}user\n{TASKS[format]}\n"
+        f"{clips}"
+        f"history:{HISTORY_START}{HISTORY}{HISTORY_END}\n"
+        f"{way}"
+        f"{IM_END}\n{IM_START}assistant\n"
+    )

@@ -1,0 +1,94 @@
+"""What a LookTwice checkpoint knows beyond its backbone: cameras, picture size, formats, codec size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+from model.driving.scene import CAMERAS, CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE
+
+CONFIG_KEY: Final = "looktwice"
+"""Where these settings lie in a checkpoint's ``config.json``."""
+
+
+class SettingsError(ValueError):
+    """Settings that do not fit together; the text says which."""
+
+
+@dataclass(frozen=True)
+class VlaSettings:
+    """Our part of a checkpoint's configuration.
+
+    Attributes:
+        name: the checkpoint's name, shown to users.
+        formats: response formats it was trained on.
+        cameras: cameras it looks at, in the order of the prompt.
+        image_width, image_height: pixels that pictures are resized to; multiples of a merged patch.
+        codec_size: trajectory codes per stage.
+        with_route: whether it has a route encoder.
+        patch_size, temporal_patch_size, spatial_merge_size, tokens_per_second: as in the backbone's
+            vision configuration.
+    """
+
+    name: str = "looktwice-nano"
+    formats: tuple[str, ...] = ("cf_vla", "traj_only")
+    cameras: tuple[str, ...] = (FRONT_WIDE, FRONT_TELE)
+    image_width: int = 224
+    image_height: int = 112
+    codec_size: int = 512
+    with_route: bool = True
+    patch_size: int = 14
+    temporal_patch_size: int = 2
+    spatial_merge_size: int = 2
+    tokens_per_second: int = 4
+
+    def __post_init__(self) -> None:
+        merged = self.patch_size * self.spatial_merge_size
+        if self.image_width % merged or self.image_height % merged:
+            raise SettingsError(
+                f"image size {self.image_width}x{self.image_height} must be a multiple of {merged} pixels"
+            )
+        if CLIP_FRAMES % self.temporal_patch_size:
+            raise SettingsError(f"temporal_patch_size {self.temporal_patch_size} must divide {CLIP_FRAMES}")
+        if unknown := [camera for camera in self.cameras if camera not in CAMERAS]:
+            raise SettingsError(f"unknown camera {', '.join(unknown)}; known are {', '.join(CAMERAS)}")
+        if not self.cameras or not self.formats:
+            raise SettingsError("a checkpoint needs at least one camera and one response format")
+
+    @property
+    def grid(self) -> tuple[int, int, int]:
+        """Time slices, rows and columns of patches of one clip."""
+        return (
+            CLIP_FRAMES // self.temporal_patch_size,
+            self.image_height // self.patch_size,
+            self.image_width // self.patch_size,
+        )
+
+    @property
+    def clip_tokens(self) -> int:
+        """Vision tokens of one clip."""
+        slices, rows, columns = self.grid
+        return slices * rows * columns // self.spatial_merge_size**2
+
+    @property
+    def seconds_per_slice(self) -> float:
+        """Seconds from one time slice of a clip to the next (1.0 with pairs of frames at 2 Hz)."""
+        return CLIP_PERIOD_S * self.temporal_patch_size
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like form for ``config.json``."""
+        return {
+            key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> VlaSettings:
+        """The inverse of `to_dict`; raises `SettingsError` for unknown or unfitting entries."""
+        try:
+            fields: dict[str, Any] = {
+                key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
+            }
+            return cls(**fields)
+        except TypeError as error:
+            raise SettingsError(f"not LookTwice settings: {error}") from error

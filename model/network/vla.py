@@ -1,0 +1,255 @@
+"""The network: `transformers`' Qwen2.5-VL, unchanged, with continuous tokens for history and route.
+
+A checkpoint is a Qwen2.5-VL checkpoint (same model type, same names of weights) with two small encoders
+more and our settings under ``looktwice`` in its configuration; ``architectures`` names this class, by
+which other engines find their own implementation.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
+
+from model.network.encoders import HistoryEncoder, RouteEncoder
+from model.network.inputs import ModelInputs, rotary_positions
+from model.network.patches import normalisation
+from model.network.settings import CONFIG_KEY, VlaSettings
+from model.network.vision import attends_to_whole_pictures, encode_pictures
+from model.network.vocabulary import (
+    END_OF_TEXT,
+    HISTORY,
+    IM_END,
+    IMAGE_PAD,
+    ROUTE,
+    VIDEO_PAD,
+    VISION_END,
+    VISION_START,
+    Vocabulary,
+)
+
+VlaConfig = Any
+"""`Qwen2_5_VLConfig`, with our settings as its attribute ``looktwice``; typed loosely, as its parts are
+declared as dictionaries that they never are."""
+
+_VOCABULARY_MULTIPLE = 64
+"""Rows of the embedding are padded to this, for fast matrix products."""
+
+
+class PromptEmbeddings(NamedTuple):
+    """A prompt ready for the decoder.
+
+    Attributes:
+        embeddings: [t, hidden].
+        position_ids: int64 [3, t] rotary positions.
+        position_offset: a token's rotary position behind the prompt is its place + this offset.
+    """
+
+    embeddings: Tensor
+    position_ids: Tensor
+    position_offset: int
+
+
+class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyped-call]
+    """Qwen2.5-VL whose embeddings at the history's and the route's token come from encoders."""
+
+    def __init__(self, config: VlaConfig) -> None:
+        super().__init__(config)
+        extra = dict(getattr(config, CONFIG_KEY))
+        self.history_token_id: int = extra.pop("history_token_id")
+        self.route_token_id: int = extra.pop("route_token_id")
+        self.settings = VlaSettings.from_dict(extra)
+        hidden_size = config.text_config.hidden_size
+        self.history_encoder = HistoryEncoder(hidden_size)
+        self.route_encoder = RouteEncoder(hidden_size) if self.settings.with_route else None
+        self._fast_vision = attends_to_whole_pictures(config.vision_config)
+        self.post_init()  # type: ignore[no-untyped-call]
+
+    def vision(self, patches: Tensor, grid_thw: Tensor) -> Tensor:
+        """Vision tokens [k, hidden] of clips, one after the other; independent of each other.
+
+        Args:
+            patches: [p, 1176], normalised floats as Qwen2.5-VL's processor makes them, or uint8, which
+                are normalised here (a quarter of the memory to move).
+            grid_thw: int64 [clips, 3], slices, rows, columns of patches.
+        """
+        if patches.dtype == torch.uint8:
+            scale, shift = (
+                torch.from_numpy(part).to(patches.device) for part in normalisation(patches.shape[1])
+            )
+            patches = patches.float() * scale + shift
+        visual = self.model.visual
+        grids = set(map(tuple, grid_thw.tolist()))
+        if self._fast_vision and len(grids) == 1 and not visual.gradient_checkpointing:
+            _, rows, columns = grids.pop()
+            return encode_pictures(visual, patches, rows, columns)
+        features = self.model.get_video_features(patches, grid_thw, return_dict=True).pooler_output
+        return torch.cat(tuple(features), dim=0)
+
+    def embed(
+        self,
+        input_ids: Tensor,
+        vision_tokens: Tensor | None = None,
+        history: Tensor | None = None,
+        route: Tensor | None = None,
+    ) -> Tensor:
+        """Input embeddings [b, t, hidden] with pictures, histories and routes in their places.
+
+        Args:
+            input_ids: int64 [b, t].
+            vision_tokens: [k, hidden] from `vision`, for the k video placeholders of the batch in order.
+            history: [b, 16, 4].
+            route: [b, 20, 2]; rows whose prompt has no route token are ignored.
+        """
+        embeddings: Tensor = self.get_input_embeddings()(input_ids)
+        if vision_tokens is not None:
+            here = (input_ids == self.config.video_token_id)[..., None]
+            embeddings = embeddings.masked_scatter(here, vision_tokens.to(embeddings.dtype))
+        for token_id, encoder, values in (
+            (self.history_token_id, self.history_encoder, history),
+            (self.route_token_id, self.route_encoder, route),
+        ):
+            if values is not None and encoder is not None:
+                here = (input_ids == token_id)[..., None]
+                embeddings = torch.where(here, encoder(values)[:, None].to(embeddings.dtype), embeddings)
+        return embeddings
+
+    def encode_prompt_embeddings(
+        self, inputs: ModelInputs, vision_tokens: Tensor | None = None
+    ) -> PromptEmbeddings:
+        """One scene's prompt, ready to be prefilled; ``vision_tokens`` from a cache save the tower."""
+        device = self.device
+        if vision_tokens is None:
+            vision_tokens = self.vision(
+                torch.from_numpy(inputs.patches).to(device), torch.from_numpy(inputs.video_grid_thw)
+            )
+        embeddings = self.embed(
+            torch.from_numpy(inputs.prompt.ids).to(device)[None],
+            vision_tokens,
+            _tensor(inputs.history, device)[None],
+            None if inputs.route is None else _tensor(inputs.route, device)[None],
+        )
+        positions = torch.from_numpy(inputs.prompt.position_ids).to(device)
+        return PromptEmbeddings(embeddings[0], positions, inputs.prompt.position_offset)
+
+    def position_ids(self, input_ids: Tensor, attention_mask: Tensor | None = None) -> Tensor:
+        """Rotary positions int64 [3, b, t] of whole sequences; zeros where the mask is 0."""
+        ids = input_ids.cpu().numpy()
+        mask = np.ones_like(ids, np.bool_) if attention_mask is None else attention_mask.cpu().numpy() > 0
+        positions = np.zeros((3, *ids.shape), np.int64)
+        for row in range(len(ids)):
+            is_video = ids[row][mask[row]] == self.config.video_token_id
+            positions[:, row, mask[row]] = rotary_positions(is_video, self.settings)
+        return torch.from_numpy(positions).to(input_ids.device)
+
+    def forward(
+        self,
+        input_ids: Tensor | None = None,
+        attention_mask: Tensor | None = None,
+        position_ids: Tensor | None = None,
+        past_key_values: Any = None,
+        inputs_embeds: Tensor | None = None,
+        labels: Tensor | None = None,
+        pixel_values_videos: Tensor | None = None,
+        video_grid_thw: Tensor | None = None,
+        history: Tensor | None = None,
+        route: Tensor | None = None,
+        **kwargs: Any,
+    ) -> Any:
+        """As Qwen2.5-VL's, with ``history`` [b, 16, 4] and ``route`` [b, 20, 2] for their tokens.
+
+        ``position_ids`` [3, b, t] are worked out here for whole sequences when they are not given.
+        """
+        if input_ids is not None and inputs_embeds is None:
+            tokens = None
+            if pixel_values_videos is not None:
+                assert video_grid_thw is not None, "pixel_values_videos need video_grid_thw"
+                tokens = self.vision(pixel_values_videos, video_grid_thw)
+            inputs_embeds = self.embed(input_ids, tokens, history, route)
+            if position_ids is None and (past_key_values is None or not past_key_values.get_seq_length()):
+                position_ids = self.position_ids(input_ids, attention_mask)
+        kwargs.pop("mm_token_type_ids", None)
+        return super().forward(
+            attention_mask=attention_mask,
+            position_ids=position_ids,
+            past_key_values=past_key_values,
+            inputs_embeds=inputs_embeds,
+            labels=labels,
+            **kwargs,
+        )
+
+
+def _tensor(array: np.ndarray[Any, Any], device: torch.device) -> Tensor:
+    # A copy: arrays of scenes are read-only, which torch warns about.
+    return torch.tensor(array, device=device)
+
+
+def with_settings(config: VlaConfig, settings: VlaSettings, vocabulary: Vocabulary) -> VlaConfig:
+    """``config`` (changed in place) with our settings and this vocabulary's ids and size."""
+    setattr(
+        config,
+        CONFIG_KEY,
+        settings.to_dict()
+        | {"history_token_id": vocabulary.id_of(HISTORY), "route_token_id": vocabulary.id_of(ROUTE)},
+    )
+    config.architectures = [LookTwiceVla.__name__]
+    config.image_token_id = vocabulary.id_of(IMAGE_PAD)
+    config.video_token_id = vocabulary.id_of(VIDEO_PAD)
+    config.vision_start_token_id = vocabulary.id_of(VISION_START)
+    config.vision_end_token_id = vocabulary.id_of(VISION_END)
+    config.text_config.bos_token_id = vocabulary.id_of(END_OF_TEXT)
+    config.text_config.eos_token_id = vocabulary.id_of(IM_END)
+    config.text_config.pad_token_id = vocabulary.id_of(END_OF_TEXT)
+    return config
+
+
+def padded_size(vocabulary: Vocabulary) -> int:
+    """Embedding rows for a vocabulary: its length rounded up."""
+    return -(-len(vocabulary) // _VOCABULARY_MULTIPLE) * _VOCABULARY_MULTIPLE
+
+
+def nano_config(vocabulary: Vocabulary, settings: VlaSettings | None = None) -> VlaConfig:
+    """The configuration of the small model that is trained from scratch and shipped."""
+    settings = settings or VlaSettings(codec_size=vocabulary.codec_size)
+    hidden_size, depth = 256, 4
+    config = Qwen2_5_VLConfig(
+        text_config={
+            "vocab_size": padded_size(vocabulary),
+            "hidden_size": hidden_size,
+            "intermediate_size": 768,
+            "num_hidden_layers": 6,
+            "num_attention_heads": 8,
+            "num_key_value_heads": 4,
+            "bos_token_id": vocabulary.id_of(END_OF_TEXT),
+            "eos_token_id": vocabulary.id_of(IM_END),
+            "pad_token_id": vocabulary.id_of(END_OF_TEXT),
+            "max_position_embeddings": 4096,
+            "rms_norm_eps": 1e-6,
+            # Sections count pairs of a head's 32 dimensions: time, row, column.
+            "rope_parameters": {"rope_type": "default", "mrope_section": [4, 6, 6], "rope_theta": 10000.0},
+        },
+        vision_config={
+            "depth": depth,
+            "hidden_size": 192,
+            "intermediate_size": 576,
+            "num_heads": 6,
+            "out_hidden_size": hidden_size,
+            "patch_size": settings.patch_size,
+            "spatial_merge_size": settings.spatial_merge_size,
+            "temporal_patch_size": settings.temporal_patch_size,
+            "tokens_per_second": settings.tokens_per_second,
+            # Pictures are small: every block sees the whole of one.
+            "window_size": 112,
+            "fullatt_block_indexes": list(range(depth)),
+        },
+        tie_word_embeddings=True,
+    )
+    return with_settings(config, settings, vocabulary)
+
+
+def parameters_of(model: nn.Module) -> int:
+    """How many weights a network has, tied ones once."""
+    return cast("int", sum(parameter.numel() for parameter in model.parameters()))
