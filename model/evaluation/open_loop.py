@@ -1,0 +1,180 @@
+"""Open-loop results of single scenes: what n draws, or a kinematic baseline, make of a labelled scene.
+
+The measures are those of CF-VLA's table 1; `model.evaluation.table` averages them over scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from model.driving.labeller import label_plan
+from model.driving.metrics import collides, displacement_errors, leaves_road
+from model.driving.plan import Plan, plan_iou
+from model.driving.scene import EGO_LENGTH_M, LabelledScene, Tag
+from model.driving.trajectory import FloatArray, constant_turn_rate, constant_velocity
+from model.engines.engine import Draw
+
+MEASURES: Final = (
+    "min_ade_m",
+    "avg_ade_m",
+    "min_fde_m",
+    "avg_fde_m",
+    "corner_distance_m",
+    "collision_rate",
+    "off_road_rate",
+    "plan_iou_first",
+    "plan_iou_best",
+    "plan_iou_revised",
+    "output_tokens",
+    "think_rate",
+)
+"""Fields of `SceneResult` that are averaged over scenes, in the table's order."""
+
+LEAD_WITHIN_M: Final = 20.0
+LANE_HALF_WIDTH_M: Final = 1.75
+"""Half of MetaDrive's 3.5 m lanes: what is closer than this to the ego's path is in its way."""
+
+BASELINES: Final[Mapping[str, Callable[[FloatArray], FloatArray]]] = {
+    "constant velocity": constant_velocity,
+    "constant turn rate": constant_turn_rate,
+}
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """What one scene's draws are worth. A measure is None where it has no meaning.
+
+    Attributes:
+        scene_id, episode_id, tags: the scene's own.
+        lead_close: a vehicle is in the ego's way within `LEAD_WITHIN_M`.
+        min_ade_m, avg_ade_m, min_fde_m, avg_fde_m, corner_distance_m: see `DisplacementErrors`.
+        collision_rate: share of draws that meet another agent or obstacle within 5 s.
+        off_road_rate: share of draws that leave the road; None where no drivable area is known.
+        plan_iou_first: IOU of the first plan with the expert's, mean over draws; None without plans.
+        plan_iou_best: the same, best of the draws.
+        plan_iou_revised: IOU of the plan a draw ends with (the first one, where it did not reflect), mean.
+        output_tokens: tokens per draw, forced ones included.
+        think_rate: share of draws that reflected; None where the format has no branch.
+    """
+
+    scene_id: str
+    episode_id: str
+    tags: frozenset[Tag]
+    lead_close: bool
+    min_ade_m: float
+    avg_ade_m: float
+    min_fde_m: float
+    avg_fde_m: float
+    corner_distance_m: float
+    collision_rate: float
+    off_road_rate: float | None
+    plan_iou_first: float | None = None
+    plan_iou_best: float | None = None
+    plan_iou_revised: float | None = None
+    output_tokens: float | None = None
+    think_rate: float | None = None
+
+
+def expert_plan(labelled: LabelledScene) -> Plan:
+    """The plan that the expert of a labelled scene carries out."""
+    return label_plan(labelled.future, labelled.scene.history, labelled.lane_trace)
+
+
+def evaluate_trajectories(labelled: LabelledScene, trajectories: FloatArray) -> SceneResult:
+    """The result of bare trajectories [n, 64, 4]."""
+    errors = displacement_errors(trajectories, labelled.future)
+    return SceneResult(
+        scene_id=labelled.scene.scene_id,
+        episode_id=labelled.episode_id,
+        tags=labelled.tags,
+        lead_close=lead_within(labelled),
+        min_ade_m=errors.min_ade_m,
+        avg_ade_m=errors.avg_ade_m,
+        min_fde_m=errors.min_fde_m,
+        avg_fde_m=errors.avg_fde_m,
+        corner_distance_m=errors.corner_distance_m,
+        collision_rate=float(collides(trajectories, labelled.agents).mean()),
+        off_road_rate=float(leaves_road(trajectories, labelled.drivable).mean())
+        if labelled.drivable
+        else None,
+    )
+
+
+def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw]) -> SceneResult:
+    """The result of a scene's draws: trajectories, plans, tokens and thinking.
+
+    Raises:
+        ValueError: no draws.
+    """
+    if not draws:
+        raise ValueError(f"scene {labelled.scene.scene_id} has no draws to evaluate")
+    expert = expert_plan(labelled)
+    first = [_iou(draw.plan, expert) for draw in draws if draw.plan is not None]
+    last = [_iou(draw.revised_plan or draw.plan, expert) for draw in draws if draw.plan is not None]
+    branches = [draw.branch for draw in draws if draw.branch is not None]
+    return replace(
+        evaluate_trajectories(labelled, np.stack([draw.trajectory for draw in draws])),
+        plan_iou_first=_mean(first),
+        plan_iou_best=max(first, default=None),
+        plan_iou_revised=_mean(last),
+        output_tokens=_mean([float(sum(draw.tokens.values())) for draw in draws]),
+        think_rate=_mean([float(branch == "Thinking:") for branch in branches]),
+    )
+
+
+def evaluate_baselines(scenes: Iterable[LabelledScene]) -> dict[str, list[SceneResult]]:
+    """Results of each kinematic baseline (`BASELINES`), one trajectory a scene."""
+    results: dict[str, list[SceneResult]] = {name: [] for name in BASELINES}
+    for labelled in scenes:
+        for name, baseline in BASELINES.items():
+            trajectory = baseline(labelled.scene.history)
+            results[name].append(evaluate_trajectories(labelled, trajectory[None]))
+    return results
+
+
+def lead_within(labelled: LabelledScene, metres: float = LEAD_WITHIN_M) -> bool:
+    """Whether a vehicle's centre is now in the ego's way, up to ``metres`` ahead of the front bumper.
+
+    In the way is what is closer than half a lane to the line straight ahead or to the expert's path, which
+    is prolonged along its last heading, for an expert that stops behind the vehicle.
+    """
+    future = labelled.future.astype(np.float64)
+    reach_m = EGO_LENGTH_M / 2 + metres
+    beyond = np.linspace(1.0, reach_m, 64)[:, None]
+    last = future[-1]
+    path = np.concatenate(
+        [
+            np.zeros((1, 2)),
+            future[:, :2],
+            last[:2] + beyond * np.array([np.cos(last[3]), np.sin(last[3])]),
+        ]
+    )
+    for agent in labelled.agents:
+        x, y = (float(value) for value in agent.present[:2])
+        if agent.kind != "vehicle" or not EGO_LENGTH_M / 2 < x <= reach_m:  # False where absent (NaN)
+            continue
+        if min(abs(y), _distance_to_line(np.array([x, y]), path)) < LANE_HALF_WIDTH_M:
+            return True
+    return False
+
+
+def _distance_to_line(point: FloatArray, line: FloatArray) -> float:
+    """Distance of a point [2] to a polyline [k, 2]."""
+    start, step = line[:-1], np.diff(line, axis=0)
+    length_sq = np.maximum((step**2).sum(axis=1), 1e-12)
+    along = np.clip(((point - start) * step).sum(axis=1) / length_sq, 0, 1)
+    return float(np.linalg.norm(start + along[:, None] * step - point, axis=1).min())
+
+
+def _iou(plan: Plan | None, expert: Plan) -> float:
+    """IOU over the groups whose truth is known: without lanes, nobody knows whether the lane was kept."""
+    known = {group: track for group, track in (plan or Plan()).tracks() if expert.track(group) is not None}
+    return plan_iou(Plan(**known), expert)
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None

@@ -1,0 +1,176 @@
+"""Variants of an evaluation, and an engine driven through one of them."""
+
+from __future__ import annotations
+
+import asyncio
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from model.driving.scene import Clip, LabelledScene
+from model.engines.engine import (
+    Controls,
+    Draw,
+    DrawFinished,
+    Engine,
+    EngineError,
+    PlanRequest,
+    Thinking,
+)
+from model.evaluation.open_loop import SceneResult, evaluate_draws, expert_plan
+
+
+@dataclass(frozen=True)
+class Variant:
+    """How scenes are put to an engine.
+
+    Attributes:
+        name: of the row.
+        format: the response format asked for.
+        controls: of every request; the seed is varied from scene to scene, alike in all variants.
+        route: whether the scene's route is given.
+        expert_plan: the expert's plan is given as the first plan.
+        shuffled_images: scenes get the clips of scenes from other episodes: a planner that looks gets worse.
+    """
+
+    name: str
+    format: str = "cf_vla"
+    controls: Controls = field(default_factory=Controls)
+    route: bool = False
+    expert_plan: bool = False
+    shuffled_images: bool = False
+
+
+def standard_variants(
+    formats: Sequence[str], *, n: int = 6, thinking: Thinking = "adaptive"
+) -> list[Variant]:
+    """The open-loop table's rows for a checkpoint that writes ``formats``, without and with the route."""
+    controls = Controls(n=n, thinking=thinking)
+    variants = []
+    for route in (False, True):
+        suffix = " + route" if route else ""
+        if "traj_only" in formats:
+            variants.append(Variant(f"traj-only{suffix}", "traj_only", Controls(n=n), route))
+        if "cf_vla" in formats:
+            variants += [
+                Variant(f"meta-act{suffix}", "cf_vla", controls, route),
+                Variant(f"meta-act{suffix}, expert plan", "cf_vla", controls, route, expert_plan=True),
+                Variant(
+                    f"meta-act{suffix}, shuffled images", "cf_vla", controls, route, shuffled_images=True
+                ),
+            ]
+    return variants
+
+
+async def evaluate_engine(
+    engine: Engine,
+    scenes: Iterable[LabelledScene],
+    variant: Variant,
+    *,
+    concurrency: int = 16,
+    on_result: Callable[[SceneResult], None] | None = None,
+) -> list[SceneResult]:
+    """Plan for every scene and return the results in the scenes' order.
+
+    Args:
+        engine: started.
+        scenes: taken one by one, so they may be read from files as they are needed; with shuffled images
+            they are gone through twice.
+        variant: what to ask for.
+        concurrency: how many scenes are under way at once.
+        on_result: called after each scene, for progress.
+
+    Raises:
+        EngineError, RequestError: the engine's.
+        ValueError: a variant that the scenes do not allow.
+    """
+    source = iter(with_shuffled_images(scenes) if variant.shuffled_images else scenes)
+    numbered = enumerate(source)
+    one_reader = asyncio.Lock()
+    results: dict[int, SceneResult] = {}
+
+    async def work() -> None:
+        while True:
+            async with one_reader:
+                # Reading and decompressing takes a while; the engine shares this event loop.
+                item = await asyncio.to_thread(next, numbered, None)
+            if item is None:
+                return
+            index, labelled = item
+            results[index] = evaluate_draws(labelled, await _plan(engine, labelled, variant))
+            if on_result is not None:
+                on_result(results[index])
+
+    try:
+        async with asyncio.TaskGroup() as group:
+            for _ in range(concurrency):
+                group.create_task(work())
+    except ExceptionGroup as failures:
+        raise failures.exceptions[0] from None
+    return [results[index] for index in range(len(results))]
+
+
+async def _plan(engine: Engine, labelled: LabelledScene, variant: Variant) -> list[Draw]:
+    request = request_for(labelled, variant)
+    draws = [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
+    if len(draws) != request.controls.n:
+        raise EngineError(f"{request.request_id}: {len(draws)} draws came for {request.controls.n}")
+    return sorted(draws, key=lambda draw: draw.index)
+
+
+def request_for(labelled: LabelledScene, variant: Variant) -> PlanRequest:
+    """What the engine is asked for a scene (with shuffled images: one that has them already)."""
+    scene = labelled.scene
+    if variant.route and scene.route is None:
+        raise ValueError(f"{variant.name}: scene {scene.scene_id} has no route")
+    # A draw's random numbers depend on the seed alone: one seed for all scenes would give all of them the same
+    # luck. A seed from the scene's name does not, and variants still meet the same luck in the same scene.
+    seed = variant.controls.seed ^ zlib.crc32(scene.scene_id.encode())
+    return PlanRequest(
+        request_id=f"{variant.name}/{scene.scene_id}",
+        scene=scene if variant.route else replace(scene, route=None),
+        format=variant.format,
+        controls=replace(
+            variant.controls,
+            seed=seed,
+            prefill=expert_plan(labelled) if variant.expert_plan else variant.controls.prefill,
+        ),
+    )
+
+
+def with_shuffled_images(scenes: Iterable[LabelledScene], seed: int = 0) -> Iterator[LabelledScene]:
+    """Scenes whose clips come from scenes of other episodes; each scene's clips are used once.
+
+    Raises:
+        ValueError: scenes that can be gone through only once, or half of which are of one episode.
+    """
+    if isinstance(scenes, Iterator):
+        raise ValueError("shuffling needs scenes that can be gone through twice")
+    clips: list[tuple[Clip, ...]] = []
+    episodes: list[str] = []
+    for labelled in scenes:
+        clips.append(labelled.scene.clips)
+        episodes.append(labelled.episode_id)
+    for labelled, donor in zip(scenes, _donors(episodes, seed), strict=True):
+        yield replace(labelled, scene=replace(labelled.scene, clips=clips[donor]))
+
+
+def _donors(episodes: Sequence[str], seed: int) -> list[int]:
+    """A permutation that maps every place to a place of another episode.
+
+    Episodes in random order, laid end to end and moved on by the longest one's length: nobody can stay within
+    the own episode, provided that no episode is longer than half of the whole.
+    """
+    random = np.random.default_rng(seed)
+    rank = {episode: position for position, episode in enumerate(random.permutation(sorted(set(episodes))))}
+    order = sorted(random.permutation(len(episodes)).tolist(), key=lambda index: rank[episodes[index]])
+    longest = max(Counter(episodes).values(), default=0)
+    if 2 * longest > len(episodes):
+        raise ValueError("shuffling needs scenes of several episodes, none with more than half of the scenes")
+    donors = [0] * len(order)
+    for position, index in enumerate(order):
+        donors[index] = order[(position + longest) % len(order)]
+    return donors

@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.driving.plan import MetaAction, Plan, plan_iou
+from model.evaluation.open_loop import (
+    BASELINES,
+    MEASURES,
+    SceneResult,
+    evaluate_baselines,
+    evaluate_draws,
+    evaluate_trajectories,
+    expert_plan,
+    lead_within,
+)
+from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
+from tests.model.evaluation.fakes import draw_of, offset
+
+
+def test_the_measures_of_three_draws_by_hand() -> None:
+    # Road from -5.25 to 5.25, ego 1.85 wide: off the road from 4.325 m aside. A car stands 30 m ahead.
+    labelled = labelled_scene(10.0, agents=(agent(30, 3.5),))
+    draws = [draw_of(offset(labelled.future, metres), tokens=30) for metres in (0.0, 3.0, 6.0)]
+    result = evaluate_draws(labelled, draws)
+    assert result.min_ade_m == 0.0
+    assert result.avg_ade_m == pytest.approx(3.0)
+    assert result.avg_fde_m == pytest.approx(3.0)
+    assert result.corner_distance_m == 0.0
+    assert result.collision_rate == pytest.approx(1 / 3)  # 3 m aside meets the car, 0 and 6 do not
+    assert result.off_road_rate == pytest.approx(1 / 3)
+    assert result.output_tokens == 30
+    assert (result.plan_iou_first, result.think_rate) == (None, None)
+    assert result.tags == {"lead_vehicle"}
+
+
+def test_without_a_known_road_nobody_leaves_it() -> None:
+    labelled = replace(labelled_scene(), drivable=())
+    assert evaluate_trajectories(labelled, labelled.future[None]).off_road_rate is None
+
+
+def test_plans_are_measured_first_and_last() -> None:
+    labelled = labelled_scene(np.maximum(0, 10 - 2 * np.maximum(MIDDLES_S, 0)))
+    expert = expert_plan(labelled)
+    assert [action.word for action in expert.longitudinal or ()] == ["Decelerate", "Wait"]
+    wrong = replace(expert, longitudinal=(MetaAction(0, 64, "Keep Speed"),))
+    draws = [draw_of(labelled.future, wrong, revised=expert), draw_of(labelled.future, wrong, index=1)]
+    result = evaluate_draws(labelled, draws)
+    assert result.plan_iou_first == result.plan_iou_best == pytest.approx(2 / 4)  # two groups of three agree
+    assert result.plan_iou_revised == pytest.approx((1 + 2 / 4) / 2)
+    assert result.think_rate == 0.5
+    better = evaluate_draws(labelled, [draws[0], draw_of(labelled.future, expert, index=1)])
+    assert better.plan_iou_best == 1.0
+
+
+def test_where_no_lanes_are_known_a_plan_that_speaks_of_them_is_not_punished() -> None:
+    labelled = replace(labelled_scene(), lane_trace=None)
+    expert = expert_plan(labelled)
+    assert expert.lane is None
+    spoken = replace(expert, lane=(MetaAction(0, 64, "Keep Lane"),))
+    assert plan_iou(spoken, expert) < 1
+    assert evaluate_draws(labelled, [draw_of(labelled.future, spoken)]).plan_iou_first == 1.0
+
+
+def test_a_plan_without_a_group_the_expert_has_is_punished() -> None:
+    labelled = labelled_scene()
+    short = Plan(lateral=expert_plan(labelled).lateral)
+    assert evaluate_draws(labelled, [draw_of(labelled.future, short)]).plan_iou_first == pytest.approx(1 / 3)
+
+
+def test_no_draws_are_an_error() -> None:
+    with pytest.raises(ValueError, match="scene has no draws"):
+        evaluate_draws(labelled_scene(), [])
+
+
+def test_baselines_are_right_where_their_assumption_holds() -> None:
+    straight, arc = labelled_scene(10.0), labelled_scene(10.0, 0.2)
+    results = evaluate_baselines(iter([straight, arc]))
+    assert list(results) == list(BASELINES)
+    velocity, turn_rate = results.values()
+    assert velocity[0].min_ade_m < 1e-3
+    assert velocity[1].min_ade_m > 5
+    assert turn_rate[1].avg_ade_m < 1e-3
+
+
+def test_every_measure_is_a_field() -> None:
+    assert set(MEASURES) <= set(SceneResult.__dataclass_fields__)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "kind", "expected"),
+    [
+        (22.0, 0.0, "vehicle", True),
+        (22.2, 0.0, "vehicle", True),  # 2.255 m to the front bumper, 19.945 m beyond it
+        (22.4, 0.0, "vehicle", False),
+        (15.0, 1.7, "vehicle", True),
+        (15.0, 3.5, "vehicle", False),
+        (-8.0, 0.0, "vehicle", False),
+        (2.0, 0.0, "vehicle", False),
+        (15.0, 0.0, "pedestrian", False),
+        (np.nan, 0.0, "vehicle", False),
+    ],
+)
+def test_a_lead_is_a_vehicle_close_ahead_in_the_way(x: float, y: float, kind: str, expected: bool) -> None:
+    other = agent(x, y, kind="pedestrian" if kind == "pedestrian" else "vehicle")
+    assert lead_within(labelled_scene(10.0, agents=(other,))) is expected
+
+
+def test_a_lead_around_the_bend_is_in_the_experts_way() -> None:
+    # Radius 20 m: a quarter circle ends at (20, 20).
+    around = agent(np.sin(0.8) * 20, (1 - np.cos(0.8)) * 20)
+    assert lead_within(labelled_scene(8.0, 0.4, agents=(around,)))
+    assert not lead_within(labelled_scene(8.0, agents=(around,)))
+
+
+def test_a_lead_behind_which_the_expert_stops_is_in_its_way() -> None:
+    # It turns by half a radian and stops; the vehicle stands where that heading leads to.
+    turning = np.where(MIDDLES_S < 2, 0.25, 0.0)
+    stopping = np.maximum(0, 4 - 2 * np.maximum(MIDDLES_S, 0))
+    labelled = labelled_scene(stopping, turning)
+    x, y, _, heading = labelled.future[-1].tolist()
+    ahead = agent(x + 8 * np.cos(heading), y + 8 * np.sin(heading))
+    assert ahead.present[1] > 2
+    assert lead_within(replace(labelled, agents=(ahead,)))

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.driving.scene import LabelledScene
+from model.engines.engine import Controls, EngineError
+from model.evaluation.open_loop import SceneResult, expert_plan
+from model.evaluation.variants import (
+    Variant,
+    evaluate_engine,
+    request_for,
+    standard_variants,
+    with_shuffled_images,
+)
+from tests.model.driving.drives import labelled_scene
+from tests.model.evaluation.fakes import FakeEngine
+
+SCENES = [labelled_scene(8.0 + i, scene_id=f"s{i}", episode_id=f"e{i // 3}", pictures=i) for i in range(10)]
+FREE = Variant("free", controls=Controls(n=3))
+
+
+def evaluate(engine: FakeEngine, variant: Variant = FREE, concurrency: int = 4) -> list[SceneResult]:
+    return asyncio.run(evaluate_engine(engine, SCENES, variant, concurrency=concurrency))
+
+
+def test_results_come_in_the_scenes_order_and_progress_as_they_finish() -> None:
+    seen: list[SceneResult] = []
+    engine = FakeEngine()
+    results = asyncio.run(evaluate_engine(engine, iter(SCENES), FREE, concurrency=4, on_result=seen.append))
+    assert [result.scene_id for result in results] == [f"s{i}" for i in range(10)]
+    assert sorted(seen, key=lambda result: result.scene_id) == results
+    for result in results:
+        assert result.min_ade_m < 1e-3
+        assert result.avg_ade_m == pytest.approx(1.0, abs=1e-3)  # 0, 1 and 2 m aside
+
+
+def test_scenes_are_read_no_faster_than_they_are_planned_for() -> None:
+    engine = FakeEngine()
+    ahead: list[int] = []
+
+    def reading() -> Iterator[LabelledScene]:
+        for index, labelled in enumerate(SCENES):
+            ahead.append(index - len(engine.requests))
+            yield labelled
+
+    asyncio.run(evaluate_engine(engine, reading(), FREE, concurrency=3))
+    assert engine.most_under_way == 3
+    assert max(ahead) <= 3
+
+
+def test_requests_carry_what_the_variant_says() -> None:
+    labelled = SCENES[4]
+    free = request_for(labelled, FREE)
+    assert free.scene.route is None
+    assert free.controls.prefill is None
+    assert free.scene.clips == labelled.scene.clips
+    full = request_for(
+        labelled, Variant("full", "other", Controls(n=2, thinking="never"), route=True, expert_plan=True)
+    )
+    assert full.scene.route is labelled.scene.route
+    assert full.controls.prefill == expert_plan(labelled)
+    assert (full.format, full.controls.n, full.controls.thinking) == ("other", 2, "never")
+
+
+def test_chances_differ_from_scene_to_scene_and_agree_between_variants() -> None:
+    seeds = [request_for(labelled, FREE).controls.seed for labelled in SCENES]
+    assert len(set(seeds)) == len(seeds)
+    assert seeds == [request_for(labelled, Variant("other")).controls.seed for labelled in SCENES]
+    assert seeds != [
+        request_for(scene, Variant("x", controls=Controls(seed=1))).controls.seed for scene in SCENES
+    ]
+
+
+def test_a_prefilled_plan_reaches_the_results() -> None:
+    results = evaluate(FakeEngine(), Variant("prefilled", expert_plan=True))
+    assert {result.plan_iou_first for result in results} == {1.0}
+
+
+def test_a_route_that_is_missing_is_an_error() -> None:
+    bare = replace(SCENES[0], scene=replace(SCENES[0].scene, route=None))
+    with pytest.raises(ValueError, match="scene s0 has no route"):
+        request_for(bare, Variant("routed", route=True))
+
+
+def test_the_engines_error_comes_through() -> None:
+    with pytest.raises(EngineError, match="out of memory"):
+        evaluate(FakeEngine(broken=frozenset({"s3"})))
+    with pytest.raises(EngineError, match="free/s0: 2 draws came for 3"):
+        evaluate(FakeEngine(missing=1), concurrency=1)
+
+
+def test_shuffled_images_come_from_other_episodes_each_once() -> None:
+    shuffled = list(with_shuffled_images(SCENES))
+    owner = {labelled.scene.clips: labelled.episode_id for labelled in SCENES}
+    for before, after in zip(SCENES, shuffled, strict=True):
+        assert owner[after.scene.clips] != before.episode_id
+        np.testing.assert_array_equal(after.scene.history, before.scene.history)
+        np.testing.assert_array_equal(after.future, before.future)
+    assert {labelled.scene.clips for labelled in shuffled} == set(owner)
+    again = [labelled.scene.clips for labelled in with_shuffled_images(SCENES)]
+    assert again == [labelled.scene.clips for labelled in shuffled]
+    assert again != [labelled.scene.clips for labelled in with_shuffled_images(SCENES, seed=1)]
+
+
+def test_the_engine_gets_the_shuffled_images() -> None:
+    engine = FakeEngine()
+    evaluate(engine, Variant("shuffled", shuffled_images=True))
+    given = {request.scene.scene_id: request.scene.clips for request in engine.requests}
+    assert given == {
+        labelled.scene.scene_id: labelled.scene.clips for labelled in with_shuffled_images(SCENES)
+    }
+
+
+def test_images_that_cannot_be_shuffled_across_episodes_are_an_error() -> None:
+    with pytest.raises(ValueError, match="several episodes"):
+        list(with_shuffled_images(SCENES[:3]))
+    with pytest.raises(ValueError, match="gone through twice"):
+        list(with_shuffled_images(iter(SCENES)))
+
+
+def test_the_standard_rows_fit_what_a_checkpoint_writes() -> None:
+    both = standard_variants(["cf_vla", "traj_only"], n=4)
+    assert len({variant.name for variant in both}) == len(both) == 8
+    assert {variant.format for variant in standard_variants(["traj_only"])} == {"traj_only"}
+    assert all(variant.controls.n == 4 for variant in both)
+    for route in (False, True):
+        of_route = [variant for variant in both if variant.route is route]
+        assert sum(variant.expert_plan for variant in of_route) == 1
+        assert sum(variant.shuffled_images for variant in of_route) == 1
