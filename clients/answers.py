@@ -1,0 +1,158 @@
+"""What comes back from the planning service: typed results, and typed errors made from problem documents."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, TypeVar
+
+import httpx
+import numpy as np
+from pydantic import BaseModel, ValidationError
+
+from clients import wire
+from model.driving.plan import Plan, PlanError, parse_plan
+from model.driving.trajectory import FloatArray, GeometryError, check_trajectory
+
+BUSY_STATUSES: Final = (429, 503)
+_Answer = TypeVar("_Answer", bound=BaseModel)
+
+
+class PlannerError(Exception):
+    """Anything that kept a planner from getting its plan."""
+
+
+class PlannerUnreachable(PlannerError):
+    """No answer: the service is not there, or it broke the connection."""
+
+
+class PlannerTimeout(PlannerUnreachable):
+    """No answer in time."""
+
+
+class BadAnswer(PlannerError):
+    """An answer that is not of the contract: another service, or another version."""
+
+
+class PlannerProblem(PlannerError):
+    """The service answered with a problem document.
+
+    Attributes:
+        type: stable URI of the kind of problem.
+        title, detail: for people.
+        status: of the HTTP answer.
+        request_id: to find it in the service's log.
+        errors: the places in the request that are wrong.
+        retry_after_s: what the service asked to wait; None where it did not ask.
+    """
+
+    def __init__(self, problem: wire.Problem, retry_after_s: float | None = None) -> None:
+        super().__init__(f"{problem.title}: {problem.detail} (request {problem.request_id})")
+        self.type, self.title, self.detail = problem.type, problem.title, problem.detail
+        self.status, self.request_id = problem.status, problem.request_id
+        self.errors = tuple(problem.errors)
+        self.retry_after_s = retry_after_s
+
+
+class RequestRefused(PlannerProblem):
+    """A 4xx: the same request would be refused again."""
+
+
+class ServiceBusy(PlannerProblem):
+    """A 429 or 503: the same request may succeed later."""
+
+
+class ServiceFailed(PlannerProblem):
+    """A 5xx: the service is at fault."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedDraw:
+    """One of the n responses.
+
+    Attributes:
+        index: 0..n-1.
+        plan: the first plan.
+        branch: ``Action:`` or ``Thinking:``.
+        think_probability: of a second look, 0..1.
+        thinking, revised_plan: the second look; None where none was taken.
+        trajectory: float32 [64, 4]: x, y, z in m and heading in rad at 10 Hz, ego frame, first row at +0.1 s.
+        tokens: tokens per section.
+    """
+
+    index: int
+    plan: Plan | None
+    branch: wire.Branch | None
+    think_probability: float | None
+    thinking: str | None
+    revised_plan: Plan | None
+    trajectory: FloatArray
+    tokens: dict[str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanResult:
+    """What came back for one scene."""
+
+    request_id: str
+    model: wire.ModelName
+    draws: tuple[PlannedDraw, ...]
+    timing: wire.Timing
+
+
+def unreachable(error: httpx.HTTPError) -> PlannerUnreachable:
+    """The typed error for a request that got no answer."""
+    kind = PlannerTimeout if isinstance(error, httpx.TimeoutException) else PlannerUnreachable
+    return kind(f"{type(error).__name__}: {error}")
+
+
+def retry_after_s(response: httpx.Response) -> float | None:
+    """Seconds the service asks to wait; None where it does not ask."""
+    # Only seconds: the service sends no dates.
+    given = response.headers.get("Retry-After", "")
+    return float(given) if given.isdecimal() else None
+
+
+def read(response: httpx.Response, answer: type[_Answer]) -> _Answer:
+    """The body of ``response`` as ``answer``; raises `PlannerError`."""
+    if response.status_code != 200:
+        raise _problem(response)
+    try:
+        return answer.model_validate_json(response.content)
+    except ValidationError as error:
+        raise BadAnswer(f"{response.url} did not answer as the contract says: {error}") from error
+
+
+def _problem(response: httpx.Response) -> PlannerError:
+    try:
+        problem = wire.Problem.model_validate_json(response.content)
+    except ValidationError:
+        return BadAnswer(f"{response.url} answered {response.status_code} without a problem document")
+    kind: type[PlannerProblem] = ServiceFailed
+    if response.status_code in BUSY_STATUSES:
+        kind = ServiceBusy
+    elif response.status_code < 500:
+        kind = RequestRefused
+    return kind(problem, retry_after_s(response))
+
+
+def plan_result(response: httpx.Response) -> PlanResult:
+    """The typed result of POST /v1/plan; raises `PlannerError`."""
+    answered = read(response, wire.PlanResponse)
+    try:
+        draws = tuple(_draw(draw) for draw in answered.draws)
+    except (PlanError, GeometryError) as error:
+        raise BadAnswer(f"{response.url} answered with something else than a plan: {error}") from error
+    return PlanResult(answered.request_id, answered.model, draws, answered.timing)
+
+
+def _draw(draw: wire.Draw) -> PlannedDraw:
+    return PlannedDraw(
+        index=draw.index,
+        plan=None if draw.plan is None else parse_plan(draw.plan.text),
+        branch=draw.branch,
+        think_probability=draw.think_probability,
+        thinking=draw.thinking,
+        revised_plan=None if draw.revised_plan is None else parse_plan(draw.revised_plan.text),
+        trajectory=check_trajectory(np.asarray(draw.trajectory, np.float32)),
+        tokens=draw.tokens,
+    )

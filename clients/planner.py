@@ -1,0 +1,248 @@
+"""Clients of the planning service: scenes in, typed plans and trajectories out.
+
+::
+
+    with PlannerClient("http://127.0.0.1:8000") as planner:
+        result = planner.plan(scene, wire.Controls(n=6))
+        result.draws[0].trajectory  # float32 [64, 4]
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import time
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self, cast
+
+import httpx
+
+from clients import wire
+from clients.answers import (
+    BUSY_STATUSES,
+    BadAnswer,
+    PlannedDraw,
+    PlannerError,
+    PlannerProblem,
+    PlannerTimeout,
+    PlannerUnreachable,
+    PlanResult,
+    RequestRefused,
+    ServiceBusy,
+    ServiceFailed,
+    plan_result,
+    read,
+    retry_after_s,
+    unreachable,
+)
+from model.driving.plan import Plan
+from model.driving.scene import Scene
+
+__all__ = [
+    "AsyncPlannerClient",
+    "BadAnswer",
+    "Patience",
+    "PlanResult",
+    "PlannedDraw",
+    "PlannerClient",
+    "PlannerError",
+    "PlannerProblem",
+    "PlannerTimeout",
+    "PlannerUnreachable",
+    "RequestRefused",
+    "ServiceBusy",
+    "ServiceFailed",
+    "plan_request",
+]
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long a client tries.
+
+    Attributes:
+        timeout_s: for one attempt, connecting included.
+        attempts: at most, the first one included. Only 429 and 503 answers that say how long to wait are
+            tried again, and never beyond a request's own ``deadline_ms``.
+        longest_wait_s: a longer Retry-After is reported instead of waited for.
+    """
+
+    timeout_s: float = 30.0
+    attempts: int = 3
+    longest_wait_s: float = 5.0
+
+
+class PlannerClient:
+    """Blocking client; safe to share between threads, as its httpx client is."""
+
+    def __init__(
+        self, base_url: str, patience: Patience = Patience(), transport: httpx.BaseTransport | None = None
+    ) -> None:
+        self._patience = patience
+        self._http = httpx.Client(base_url=base_url, timeout=patience.timeout_s, transport=transport)
+
+    def plan(
+        self,
+        scene: Scene,
+        controls: wire.Controls = wire.Controls(),
+        *,
+        prefill: Plan | None = None,
+        format: str = "cf_vla",
+        request_id: str | None = None,
+    ) -> PlanResult:
+        """Plan for ``scene``.
+
+        Args:
+            scene: what the car sees.
+            controls: draws, thinking, sampling, deadline.
+            prefill: the first plan, to be continued instead of one the model writes.
+            format: a response format the model writes.
+            request_id: shows up in the service's log; made there when None.
+
+        Raises:
+            PlannerError: see its subclasses.
+        """
+        asked = plan_request(scene, controls, prefill=prefill, format=format)
+        answered = self._send(_plan_call(self._http, asked, request_id), controls.deadline_ms)
+        return plan_result(answered)
+
+    def models(self) -> list[wire.ModelCard]:
+        """The models behind the service; raises `PlannerError`."""
+        return read(self._send(self._http.build_request("GET", "/v1/models")), wire.ModelList).models
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _send(self, request: httpx.Request, deadline_ms: int | None = None) -> httpx.Response:
+        attempts = _Attempts(self._patience, deadline_ms)
+        while True:
+            try:
+                response = self._http.send(request)
+            except httpx.HTTPError as error:
+                raise unreachable(error) from error
+            wait_s = attempts.wait_after(response)
+            if wait_s is None:
+                return response
+            time.sleep(wait_s)
+
+
+class AsyncPlannerClient:
+    """The same for asyncio; see `PlannerClient`. Cancelling a call cancels the planning."""
+
+    def __init__(
+        self,
+        base_url: str,
+        patience: Patience = Patience(),
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self._patience = patience
+        self._http = httpx.AsyncClient(base_url=base_url, timeout=patience.timeout_s, transport=transport)
+
+    async def plan(
+        self,
+        scene: Scene,
+        controls: wire.Controls = wire.Controls(),
+        *,
+        prefill: Plan | None = None,
+        format: str = "cf_vla",
+        request_id: str | None = None,
+    ) -> PlanResult:
+        """Plan for ``scene``; see `PlannerClient.plan`."""
+        asked = plan_request(scene, controls, prefill=prefill, format=format)
+        answered = await self._send(_plan_call(self._http, asked, request_id), controls.deadline_ms)
+        return plan_result(answered)
+
+    async def models(self) -> list[wire.ModelCard]:
+        """The models behind the service; raises `PlannerError`."""
+        answered = await self._send(self._http.build_request("GET", "/v1/models"))
+        return read(answered, wire.ModelList).models
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def _send(self, request: httpx.Request, deadline_ms: int | None = None) -> httpx.Response:
+        attempts = _Attempts(self._patience, deadline_ms)
+        while True:
+            try:
+                response = await self._http.send(request)
+            except httpx.HTTPError as error:
+                raise unreachable(error) from error
+            wait_s = attempts.wait_after(response)
+            if wait_s is None:
+                return response
+            await asyncio.sleep(wait_s)
+
+
+def plan_request(
+    scene: Scene,
+    controls: wire.Controls = wire.Controls(),
+    *,
+    prefill: Plan | None = None,
+    format: str = "cf_vla",
+) -> wire.PlanRequest:
+    """The body of POST /v1/plan for ``scene``."""
+    if prefill is not None:
+        controls = controls.model_copy(update={"prefill": str(prefill)})
+    return wire.PlanRequest(
+        scene=wire.Scene(
+            scene_id=scene.scene_id,
+            clips=[
+                wire.Clip(
+                    camera=cast(wire.Camera, clip.camera),
+                    images=[base64.b64encode(image).decode() for image in clip.images],
+                )
+                for clip in scene.clips
+            ],
+            history=scene.history.tolist(),
+            route=None if scene.route is None else scene.route.tolist(),
+        ),
+        controls=controls,
+        format=format,
+    )
+
+
+class _Attempts:
+    """Decides, without waiting itself, whether and when to try again."""
+
+    def __init__(self, patience: Patience, deadline_ms: int | None) -> None:
+        self._left = patience.attempts
+        self._longest_wait_s = patience.longest_wait_s
+        self._ends = None if deadline_ms is None else time.monotonic() + deadline_ms / 1000
+
+    def wait_after(self, response: httpx.Response) -> float | None:
+        """Seconds to wait before the next attempt; None when ``response`` is the last word."""
+        self._left -= 1
+        wait_s = retry_after_s(response)
+        if response.status_code not in BUSY_STATUSES or wait_s is None or self._left <= 0:
+            return None
+        if wait_s > self._longest_wait_s or (self._ends and time.monotonic() + wait_s > self._ends):
+            return None
+        return wait_s
+
+
+def _plan_call(
+    http: httpx.Client | httpx.AsyncClient, asked: wire.PlanRequest, request_id: str | None
+) -> httpx.Request:
+    headers = {"Content-Type": "application/json"}
+    if request_id is not None:
+        headers[wire.REQUEST_ID_HEADER] = request_id
+    return http.build_request("POST", "/v1/plan", content=asked.model_dump_json(), headers=headers)

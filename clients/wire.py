@@ -1,0 +1,288 @@
+"""The public HTTP contract: what travels over the wire, as pydantic models.
+
+Ego frame at the scene's instant: x forward, y left, z up, metres; heading in radians, counter-clockwise
+positive. Requests refuse fields they do not know; answers may grow fields, so readers ignore unknown ones.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
+
+Camera = Literal[
+    "front_wide_120",
+    "front_tele_30",
+    "front_left",
+    "front",
+    "front_right",
+    "back_left",
+    "back",
+    "back_right",
+]
+Thinking = Literal["adaptive", "always", "never"]
+Branch = Literal["Action:", "Thinking:"]
+
+PROBLEM_MEDIA_TYPE: Final = "application/problem+json"
+REQUEST_ID_HEADER: Final = "X-Request-ID"
+MAX_SEED: Final = 2**53 - 1
+"""The largest integer that every JSON reader keeps exact."""
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Probability = Annotated[float, Field(ge=0, le=1)]
+Milliseconds = Annotated[float, Field(ge=0)]
+Pose = Annotated[list[Finite], Field(min_length=4, max_length=4, description="x, y, z in m, heading in rad")]
+Point = Annotated[list[Finite], Field(min_length=2, max_length=2, description="x, y in m")]
+History = Annotated[
+    list[Pose],
+    Field(
+        min_length=16,
+        max_length=16,
+        description="16 ego poses at 10 Hz, oldest first; the last one is the present, (0, 0, 0, 0).",
+    ),
+]
+Route = Annotated[
+    list[Point],
+    Field(min_length=20, max_length=20, description="20 points, one every 4 m along the way to go."),
+]
+Trajectory = Annotated[
+    list[Pose],
+    Field(min_length=64, max_length=64, description="64 future poses at 10 Hz; the first lies 0.1 s ahead."),
+]
+
+
+class Asked(BaseModel):
+    """Base of everything a caller sends: unknown fields are refused."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+
+class Answered(BaseModel):
+    """Base of everything the service sends: readers ignore fields they do not know."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="ignore")
+
+
+class Clip(Asked):
+    """Four pictures of one camera over the past 2 s."""
+
+    camera: Camera = Field(description="Which camera.")
+    images: list[str] = Field(
+        min_length=4,
+        max_length=4,
+        description="4 pictures at 2 Hz, oldest first: JPEG, PNG or WebP in base64, no data: prefix, "
+        "at most 4 megapixels each.",
+    )
+
+
+class Scene(Asked):
+    """One planning instant."""
+
+    scene_id: str = Field(default="", max_length=200, description="The caller's name for the scene.")
+    clips: list[Clip] = Field(
+        min_length=1, max_length=8, description="One clip per camera; GET /v1/models says which are needed."
+    )
+    history: History
+    route: Route | None = Field(default=None, description="The way to go, or null where it is unknown.")
+
+
+class MetaAction(Asked):
+    """One named intent over one time interval."""
+
+    start_s: Finite = Field(description="Begin in s, on the 0.1 s grid.")
+    end_s: Finite = Field(description="End in s, on the 0.1 s grid.")
+    word: str = Field(max_length=40, description="e.g. Accelerate, Left Turn, Keep Lane.")
+
+
+class Tracks(Asked):
+    """The three tracks of a plan; each one that is there covers 0.0 s to 6.4 s without gap or overlap."""
+
+    longitudinal: list[MetaAction] | None = Field(default=None, max_length=64)
+    lateral: list[MetaAction] | None = Field(default=None, max_length=64)
+    lane: list[MetaAction] | None = Field(default=None, max_length=64)
+
+
+def _form_of_plan(value: object) -> str:
+    return "text" if isinstance(value, str) else "tracks"
+
+
+PlanGiven = Annotated[
+    Annotated[str, Field(max_length=20_000), Tag("text")] | Annotated[Tracks, Tag("tracks")],
+    Discriminator(_form_of_plan),
+]
+"""A plan as bullet text or as tracks; the discriminator keeps errors to the form that was meant."""
+
+
+class Controls(Asked):
+    """What the caller decides about decoding."""
+
+    thinking: Thinking = Field(
+        default="adaptive", description="Who decides on a second look: the model, always think, never think."
+    )
+    think_threshold: Probability | None = Field(
+        default=None,
+        description="With adaptive: think exactly when the think probability exceeds it; "
+        "null samples the branch.",
+    )
+    prefill: PlanGiven | None = Field(
+        default=None,
+        description="The first plan, given instead of written by the model: bullet text, or tracks.",
+    )
+    n: int = Field(default=6, ge=1, le=64, description="Draws.")
+    temperature: float = Field(default=1.0, ge=0, le=2, description="0 takes the likeliest allowed token.")
+    top_p: float = Field(default=1.0, gt=0, le=1, description="Nucleus mass; 1 keeps all allowed tokens.")
+    seed: int = Field(
+        default=0, ge=0, le=MAX_SEED, description="The same request and seed give the same draws."
+    )
+    deadline_ms: int | None = Field(
+        default=None,
+        ge=1,
+        le=600_000,
+        description="Milliseconds until the answer must be there; null for none.",
+    )
+
+
+class PlanRequest(Asked):
+    """Body of POST /v1/plan."""
+
+    scene: Scene
+    controls: Controls = Controls()
+    format: str = Field(
+        default="cf_vla",
+        max_length=40,
+        description="Response format; GET /v1/models lists what the model writes.",
+    )
+
+
+class Plan(Answered):
+    """A plan in both its forms; either can be sent back as `prefill`."""
+
+    text: str = Field(description="The plan as bullet text.")
+    tracks: Tracks
+
+
+class Draw(Answered):
+    """One of the n responses of a scene."""
+
+    index: int = Field(ge=0, description="0..n-1.")
+    plan: Plan | None = Field(description="The first plan; null where the format has none.")
+    branch: Branch | None = Field(description="Action: (direct) or Thinking: (a second look was taken).")
+    think_probability: Probability | None = Field(description="Probability of Thinking: at the branch.")
+    thinking: str | None = Field(description="The reasoning; null without a second look.")
+    revised_plan: Plan | None = Field(description="The plan after reasoning; null without a second look.")
+    trajectory: Trajectory
+    tokens: dict[str, int] = Field(description="Tokens per section of the response.")
+
+
+class ModelName(Answered):
+    """Which weights answered."""
+
+    name: str
+    revision: str = Field(description="Changes with the weights.")
+
+
+class Timing(Answered):
+    """Where the time went, in milliseconds."""
+
+    total_ms: Milliseconds = Field(description="From the parsed body to the finished answer.")
+    checks_ms: Milliseconds = Field(description="Base64, picture headers and geometry.")
+    engine_ms: Milliseconds = Field(description="In the engine, waiting for a place in the batch included.")
+    queue_ms: Milliseconds | None = Field(
+        default=None, description="Waiting for admission; null where unmeasured."
+    )
+
+
+class PlanResponse(Answered):
+    """Answer of POST /v1/plan."""
+
+    request_id: str
+    model: ModelName
+    draws: list[Draw]
+    timing: Timing
+
+
+class ModelCard(Answered):
+    """What a loaded checkpoint is."""
+
+    name: str
+    revision: str = Field(description="Changes with the weights.")
+    engine: str = Field(description="torch or vllm.")
+    formats: list[str] = Field(description="Response formats it writes.")
+    cameras: list[str] = Field(description="Cameras it needs; a scene must have a clip of each.")
+    image_size: Annotated[list[int], Field(min_length=2, max_length=2)] = Field(
+        description="Width and height in pixels that pictures are resized to."
+    )
+    parameters: int = Field(description="How many weights.")
+    details: dict[str, Any] = Field(default_factory=dict)
+
+
+class ModelList(Answered):
+    """Answer of GET /v1/models."""
+
+    models: list[ModelCard]
+
+
+class Agent(Answered):
+    """Another road user or obstacle of a labelled scene, as an oriented box over past and future."""
+
+    agent_id: int
+    kind: str = Field(description="vehicle, pedestrian, cone or barrier.")
+    length_m: float
+    width_m: float
+    poses: list[Annotated[list[float], Field(min_length=3, max_length=3)] | None] = Field(
+        description="80 poses (x, y in m, heading in rad) at 10 Hz, row 15 is now; null where absent."
+    )
+
+
+class LabelledScene(Answered):
+    """A scene with what is known about it besides, for looking at; `scene` can be planned for as it is."""
+
+    scene: Scene
+    episode_id: str
+    seed: int
+    future: Trajectory
+    agents: list[Agent]
+    drivable: list[list[Point]] = Field(
+        description="Closed rings; a point is on the road when an odd number of rings contains it."
+    )
+    lane_lines: list[list[Point]] = Field(description="Centre lines of the lanes around.")
+    tags: list[str] = Field(description="What makes the scene difficult.")
+
+
+class SceneEntry(Answered):
+    """A line in the list of bundled scenes."""
+
+    scene_id: str
+    tags: list[str]
+
+
+class SceneList(Answered):
+    """Answer of GET /v1/scenes."""
+
+    scenes: list[SceneEntry]
+
+
+class SceneFile(Answered):
+    """Answer of POST /v1/scenes:read."""
+
+    scenes: list[LabelledScene]
+
+
+class Fault(Answered):
+    """One thing that is wrong with a request."""
+
+    pointer: str = Field(description="JSON pointer (RFC 6901) into the body.")
+    detail: str
+
+
+class Problem(Answered):
+    """A problem document (RFC 9457)."""
+
+    type: str = Field(description="Stable URI of the kind of problem.")
+    title: str
+    status: int
+    detail: str = Field(description="What is wrong here, and what to change.")
+    request_id: str
+    errors: list[Fault] = Field(
+        default_factory=list, description="Every fault found, where there are places."
+    )

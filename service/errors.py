@@ -1,0 +1,147 @@
+"""Every error of the service as a problem document (RFC 9457)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any, Final
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from clients.wire import PROBLEM_MEDIA_TYPE, Fault, Problem
+from service.problems import (
+    BODY_TOO_LARGE,
+    ENGINE_FAILED,
+    INTERNAL,
+    INVALID_CLIP,
+    INVALID_CONTROLS,
+    INVALID_HISTORY,
+    INVALID_JSON,
+    INVALID_PLAN,
+    INVALID_REQUEST,
+    INVALID_ROUTE,
+    METHOD_NOT_ALLOWED,
+    NOT_FOUND,
+    NOT_READY,
+    RETRY_AFTER_S,
+    UNKNOWN_CAMERA,
+    UNKNOWN_FIELD,
+    UNSUPPORTED_MEDIA_TYPE,
+    Kind,
+    ProblemError,
+)
+
+_MAX_FAULTS: Final = 20
+
+# The kind of a schema violation is that of the first place that fits.
+_KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], Kind]]] = (
+    (("scene", "clips"), INVALID_CLIP),
+    (("scene", "history"), INVALID_HISTORY),
+    (("scene", "route"), INVALID_ROUTE),
+    (("controls", "prefill"), INVALID_PLAN),
+    (("controls",), INVALID_CONTROLS),
+)
+_KIND_BY_STATUS: Final = {
+    kind.status: kind
+    for kind in (INVALID_JSON, NOT_FOUND, METHOD_NOT_ALLOWED, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE)
+}
+
+
+def install_error_handlers(app: FastAPI) -> None:
+    """Answer every error of ``app`` with a problem document; what is not foreseen, the middleware answers."""
+
+    @app.exception_handler(ProblemError)
+    async def _problem(request: Request, error: ProblemError) -> Response:
+        return problem_response(error, request.state.request_id)
+
+    @app.exception_handler(RequestValidationError)
+    async def _validation(request: Request, error: RequestValidationError) -> Response:
+        return problem_response(_from_validation(error), request.state.request_id)
+
+    @app.exception_handler(HTTPException)
+    async def _http(request: Request, error: HTTPException) -> Response:
+        kind = _KIND_BY_STATUS.get(error.status_code, INTERNAL)
+        problem = ProblemError(kind, _http_detail(kind, request, error))
+        return problem_response(problem, request.state.request_id, dict(error.headers or {}))
+
+
+def problem_response(error: ProblemError, request_id: str, headers: dict[str, str] | None = None) -> Response:
+    """The answer to a request that ended with ``error``."""
+    kind = error.kind
+    document = Problem(
+        type=kind.type,
+        title=kind.title,
+        status=kind.status,
+        detail=error.detail,
+        request_id=request_id,
+        errors=list(error.errors),
+    )
+    extra = dict(headers or {})
+    if kind in (NOT_READY, ENGINE_FAILED):
+        extra["Retry-After"] = str(RETRY_AFTER_S)
+    # Plain ASCII: details quote what callers sent, which need not be encodable otherwise.
+    content = json.dumps(document.model_dump(exclude_defaults=True))
+    return Response(content, kind.status, extra, media_type=PROBLEM_MEDIA_TYPE)
+
+
+def _http_detail(kind: Kind, request: Request, error: HTTPException) -> str:
+    path = request.url.path
+    if kind is METHOD_NOT_ALLOWED:
+        allowed = (error.headers or {}).get("Allow", "")
+        return f"{request.method} {path} does not exist" + (f"; allowed: {allowed}" if allowed else "")
+    if kind is NOT_FOUND:
+        return f"{path} does not exist; /openapi.json lists what does"
+    return str(error.detail)
+
+
+def _from_validation(error: RequestValidationError) -> ProblemError:
+    if isinstance(error.body, bytes):
+        return ProblemError(UNSUPPORTED_MEDIA_TYPE, "send the body as application/json")
+    found = error.errors()
+    first = found[0]
+    if first["type"] == "json_invalid":
+        return ProblemError(
+            INVALID_JSON, f"not JSON at character {first['loc'][-1]}: {first['ctx']['error']}"
+        )
+    faults = [
+        Fault(pointer=_pointer(fault["loc"][1:], error.body), detail=fault["msg"])
+        for fault in found[:_MAX_FAULTS]
+    ]
+    detail = f"{faults[0].pointer or 'body'}: {faults[0].detail}"
+    if len(found) > 1:
+        detail += f" (and {len(found) - 1} more)"
+    return ProblemError(_kind(first), detail, faults)
+
+
+def _kind(fault: dict[str, Any]) -> Kind:
+    place = tuple(part for part in fault["loc"][1:] if isinstance(part, str))
+    if fault["type"] == "extra_forbidden":
+        return UNKNOWN_FIELD
+    if place[:3] == ("scene", "clips", "camera") and fault["type"] == "literal_error":
+        return UNKNOWN_CAMERA
+    for start, kind in _KIND_BY_PLACE:
+        if place[: len(start)] == start:
+            return kind
+    return INVALID_REQUEST
+
+
+def _pointer(location: Sequence[str | int], body: object) -> str:
+    """RFC 6901 pointer into ``body``; names of union branches, which pydantic adds, are left out."""
+    parts: list[str] = []
+    node: object = body
+    for position, part in enumerate(location):
+        if _holds(node, part):
+            node = node[part]  # type: ignore[index]  # it was just asked
+        elif position < len(location) - 1 or not isinstance(node, dict):
+            continue
+        parts.append(str(part).replace("~", "~0").replace("/", "~1"))
+    return "".join(f"/{part}" for part in parts)
+
+
+def _holds(node: object, part: str | int) -> bool:
+    if isinstance(node, list):
+        return isinstance(part, int) and part < len(node)
+    return isinstance(node, dict) and part in node

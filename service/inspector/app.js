@@ -1,0 +1,193 @@
+// The page: which scene, which controls, which draw.
+
+import * as api from "./api.js";
+import { drawBirdseye } from "./birdseye.js";
+import { showCameras } from "./cameras.js";
+import { byId, element } from "./dom.js";
+import { showDraw } from "./timeline.js";
+
+const state = { view: null, draws: [], chosen: 0, running: null, opened: new Map() };
+
+const say = (text) => { byId("status").textContent = text; };
+
+function complain(error) {
+  const box = byId("problem");
+  box.hidden = false;
+  box.replaceChildren(element("strong", { textContent: error.title || "That did not work" }), ` ${error.message} `);
+  if (error.requestId) box.append(element("code", { textContent: `request ${error.requestId}` }));
+}
+
+async function attempt(work) {
+  byId("problem").hidden = true;
+  try {
+    await work();
+  } catch (error) {
+    if (error.name !== "AbortError") complain(error);
+  }
+}
+
+function redraw() {
+  if (state.view) drawBirdseye(state.view, state.draws, state.chosen);
+}
+
+function forgetDraws() {
+  state.running?.abort();
+  state.draws = [];
+  state.chosen = 0;
+  byId("draws").hidden = true;
+  byId("timeline").replaceChildren();
+  for (const empty of document.querySelectorAll(".empty")) empty.hidden = false;
+}
+
+function showView(view) {
+  forgetDraws();
+  state.view = view;
+  showCameras(view.scene);
+  byId("tags").replaceChildren(...view.tags.map((tag) => element("li", { textContent: tag.replaceAll("_", " ") })));
+  byId("with-route").disabled = !view.scene.route;
+  redraw();
+  say(`Scene ${view.scene.scene_id || "without a name"}: press Plan.`);
+}
+
+async function chooseScene() {
+  const id = byId("scene").value;
+  const view = state.opened.get(id) || await api.bundledScene(id);
+  if (byId("scene").value === id) showView(view); // another one may have been chosen meanwhile
+}
+
+async function openFile(file) {
+  say(`Reading ${file.name} …`);
+  const views = await api.scenesOfFile(file);
+  if (!views.length) throw new Error(`${file.name} holds no scenes.`);
+  const options = views.map((view, index) => {
+    const id = `file:${file.name}:${index}`;
+    state.opened.set(id, view);
+    return element("option", { value: id, textContent: `${view.scene.scene_id || "scene"} (${file.name})` });
+  });
+  byId("scene").append(...options);
+  byId("scene").value = options[0].value;
+  showView(views[0]);
+}
+
+function controls() {
+  return {
+    thinking: byId("thinking").value,
+    n: byId("n").valueAsNumber,
+    temperature: byId("temperature").valueAsNumber,
+    seed: byId("seed").valueAsNumber,
+  };
+}
+
+async function plan() {
+  if (!state.view) return;
+  state.running?.abort();
+  const running = state.running = new AbortController();
+  const scene = byId("with-route").checked ? state.view.scene : { ...state.view.scene, route: null };
+  say("Planning …");
+  byId("plan").disabled = true;
+  const began = performance.now();
+  try {
+    const body = await api.plan(scene, controls(), running.signal);
+    showDraws(body.draws);
+    const { total_ms: total, engine_ms: engine } = body.timing;
+    say(`${body.draws.length} draws in ${total.toFixed(0)} ms (engine ${engine.toFixed(0)} ms, `
+      + `with the network ${(performance.now() - began).toFixed(0)} ms), request ${body.request_id}`);
+  } catch (error) {
+    if (state.running === running) say("No plan.");
+    throw error;
+  } finally {
+    byId("plan").disabled = false;
+  }
+}
+
+function averageError(trajectory, expert) {
+  if (!expert) return "–";
+  const sum = trajectory.reduce((total, row, index) =>
+    total + Math.hypot(row[0] - expert[index][0], row[1] - expert[index][1]), 0);
+  return `${(sum / trajectory.length).toFixed(2)} m`;
+}
+
+function showDraws(draws) {
+  state.draws = draws;
+  byId("draws").hidden = draws.length === 0;
+  for (const empty of document.querySelectorAll(".empty")) empty.hidden = true;
+  byId("draws").tBodies[0].replaceChildren(...draws.map(drawRow));
+  if (draws.length) choose(Math.min(state.chosen, draws.length - 1));
+}
+
+function drawRow(draw, index) {
+  const radio = element("input", { type: "radio", name: "draw", value: index });
+  radio.addEventListener("change", () => choose(index));
+  const thinks = draw.branch === "Thinking:";
+  const branch = element("span", { className: `branch${thinks ? " think" : ""}`, textContent: thinks ? "second look" : "direct" });
+  const tokens = Object.values(draw.tokens).reduce((sum, count) => sum + count, 0);
+  const row = element("tr", {},
+    element("td", {}, element("label", {}, radio, `draw ${draw.index + 1}`)),
+    element("td", {}, draw.branch === null ? "–" : branch),
+    element("td", {}, draw.think_probability === null ? "–" : probability(draw.think_probability)),
+    element("td", { className: "number", textContent: tokens }),
+    element("td", { className: "number", textContent: averageError(draw.trajectory, state.view.future) }));
+  row.addEventListener("click", () => choose(index));
+  return row;
+}
+
+function probability(value) {
+  const bar = element("i");
+  bar.style.width = `${100 * value}%`;
+  return element("span", { className: "probability" },
+    element("span", {}, bar), element("span", { textContent: value.toFixed(2) }));
+}
+
+function choose(index) {
+  state.chosen = index;
+  [...byId("draws").tBodies[0].rows].forEach((row, position) => {
+    row.classList.toggle("is-chosen", position === index);
+    row.querySelector("input").checked = position === index;
+  });
+  byId("plan-title").textContent = `Plan of draw ${state.draws[index].index + 1}`;
+  showDraw(state.draws[index]);
+  redraw();
+}
+
+function listen() {
+  byId("scene").addEventListener("change", () => attempt(chooseScene));
+  byId("controls").addEventListener("submit", (event) => {
+    event.preventDefault();
+    attempt(plan);
+  });
+  byId("file").addEventListener("change", (event) => {
+    const [file] = event.target.files;
+    event.target.value = ""; // the same file can be opened again
+    if (file) attempt(() => openFile(file));
+  });
+  document.addEventListener("dragover", (event) => {
+    event.preventDefault();
+    byId("drop-hint").hidden = false;
+  });
+  document.addEventListener("dragleave", (event) => {
+    if (!event.relatedTarget) byId("drop-hint").hidden = true;
+  });
+  document.addEventListener("drop", (event) => {
+    event.preventDefault();
+    byId("drop-hint").hidden = true;
+    const [file] = event.dataTransfer.files;
+    if (file) attempt(() => openFile(file));
+  });
+  new ResizeObserver(redraw).observe(byId("birdseye"));
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+}
+
+async function begin() {
+  const [scenes] = await Promise.all([api.sceneList(), showModel()]);
+  byId("scene").replaceChildren(...scenes.map(({ scene_id: id, tags }) =>
+    element("option", { value: id, textContent: tags.length ? `${id} · ${tags.join(", ").replaceAll("_", " ")}` : id })));
+  if (scenes.length) await chooseScene();
+}
+
+async function showModel() {
+  const [card] = await api.models();
+  byId("model").textContent = `${card.name} ${card.revision} · ${card.engine} · ${card.cameras.length} cameras`;
+}
+
+listen();
+attempt(begin);

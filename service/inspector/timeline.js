@@ -1,0 +1,71 @@
+// The plan of the chosen draw: tracks over time, the reasoning, tokens per section.
+
+import { byId, element } from "./dom.js";
+
+const HORIZON_S = 6.4;
+const GROUPS = ["longitudinal", "lateral", "lane"];
+const LOOK = {
+  "Accelerate": "go", "Decelerate": "slow", "Wait": "stop", "Reverse": "back",
+  "Left Turn": "left", "Left Lane Change": "left", "Right Turn": "right", "Right Lane Change": "right",
+};
+
+const percent = (seconds) => `${100 * seconds / HORIZON_S}%`;
+
+export function showDraw(draw) {
+  const parts = [element("h3", { textContent: "First plan" }), tracks(draw.plan, null)];
+  if (draw.thinking !== null) {
+    parts.push(element("h3", { textContent: "Second look" }), element("blockquote", { textContent: draw.thinking }));
+  }
+  if (draw.revised_plan) {
+    parts.push(element("h3", { textContent: "Revised plan" }), tracks(draw.revised_plan, draw.plan));
+  }
+  const text = element("pre", { textContent: (draw.revised_plan || draw.plan || { text: "" }).text, tabIndex: 0 });
+  const chips = Object.entries(draw.tokens).map(([section, count]) =>
+    element("li", { textContent: `${section.replaceAll("_", " ")} ${count}` }));
+  parts.push(
+    element("h3", { textContent: "Tokens per section" }),
+    element("ul", { className: "chips", id: "tokens" }, ...chips),
+    element("details", {}, element("summary", { textContent: "Plan as text" }), text),
+  );
+  byId("timeline").replaceChildren(...parts);
+}
+
+// Segments that differ from the plan before are marked.
+function tracks(plan, before) {
+  if (!plan) return element("p", { className: "empty", textContent: "This response format has no plan." });
+  const rows = GROUPS.filter((group) => plan.tracks[group]).flatMap((group) => [
+    element("span", { textContent: group }),
+    track(group, plan.tracks[group], before && before.tracks[group]),
+  ]);
+  return element("div", { className: "tracks" }, ...rows, element("span"), axis());
+}
+
+function track(group, segments, before) {
+  const items = segments.map((segment) => {
+    const when = `${segment.start_s.toFixed(1)}–${segment.end_s.toFixed(1)} s`;
+    const item = element("li", { textContent: segment.word, title: `${segment.word}, ${when}` });
+    item.className = LOOK[segment.word] || "";
+    item.style.left = percent(segment.start_s);
+    item.style.width = percent(segment.end_s - segment.start_s);
+    item.classList.toggle("changed", Boolean(before) && !same(segment, before));
+    item.setAttribute("aria-label", `${when}: ${segment.word}`);
+    return item;
+  });
+  const list = element("ol", { className: "track" }, ...items);
+  list.setAttribute("aria-label", `${group} track`);
+  return list;
+}
+
+const same = (segment, before) => before.some((other) =>
+  other.word === segment.word && other.start_s <= segment.start_s && other.end_s >= segment.end_s);
+
+function axis() {
+  const marks = [0, 1, 2, 3, 4, 5, 6.4].map((seconds) => {
+    const mark = element("span", { textContent: seconds === 0 ? "0 s" : String(seconds) });
+    mark.style.left = percent(seconds);
+    return mark;
+  });
+  const line = element("div", { className: "axis" }, ...marks);
+  line.setAttribute("aria-hidden", "true");
+  return line;
+}

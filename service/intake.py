@@ -1,0 +1,151 @@
+"""From the wire's request to the engine's: everything is checked here, before the engine hears of it."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Iterable
+from typing import Final
+
+import numpy as np
+
+from clients import wire
+from model.driving.images import ImageError, check_image
+from model.driving.plan import GROUPS, TICKS, MetaAction, Plan, PlanError, parse_plan
+from model.driving.scene import Clip, Scene, SceneError
+from model.driving.trajectory import (
+    FloatArray,
+    GeometryError,
+    check_history,
+    check_route,
+    wrap_angle,
+)
+from model.engines.engine import Controls, ModelCard, PlanRequest, RequestError
+from service.problems import (
+    INVALID_CLIP,
+    INVALID_CONTROLS,
+    INVALID_HISTORY,
+    INVALID_IMAGE,
+    INVALID_PLAN,
+    INVALID_ROUTE,
+    MISSING_CAMERA,
+    UNKNOWN_FORMAT,
+    at,
+)
+
+MAX_STEP_M: Final = 10.0
+"""Between history rows: 100 m/s. Faster is another unit or another frame, not a car."""
+MAX_STEP_CHANGE_M: Final = 1.0
+"""Between neighbouring steps: 100 m/s². Rows out of order zigzag by more at any speed above 4 m/s."""
+MAX_TURN_RAD: Final = 0.5
+"""Between history rows: 290 degrees a second. More is a heading in degrees."""
+
+
+def engine_request(asked: wire.PlanRequest, card: ModelCard, engine_id: str) -> PlanRequest:
+    """The engine's request for what was ``asked``.
+
+    Args:
+        asked: a request whose shapes the schema has checked.
+        card: the model that is to answer.
+        engine_id: unique among running requests, which a caller's request id need not be.
+
+    Raises:
+        ProblemError: pictures, geometry, plan, controls, format or cameras that cannot be served.
+    """
+    if asked.format not in card.formats:
+        raise at(UNKNOWN_FORMAT, "/format", f"{card.name} writes {', '.join(card.formats)}")
+    cameras = [clip.camera for clip in asked.scene.clips]
+    if missing := [camera for camera in card.cameras if camera not in cameras]:
+        raise at(MISSING_CAMERA, "/scene/clips", f"{card.name} also needs {', '.join(missing)}")
+    controls = _controls(asked.controls)
+    return PlanRequest(engine_id, _scene(asked.scene), asked.format, controls)
+
+
+def _scene(asked: wire.Scene) -> Scene:
+    history = _history(asked.history)
+    try:
+        route = None if asked.route is None else check_route(asked.route)
+    except GeometryError as error:
+        raise at(INVALID_ROUTE, "/scene/route", str(error)) from None
+    clips = tuple(
+        Clip(clip.camera, tuple(_images(clip.images, f"/scene/clips/{number}/images")))
+        for number, clip in enumerate(asked.clips)
+    )
+    try:
+        return Scene(asked.scene_id, clips, history, route)
+    except SceneError as error:
+        raise at(INVALID_CLIP, "/scene/clips", str(error)) from None
+
+
+def _images(encoded: Iterable[str], pointer: str) -> Iterable[bytes]:
+    for number, text in enumerate(encoded):
+        try:
+            image = base64.b64decode(text, validate=True)
+            check_image(image)
+        except (ImageError, binascii.Error, ValueError) as error:
+            problem = str(error) if isinstance(error, ImageError) else f"not base64: {error}"
+            raise at(INVALID_IMAGE, f"{pointer}/{number}", problem) from None
+        yield image
+
+
+def _history(rows: list[list[float]]) -> FloatArray:
+    pointer = "/scene/history"
+    try:
+        history = check_history(rows)
+    except GeometryError as error:
+        raise at(INVALID_HISTORY, pointer, str(error)) from None
+    steps = np.diff(history[:, :3], axis=0)
+    _limit(np.linalg.norm(steps, axis=1), MAX_STEP_M, "moves {:.1f} m in 0.1 s; is it 10 Hz and metres?")
+    _limit(
+        np.linalg.norm(np.diff(steps, axis=0), axis=1),
+        MAX_STEP_CHANGE_M,
+        "changes its step by {:.1f} m in 0.1 s; are the rows in order of time, oldest first, at 10 Hz?",
+    )
+    turns = np.abs(wrap_angle(np.diff(history[:, 3])))
+    _limit(turns, MAX_TURN_RAD, "turns by {:.1f} rad in 0.1 s; are headings in radians?")
+    return history
+
+
+def _limit(values: np.ndarray[tuple[int, ...], np.dtype[np.floating]], largest: float, text: str) -> None:
+    worst = int(values.argmax())
+    if values[worst] > largest:
+        problem = text.format(float(values[worst]))
+        raise at(INVALID_HISTORY, f"/scene/history/{worst + 1}", f"the ego {problem}")
+
+
+def _controls(asked: wire.Controls) -> Controls:
+    try:
+        return Controls(
+            thinking=asked.thinking,
+            think_threshold=asked.think_threshold,
+            prefill=None if asked.prefill is None else _plan(asked.prefill),
+            n=asked.n,
+            temperature=asked.temperature,
+            top_p=asked.top_p,
+            seed=asked.seed,
+            deadline_ms=asked.deadline_ms,
+        )
+    except PlanError as error:
+        raise at(INVALID_PLAN, "/controls/prefill", str(error)) from None
+    except RequestError as error:
+        raise at(INVALID_CONTROLS, "/controls", str(error)) from None
+
+
+def _plan(asked: wire.PlanGiven) -> Plan:
+    if isinstance(asked, str):
+        return parse_plan(asked)
+    tracks = {
+        group: tuple(MetaAction(_tick(action.start_s), _tick(action.end_s), action.word) for action in track)
+        for group in GROUPS
+        if (track := getattr(asked, group)) is not None
+    }
+    if not tracks:
+        raise PlanError("the plan has no tracks")
+    return Plan(**tracks)
+
+
+def _tick(seconds: float) -> int:
+    tick = round(10 * seconds) if abs(seconds) <= 10 * TICKS else -1
+    if abs(10 * seconds - tick) > 1e-6:
+        raise PlanError(f"{seconds} s is not on the 0.1 s grid")
+    return tick

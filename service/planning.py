@@ -1,0 +1,157 @@
+"""One planning request, from the parsed body to the answer."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import time
+from collections.abc import Awaitable, Callable
+from typing import Final
+
+import structlog
+
+from clients import wire
+from model.driving.images import ImageError
+from model.driving.plan import GROUPS, Plan, PlanError
+from model.driving.scene import SceneError
+from model.engines.engine import (
+    Draw,
+    DrawFinished,
+    Engine,
+    EngineError,
+    ModelCard,
+    PlanRequest,
+    RequestError,
+)
+from service.intake import engine_request
+from service.metrics import Metrics
+from service.problems import ENGINE_FAILED, INVALID_IMAGE, REFUSED, ProblemError
+
+_DECIMALS: Final = 4
+"""Of poses on the wire: a tenth of a millimetre."""
+
+log = structlog.stdlib.get_logger()
+
+
+class CallerLeft(Exception):
+    """The caller closed the connection before the answer was ready."""
+
+
+async def answer(
+    asked: wire.PlanRequest,
+    engine: Engine,
+    metrics: Metrics,
+    request_id: str,
+    caller_leaves: Callable[[], Awaitable[None]],
+) -> wire.PlanResponse:
+    """Plan for one scene.
+
+    Args:
+        asked: the parsed body.
+        engine: a started engine.
+        metrics: where draws are counted.
+        request_id: the caller's id for the request.
+        caller_leaves: returns when the caller has gone; the engine's work is then dropped.
+
+    Raises:
+        ProblemError: the request cannot be served; the engine failed.
+        CallerLeft: nobody waits for the answer.
+    """
+    began = time.perf_counter()
+    engine_id = f"{request_id}/{secrets.token_hex(4)}"
+    # On a thread: megabytes of base64 must not hold up the answers of others.
+    request = await asyncio.to_thread(engine_request, asked, engine.card, engine_id)
+    checked = time.perf_counter()
+    with metrics.plans_in_flight.track_inprogress():
+        draws = await _while_wanted(_draws(engine, request), caller_leaves)
+    finished = time.perf_counter()
+    for draw in draws:
+        metrics.draw_finished(draw, request.controls.thinking)
+    card = engine.card
+    return wire.PlanResponse(
+        request_id=request_id,
+        model=wire.ModelName(name=card.name, revision=card.revision),
+        draws=[_draw(draw) for draw in draws],
+        timing=wire.Timing(
+            total_ms=_ms(time.perf_counter() - began),
+            checks_ms=_ms(checked - began),
+            engine_ms=_ms(finished - checked),
+        ),
+    )
+
+
+def model_card(card: ModelCard) -> wire.ModelCard:
+    """A model card for the wire."""
+    return wire.ModelCard(
+        name=card.name,
+        revision=card.revision,
+        engine=card.engine,
+        formats=list(card.formats),
+        cameras=list(card.cameras),
+        image_size=list(card.image_size),
+        parameters=card.parameters,
+        details=dict(card.details),
+    )
+
+
+async def _draws(engine: Engine, request: PlanRequest) -> list[Draw]:
+    try:
+        draws = [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
+    except ImageError as error:
+        raise ProblemError(INVALID_IMAGE, str(error)) from error
+    except (RequestError, SceneError, PlanError) as error:
+        raise ProblemError(REFUSED, str(error)) from error
+    except EngineError as error:
+        log.exception("engine failed")
+        raise ProblemError(ENGINE_FAILED, str(error)) from error
+    except asyncio.CancelledError:
+        engine.cancel(request.request_id)
+        raise
+    return sorted(draws, key=lambda draw: draw.index)
+
+
+async def _while_wanted(
+    work: Awaitable[list[Draw]], caller_leaves: Callable[[], Awaitable[None]]
+) -> list[Draw]:
+    working = asyncio.ensure_future(work)
+    leaving = asyncio.ensure_future(caller_leaves())
+    try:
+        await asyncio.wait((working, leaving), return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            return working.result()
+        raise CallerLeft
+    finally:
+        working.cancel()
+        leaving.cancel()
+        await asyncio.gather(working, leaving, return_exceptions=True)
+
+
+def _draw(draw: Draw) -> wire.Draw:
+    return wire.Draw(
+        index=draw.index,
+        plan=_plan(draw.plan),
+        branch=draw.branch,
+        think_probability=draw.think_probability,
+        thinking=draw.thinking,
+        revised_plan=_plan(draw.revised_plan),
+        trajectory=draw.trajectory.astype(float).round(_DECIMALS).tolist(),
+        tokens=dict(draw.tokens),
+    )
+
+
+def _plan(plan: Plan | None) -> wire.Plan | None:
+    if plan is None:
+        return None
+    tracks = {
+        group: [
+            wire.MetaAction(start_s=action.start / 10, end_s=action.end / 10, word=action.word)
+            for action in track
+        ]
+        for group in GROUPS
+        if (track := plan.track(group)) is not None
+    }
+    return wire.Plan(text=str(plan), tracks=wire.Tracks(**tracks))
+
+
+def _ms(seconds: float) -> float:
+    return round(1000 * seconds, 2)

@@ -1,0 +1,74 @@
+"""The kinds of problems the service answers with: one table, whose types are part of the contract."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from clients.wire import Fault
+
+TYPE_BASE: Final = "https://looktwice.dev/problems/"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of problem; ``slug`` is the last part of its stable type URI."""
+
+    slug: str
+    status: int
+    title: str
+
+    @property
+    def type(self) -> str:
+        """The type URI."""
+        return TYPE_BASE + self.slug
+
+
+INVALID_JSON: Final = Kind("invalid-json", 400, "The body is not JSON")
+NOT_FOUND: Final = Kind("not-found", 404, "There is nothing here")
+UNKNOWN_SCENE: Final = Kind("unknown-scene", 404, "There is no such scene")
+METHOD_NOT_ALLOWED: Final = Kind("method-not-allowed", 405, "This method is not allowed here")
+BODY_TOO_LARGE: Final = Kind("body-too-large", 413, "The body is too large")
+UNSUPPORTED_MEDIA_TYPE: Final = Kind("unsupported-media-type", 415, "The body is of a type not taken here")
+INVALID_REQUEST: Final = Kind("invalid-request", 422, "The request breaks the contract")
+UNKNOWN_FIELD: Final = Kind("unknown-field", 422, "The request holds a field that does not exist")
+INVALID_CLIP: Final = Kind("invalid-clip", 422, "A camera clip is not four frames of one camera")
+UNKNOWN_CAMERA: Final = Kind("unknown-camera", 422, "There is no such camera")
+MISSING_CAMERA: Final = Kind("missing-camera", 422, "The model needs a camera that the scene lacks")
+INVALID_IMAGE: Final = Kind("invalid-image", 422, "A picture cannot be accepted")
+INVALID_HISTORY: Final = Kind("invalid-history", 422, "The ego history is not one a car can have driven")
+INVALID_ROUTE: Final = Kind("invalid-route", 422, "The route is not 20 points in the ego frame")
+INVALID_CONTROLS: Final = Kind("invalid-controls", 422, "The controls contradict each other or their limits")
+INVALID_PLAN: Final = Kind("invalid-plan", 422, "The given plan breaks the plan language")
+UNKNOWN_FORMAT: Final = Kind("unknown-format", 422, "The model does not write this response format")
+REFUSED: Final = Kind("request-refused", 422, "The model cannot serve this request")
+INVALID_SCENE_FILE: Final = Kind("invalid-scene-file", 422, "This is not a scene file of this version")
+INTERNAL: Final = Kind("internal", 500, "The service failed")
+SCENES_UNREADABLE: Final = Kind("scenes-unreadable", 500, "The bundled scenes cannot be read")
+NOT_READY: Final = Kind("not-ready", 503, "The model is not ready")
+ENGINE_FAILED: Final = Kind("engine-failed", 503, "The engine failed")
+
+KINDS: Final = tuple(value for value in list(globals().values()) if isinstance(value, Kind))
+"""All of them, in the table's order."""
+
+RETRY_AFTER_S: Final = 1
+
+
+class ProblemError(Exception):
+    """Ends a request with a problem document.
+
+    Attributes:
+        kind: which problem.
+        detail: what is wrong here, and what to change.
+        errors: the places in the body that are wrong.
+    """
+
+    def __init__(self, kind: Kind, detail: str, errors: Sequence[Fault] = ()) -> None:
+        super().__init__(detail)
+        self.kind, self.detail, self.errors = kind, detail, tuple(errors)
+
+
+def at(kind: Kind, pointer: str, detail: str) -> ProblemError:
+    """A problem with one known place in the body."""
+    return ProblemError(kind, f"{pointer}: {detail}", [Fault(pointer=pointer, detail=detail)])

@@ -1,0 +1,147 @@
+"""An engine without a network: plausible draws by rule, and failures, delays and refusals on demand."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import AsyncIterator
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from model.driving.plan import GROUPS, Plan, parse_plan
+from model.driving.trajectory import FUTURE_STEPS, STEP_S, FloatArray, present_speed
+from model.engines.engine import (
+    Branch,
+    Draw,
+    DrawFinished,
+    Event,
+    ModelCard,
+    PlanRequest,
+    SectionFinished,
+)
+
+CARD: Final = ModelCard(
+    name="scripted",
+    revision="r1",
+    engine="scripted",
+    formats=("cf_vla", "traj_only"),
+    cameras=("front_wide_120", "front_tele_30"),
+    image_size=(224, 128),
+    parameters=0,
+)
+KEEP_ON: Final = parse_plan(
+    "- longitudinal\n  - 0.0s-2.1s: Keep Speed\n  - 2.1s-6.4s: Accelerate\n"
+    "- lateral\n  - 0.0s-6.4s: Straight\n- lane\n  - 0.0s-6.4s: Keep Lane\n"
+)
+SLOW_DOWN: Final = parse_plan(
+    "- longitudinal\n  - 0.0s-0.9s: Keep Speed\n  - 0.9s-4.8s: Decelerate\n  - 4.8s-6.4s: Keep Speed\n"
+    "- lateral\n  - 0.0s-6.4s: Straight\n- lane\n  - 0.0s-2.4s: Keep Lane\n  - 2.4s-6.4s: Left Lane Change\n"
+)
+REASONING: Final = (
+    "The vehicle ahead in our lane is slower and its brake lights are on. Accelerating from 2.1 s would "
+    "close the gap before the left lane opens, so ease off now and change to the left lane once it is clear."
+)
+_ACCELERATION: Final = {"Accelerate": 1.2, "Decelerate": -1.6}
+_LANE_SHIFT_M: Final = {"Left Lane Change": 3.5, "Right Lane Change": -3.5}
+
+
+class ScriptedEngine:
+    """`model.engines.engine.Engine` by rule.
+
+    Attributes:
+        failure: raised at the first iteration of every request.
+        start_failure: raised by `start`.
+        may_start: `start` returns when it is set.
+        may_finish: requests wait for it after they were noted.
+        submitted, cancelled: what was asked, in order.
+    """
+
+    def __init__(self) -> None:
+        self.failure: Exception | None = None
+        self.start_failure: Exception | None = None
+        self.may_start = asyncio.Event()
+        self.may_start.set()
+        self.may_finish = asyncio.Event()
+        self.may_finish.set()
+        self.submitted: list[PlanRequest] = []
+        self.cancelled: list[str] = []
+        self.stopped = False
+        self.card_shown = CARD
+
+    @property
+    def card(self) -> ModelCard:
+        return self.card_shown
+
+    async def start(self) -> None:
+        await self.may_start.wait()
+        if self.start_failure is not None:
+            raise self.start_failure
+
+    async def stop(self) -> None:
+        self.stopped = True
+
+    async def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
+        self.submitted.append(request)
+        if self.failure is not None:
+            raise self.failure
+        await self.may_finish.wait()
+        # Later draws finish first, as they may in a batch.
+        for index in reversed(range(request.controls.n)):
+            draw = _draw(request, index)
+            yield SectionFinished(index, "plan", str(draw.plan))
+            yield DrawFinished(draw)
+
+    def cancel(self, request_id: str) -> None:
+        self.cancelled.append(request_id)
+
+
+def _draw(request: PlanRequest, index: int) -> Draw:
+    controls = request.controls
+    luck = random.Random(1000 * controls.seed + index)
+    probability = round(luck.uniform(0.05, 0.6), 4)
+    think = controls.thinking == "always" or (
+        controls.thinking == "adaptive"
+        and (
+            luck.random() < probability
+            if controls.think_threshold is None
+            else probability > controls.think_threshold
+        )
+    )
+    first = controls.prefill or KEEP_ON
+    followed = SLOW_DOWN if think else first
+    branch: Branch = "Thinking:" if think else "Action:"
+    tokens = {"plan": 40, "branch": 1, "trajectory": 8} | (
+        {"thinking": 48, "revised_plan": 52} if think else {}
+    )
+    direct = Draw(
+        index=index,
+        text=f"{first}{branch}",
+        plan=first,
+        branch=branch,
+        think_probability=probability,
+        thinking=None,
+        revised_plan=None,
+        trajectory=_drive(followed, present_speed(request.scene.history), luck),
+        codes=(1, 2, 3, 4, 5, 6),
+        tokens=tokens,
+    )
+    return replace(direct, thinking=REASONING, revised_plan=SLOW_DOWN) if think else direct
+
+
+def _drive(plan: Plan, speed: float, luck: random.Random) -> FloatArray:
+    """What a car does that follows ``plan``, with a little variation in strength and curvature."""
+    zeal, bend = luck.uniform(0.6, 1.3), luck.gauss(0.0, 0.0012)
+    rows = np.zeros((FUTURE_STEPS, 4), np.float32)
+    x = y = heading = shift = 0.0
+    for tick in range(FUTURE_STEPS):
+        words = {group: plan.word_at(group, tick) or "" for group in GROUPS}
+        speed = max(0.0, speed + zeal * _ACCELERATION.get(words["longitudinal"], 0.0) * STEP_S)
+        target = _LANE_SHIFT_M.get(words["lane"], 0.0)
+        shift += (target - shift) * 0.045
+        heading = 0.012 * speed * STEP_S * tick * bend * 10 + np.arctan2(target - shift, 40.0)
+        x += speed * STEP_S * float(np.cos(heading))
+        y += speed * STEP_S * float(np.sin(heading))
+        rows[tick] = (x, y, 0.0, heading)
+    return rows

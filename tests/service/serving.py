@@ -1,0 +1,117 @@
+"""A real server on a free port, and what it takes to talk to it."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+import uvicorn
+from prometheus_client import CollectorRegistry
+from prometheus_client.parser import text_string_to_metric_families
+
+from model.driving.scene import Scene
+from service.app import create_app
+from service.settings import Settings
+from tests.service.scenes import scene
+from tests.service.scripted_engine import ScriptedEngine
+
+PATIENCE_S = 30
+
+
+@dataclass
+class Served:
+    """A running service."""
+
+    engine: ScriptedEngine
+    url: str
+    http: httpx.Client
+    loop: asyncio.AbstractEventLoop
+
+    def in_loop(self, call: Callable[[], object]) -> None:
+        """Run ``call`` in the server's event loop, which owns the engine."""
+        done = threading.Event()
+
+        def run() -> None:
+            call()
+            done.set()
+
+        self.loop.call_soon_threadsafe(run)
+        assert done.wait(PATIENCE_S)
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Wait for what must come; fails when it does not."""
+        pause = threading.Event()
+        for _ in range(PATIENCE_S * 100):
+            if condition():
+                return
+            pause.wait(0.01)
+        raise AssertionError("what was waited for did not happen")
+
+    def until_ready(self) -> None:
+        self.until(lambda: self.http.get("/readyz").status_code == 200)
+
+    def metric(self, name: str, **labels: str) -> float:
+        """The value of one sample; 0 where there is none yet."""
+        for family in text_string_to_metric_families(self.http.get("/metrics").text):
+            for sample in family.samples:
+                if sample.name == name and labels.items() <= sample.labels.items():
+                    return sample.value
+        return 0.0
+
+
+@contextmanager
+def serve(engine: ScriptedEngine, settings: Settings, *, wait: bool = True) -> Iterator[Served]:
+    """Serve ``engine`` over a real socket until the block ends."""
+    listening = socket.create_server(("127.0.0.1", 0))
+    url = f"http://127.0.0.1:{listening.getsockname()[1]}"
+    app = create_app(engine, settings, CollectorRegistry())
+    config = uvicorn.Config(app, log_config=None, ws="none", timeout_graceful_shutdown=5)
+    server = uvicorn.Server(config)
+    loops: list[asyncio.AbstractEventLoop] = []
+
+    async def run() -> None:
+        loops.append(asyncio.get_running_loop())
+        await server.serve([listening])
+
+    thread = threading.Thread(target=lambda: asyncio.run(run()), name="server")
+    thread.start()
+    try:
+        with httpx.Client(base_url=url, timeout=PATIENCE_S) as http:
+            # The socket listens already, so this request waits for the server and is not refused.
+            assert http.get("/healthz").status_code in (200, 503)
+            served = Served(engine, url, http, loops[0])
+            if wait:
+                served.until_ready()
+            yield served
+    finally:
+        server.should_exit = True
+        thread.join(PATIENCE_S)
+        listening.close()
+    assert not thread.is_alive()
+
+
+def body(of: Scene | None = None, **controls: Any) -> dict[str, Any]:
+    """A good request body; tests break it in one place."""
+    planned = of or scene()
+    return {
+        "scene": {
+            "scene_id": planned.scene_id,
+            "clips": [
+                {
+                    "camera": clip.camera,
+                    "images": [base64.b64encode(image).decode() for image in clip.images],
+                }
+                for clip in planned.clips
+            ],
+            "history": planned.history.tolist(),
+            "route": None if planned.route is None else planned.route.tolist(),
+        },
+        "controls": {"n": 2, "seed": 1} | controls,
+    }
