@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from typing import Final
 
-from model.formats.pieces import Choice, Codes, Format, FreeText, Literal, Option, PlanTracks, Section, Sequence
-
-ACTION: Final = "Action:"
-THINKING: Final = "Thinking:"
-BRANCH: Final = "branch"
-"""Name of the choice, and of its section, where a response decides to act or to think."""
+from model.formats.pieces import (
+    ACTION,
+    BRANCH,
+    THINKING,
+    Choice,
+    Codes,
+    Format,
+    FreeText,
+    Literal,
+    Option,
+    PlanTracks,
+    Section,
+    Sequence,
+)
 
 MAX_THINKING_TOKENS: Final = 160
 """Teachers write at most 80 words (CF-VLA section 8); two tokens a word leave room to spare."""

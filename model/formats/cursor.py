@@ -310,6 +310,13 @@ class Cursor:
         choice, node = self._active
         return tuple(choice.options[position].text for position in node.children[token].options())
 
+    @property
+    def stop_id(self) -> int | None:
+        """Within free text: the token that ends it; None elsewhere."""
+        if isinstance(self._active, _InText):
+            return self.compiled.literal(self._active.piece.stop)[0]
+        return None
+
     def answer(self, values: Values) -> tuple[int, ...]:
         """The tokens that write the current section's value from here; raises `FormatError`."""
         if self.section not in values:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
+from typing import Literal as Literal_
 
 from model.driving.plan import GROUPS, TICKS, WORDS, Group, Plan, format_tick
 
@@ -19,6 +20,11 @@ Value = Plan | str | tuple[int, ...]
 """What a section holds: a plan, a word or free text, or codes."""
 Values = Mapping[str, Value]
 """Section name to value, for the sections that hold one."""
+
+BRANCH: Final = "branch"
+"""Name of the choice, and of its section, where a response decides to act or to think."""
+ACTION: Final[Literal_["Action:"]] = "Action:"
+THINKING: Final[Literal_["Thinking:"]] = "Thinking:"
 
 CODES: Final = 6
 """Trajectory codes of a trajectory (CF-VLA section 8)."""

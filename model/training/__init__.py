@@ -1,0 +1,1 @@
+"""Learning: targets, grounding, recipes, the trainer."""

@@ -1,0 +1,127 @@
+"""The torch engine: the decoding loop on a thread of its own, behind the asynchronous interface."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import threading
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from model.engines.engine import DrawFinished, EngineError, Event, ModelCard, PlanRequest, RequestError
+from model.engines.torch.decoder import Decoder, Failed
+from model.engines.torch.runner import Runner
+from model.network.checkpoint import load
+
+
+@dataclass(frozen=True)
+class TorchSettings:
+    """How the torch engine runs.
+
+    Attributes:
+        rows: draws decoded at once; more wait.
+        length: tokens a row can hold, prompt and response together.
+        dtype: of weights and KV.
+        device: ``cpu`` or ``cuda``.
+        jump: forced runs go through the network in one pass.
+    """
+
+    rows: int = 64
+    length: int = 1536
+    dtype: torch.dtype = torch.float32
+    device: str = "cpu"
+    jump: bool = True
+
+
+class TorchEngine:
+    """`model.engines.engine.Engine` over a checkpoint folder; see there for the contract."""
+
+    def __init__(self, checkpoint: Path, settings: TorchSettings = TorchSettings()) -> None:
+        self._settings = settings
+        self._loaded = load(checkpoint, dtype=settings.dtype, device=settings.device)
+        self._commands: queue.SimpleQueue[Callable[[Decoder], None] | None] = queue.SimpleQueue()
+        self._listeners: dict[str, tuple[asyncio.AbstractEventLoop, asyncio.Queue[Event | Failed]]] = {}
+        self._thread: threading.Thread | None = None
+
+    @property
+    def card(self) -> ModelCard:
+        """What is loaded."""
+        return self._loaded.card
+
+    async def start(self) -> None:
+        """Start the decoding thread."""
+        if self._thread is not None:
+            raise EngineError("the engine runs already")
+        self._thread = threading.Thread(target=self._run, name="looktwice-engine", daemon=True)
+        self._thread.start()
+
+    async def stop(self) -> None:
+        """Cancel everything and end the thread; running requests get an `EngineError`."""
+        if self._thread is None:
+            return
+        self._commands.put(None)
+        await asyncio.to_thread(self._thread.join)
+        self._thread = None
+
+    async def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
+        """Queue a request and iterate over its events; see `Engine.submit`."""
+        if self._thread is None or not self._thread.is_alive():
+            raise EngineError("the engine is not running")
+        if request.request_id in self._listeners:
+            raise RequestError(f"request id {request.request_id} is in use")
+        events: asyncio.Queue[Event | Failed] = asyncio.Queue()
+        self._listeners[request.request_id] = (asyncio.get_running_loop(), events)
+        self._commands.put(lambda decoder: self._add(decoder, request))
+        try:
+            remaining = request.controls.n
+            while remaining:
+                event = await events.get()
+                if isinstance(event, Failed):
+                    raise event.error
+                remaining -= isinstance(event, DrawFinished)
+                yield event
+        finally:
+            if self._listeners.pop(request.request_id, None):
+                self.cancel(request.request_id)
+
+    def cancel(self, request_id: str) -> None:
+        """Drop a request; unknown ids are ignored."""
+        self._commands.put(lambda decoder: decoder.cancel(request_id))
+
+    def _add(self, decoder: Decoder, request: PlanRequest) -> None:
+        try:
+            decoder.add(request)
+        except RequestError as error:
+            self._tell(request.request_id, Failed(error))
+
+    def _tell(self, request_id: str, event: Event | Failed) -> None:
+        if listener := self._listeners.get(request_id):
+            loop, events = listener
+            loop.call_soon_threadsafe(events.put_nowait, event)
+
+    def _run(self) -> None:
+        settings = self._settings
+        decoder = Decoder(Runner(self._loaded, settings.rows, settings.length), jump=settings.jump)
+        reason: Exception = EngineError("the engine was stopped")
+        try:
+            with torch.inference_mode():
+                while self._obey(decoder):
+                    for request_id, event in decoder.step():
+                        self._tell(request_id, event)
+        except Exception as error:  # the thread's last word: everyone who waits must hear of it
+            reason = EngineError(f"decoding failed: {error}")
+            reason.__cause__ = error
+        for request_id in list(self._listeners):
+            self._tell(request_id, Failed(reason))
+
+    def _obey(self, decoder: Decoder) -> bool:
+        """Carry out what was asked for; waits only while there is nothing to decode. False ends the loop."""
+        while decoder.idle or not self._commands.empty():
+            command = self._commands.get()
+            if command is None:
+                return False
+            command(decoder)
+        return True

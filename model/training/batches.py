@@ -1,0 +1,170 @@
+"""Batches for learning to respond: examples with a task each, padded and stacked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import BatchSampler, Dataset
+
+from model.driving.images import decode_image
+from model.formats.cf_vla import FORMATS
+from model.formats.cursor import CompiledFormat
+from model.network.inputs import InputBuilder
+from model.network.patches import patchify, resize
+from model.network.prompts import prompt_text
+from model.network.vocabulary import Vocabulary
+from model.training.examples import Examples
+from model.training.targets import SectionWeights, Task, make_target
+
+Batch = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Item:
+    """Which example to learn from, and how."""
+
+    index: int
+    task: Task
+    route: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One example rendered for the network."""
+
+    ids: list[int]
+    weights: list[float]
+    patches: np.ndarray[tuple[int, ...], np.dtype[np.uint8]] | None
+    history: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+    route: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+
+
+class ResponseDataset(Dataset[Sample]):
+    """Renders `Item`s; the items of an epoch come from `TaskSampler`."""
+
+    def __init__(
+        self,
+        examples: Examples,
+        codes: np.ndarray[tuple[int, int], np.dtype[np.int64]],
+        inputs: InputBuilder,
+        vocabulary: Vocabulary,
+        weights: SectionWeights,
+        *,
+        pictures: bool,
+    ) -> None:
+        self._examples, self._codes, self._inputs = examples, codes, inputs
+        self._weights, self._pictures, self._vocabulary = weights, pictures, vocabulary
+        self._formats = {name: CompiledFormat(FORMATS[name], vocabulary) for name in ("cf_vla", "traj_only")}
+
+    def __len__(self) -> int:
+        return len(self._examples)
+
+    def __getitem__(self, item: Item) -> Sample:
+        examples, index = self._examples, item.index
+        target = make_target(
+            self._formats[item.task], examples.plan(index), self._codes[index].tolist(), self._weights
+        )
+        prompt = self._prompt(item)
+        return Sample(
+            ids=prompt + list(target.ids),
+            weights=[0.0] * len(prompt) + list(target.weights),
+            patches=patchify(self.frames(index), self._inputs.settings) if self._pictures else None,
+            history=examples.history[index],
+            route=np.nan_to_num(examples.route[index]),
+        )
+
+    def _prompt(self, item: Item) -> list[int]:
+        if self._pictures:
+            return cast("list[int]", self._inputs.prompt(item.task, route=item.route).ids.tolist())
+        # Learning the language first, without pictures, is ten times faster: the same prompt less its clips.
+        return list(self._vocabulary.encode(prompt_text(item.task, (), 0, route=item.route)))
+
+    def frames(self, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+        """The pictures of an example, uint8 [cameras x 4, h, w, 3]."""
+        cameras, frames = self._examples.picture_spans.shape[1:3]
+        return np.stack(
+            [
+                resize(decode_image(self._examples.picture(index, camera, frame)), self._inputs.settings)
+                for camera in range(cameras)
+                for frame in range(frames)
+            ]
+        )
+
+
+class TaskSampler(BatchSampler):
+    """Epochs of batches; within a batch the task and the presence of a route are the same, so little is padded.
+
+    Args:
+        examples: how many there are, and which have a route.
+        batch_size: examples per batch.
+        tasks: share of the examples for each task.
+        route_share: share of the examples, among those that have one, that are given their route.
+        seed: of the order; every epoch has another one.
+    """
+
+    def __init__(
+        self,
+        has_route: np.ndarray[tuple[int], np.dtype[np.bool_]],
+        batch_size: int,
+        tasks: Mapping[Task, float],
+        route_share: float,
+        seed: int,
+    ) -> None:
+        self._has_route, self.batch_size, self._tasks = has_route, batch_size, tasks
+        self._route_share, self._seed, self._epoch = route_share, seed, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch's order."""
+        self._epoch = epoch
+
+    def __len__(self) -> int:
+        return len(self._has_route) // self.batch_size
+
+    def __iter__(self) -> Iterator[list[Item]]:  # type: ignore[override]  # items instead of positions
+        random = np.random.default_rng((self._seed, self._epoch))
+        order = random.permutation(len(self._has_route))
+        given = self._has_route & (random.random(len(order)) < self._route_share)
+        names = list(self._tasks)
+        drawn = random.choice(len(names), len(order), p=list(self._tasks.values()))
+        buckets: dict[tuple[int, bool], list[Item]] = {}
+        leftover: list[Item] = []
+        batches: list[list[Item]] = []
+        for index in order:
+            key = (int(drawn[index]), bool(given[index]))
+            bucket = buckets.setdefault(key, [])
+            bucket.append(Item(int(index), names[key[0]], key[1]))
+            if len(bucket) == self.batch_size:
+                batches.append(buckets.pop(key))
+        for bucket in buckets.values():
+            leftover += bucket
+        batches += [
+            leftover[start : start + self.batch_size] for start in range(0, len(leftover), self.batch_size)
+        ]
+        yield from batches[: len(self)]
+
+
+def collate(samples: list[Sample]) -> Batch:
+    """Stack samples, padded on the right with token 0 and weight 0."""
+    width = max(len(sample.ids) for sample in samples)
+    ids = np.zeros((len(samples), width), np.int64)
+    weights = np.zeros((len(samples), width), np.float32)
+    mask = np.zeros((len(samples), width), np.int64)
+    for row, sample in enumerate(samples):
+        ids[row, : len(sample.ids)] = sample.ids
+        weights[row, : len(sample.ids)] = sample.weights
+        mask[row, : len(sample.ids)] = 1
+    batch = {
+        "input_ids": torch.from_numpy(ids),
+        "attention_mask": torch.from_numpy(mask),
+        "loss_weights": torch.from_numpy(weights),
+        "history": torch.from_numpy(np.stack([sample.history for sample in samples])),
+        "route": torch.from_numpy(np.stack([sample.route for sample in samples])),
+    }
+    if samples[0].patches is not None:
+        batch["patches"] = torch.from_numpy(np.concatenate([sample.patches for sample in samples]))  # type: ignore[misc]
+    return batch

@@ -1,0 +1,147 @@
+"""Labelled scenes brought into arrays for training, cached per scene file.
+
+Reading nested Parquet rows costs milliseconds a scene; an epoch would spend more on that than on learning.
+The cache holds what training reads, in flat arrays, and is rebuilt whenever its scene file is newer.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from model.driving.labeller import label_plan
+from model.driving.plan import Plan, plan_from_bins
+from model.driving.scene import CLIP_FRAMES, LabelledScene
+from model.driving.scene_store import read_scenes, scene_files
+from model.driving.trajectory import FloatArray
+from model.training.facts import scene_facts
+
+CACHE_VERSION: Final = 1
+DENSE_FAR_M: Final = 200.0
+"""Ranges beyond are all the same to a dense target."""
+
+
+@dataclass(frozen=True, eq=False)
+class Examples:
+    """N labelled scenes as arrays.
+
+    Attributes:
+        pictures: uint8, all encoded pictures one after the other, each distinct one once.
+        picture_spans: int64 [N, cameras, 4, 2], first and last-plus-one byte of each picture.
+        history: float32 [N, 16, 4].
+        route: float32 [N, 20, 2]; NaN where a scene has none.
+        future: float32 [N, 64, 4].
+        plan_bins: int8 [N, 3, 64].
+        dense_classes: uint8 [N, cameras, h, w].
+        dense_range_log: float16 [N, cameras, h, w], log(1 + metres); 0 where there is nothing.
+        facts: float32 [N, facts].
+        episode: int64 [N], the simulator's seed.
+    """
+
+    pictures: npt.NDArray[np.uint8]
+    picture_spans: npt.NDArray[np.int64]
+    history: FloatArray
+    route: FloatArray
+    future: FloatArray
+    plan_bins: npt.NDArray[np.int8]
+    dense_classes: npt.NDArray[np.uint8]
+    dense_range_log: npt.NDArray[np.float16]
+    facts: FloatArray
+    episode: npt.NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.history)
+
+    def picture(self, index: int, camera: int, frame: int) -> bytes:
+        """One encoded picture."""
+        first, last = self.picture_spans[index, camera, frame]
+        return self.pictures[first:last].tobytes()
+
+    def plan(self, index: int) -> Plan:
+        """The expert's plan."""
+        return plan_from_bins(self.plan_bins[index])
+
+    @classmethod
+    def from_scenes(cls, scenes: Iterable[LabelledScene], cameras: Sequence[str]) -> Examples:
+        """Gather scenes; every scene needs all ``cameras`` and their dense targets, or none of the latter."""
+        blob, spans_of = bytearray(), dict[bytes, tuple[int, int]]()
+        columns: dict[str, list[Any]] = {field.name: [] for field in fields(cls)}
+        for labelled in scenes:
+            scene = labelled.scene
+            spans = []
+            for camera in cameras:
+                for picture in scene.clip(camera).images:
+                    if picture not in spans_of:
+                        spans_of[picture] = (len(blob), len(blob) + len(picture))
+                        blob += picture
+                    spans.append(spans_of[picture])
+            columns["picture_spans"].append(np.reshape(spans, (len(cameras), CLIP_FRAMES, 2)))
+            columns["history"].append(scene.history)
+            columns["route"].append(
+                np.full((20, 2), np.nan, np.float32) if scene.route is None else scene.route
+            )
+            columns["future"].append(labelled.future)
+            plan = label_plan(labelled.future, scene.history, labelled.lane_trace)
+            columns["plan_bins"].append(plan.bins())
+            dense = {target.camera: target for target in labelled.dense}
+            columns["dense_classes"].append([dense[camera].classes for camera in cameras])
+            columns["dense_range_log"].append(
+                [np.log1p(np.minimum(dense[camera].range_m, DENSE_FAR_M)) for camera in cameras]
+            )
+            columns["facts"].append(scene_facts(labelled))
+            columns["episode"].append(labelled.seed)
+        types = {"picture_spans": np.int64, "plan_bins": np.int8, "dense_classes": np.uint8}
+        types |= {"dense_range_log": np.float16, "episode": np.int64}
+        arrays = {
+            name: np.asarray(values, types.get(name, np.float32))
+            for name, values in columns.items()
+            if name != "pictures"
+        }
+        return cls(pictures=np.frombuffer(bytes(blob), np.uint8), **arrays)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Examples]) -> Examples:
+        """Several sets of examples as one."""
+        starts = np.cumsum([0, *(len(part.pictures) for part in parts)])[:-1]
+        columns = {
+            field.name: np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)
+        }
+        columns["picture_spans"] = np.concatenate(
+            [part.picture_spans + start for part, start in zip(parts, starts, strict=True)]
+        )
+        return cls(**columns)
+
+
+def load_examples(scenes: Path, cache: Path, cameras: Sequence[str], workers: int = 2) -> Examples:
+    """The examples of a scene file or folder, through the cache folder."""
+    jobs = [(file, cache / f"{file.parent.name}-{file.stem}.v{CACHE_VERSION}.npz") for file in scene_files(scenes)]
+    stale = [
+        (file, cached)
+        for file, cached in jobs
+        if not cached.exists() or cached.stat().st_mtime < file.stat().st_mtime
+    ]
+    cache.mkdir(parents=True, exist_ok=True)
+    if stale:
+        with ProcessPoolExecutor(min(workers, len(stale))) as pool:
+            list(pool.map(_fill_cache, *zip(*[(*job, tuple(cameras)) for job in stale], strict=True)))
+    parts = []
+    for _, cached in jobs:
+        with np.load(cached) as arrays:
+            part = cast("dict[str, Any]", {field.name: arrays[field.name] for field in fields(Examples)})
+        if len(part["history"]):
+            parts.append(Examples(**part))
+    return Examples.concatenate(parts)
+
+
+def _fill_cache(file: Path, cached: Path, cameras: tuple[str, ...]) -> None:
+    examples = Examples.from_scenes(read_scenes(file), cameras)
+    temporary = cached.with_name(f".{cached.name}.{os.getpid()}.npz")
+    np.savez(temporary, **{field.name: getattr(examples, field.name) for field in fields(Examples)})  # type: ignore[arg-type]
+    os.replace(temporary, cached)

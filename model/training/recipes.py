@@ -1,0 +1,109 @@
+"""Recipes: the stages of learning with everything that decides their outcome (CF-VLA sections 3.4 and 7).
+
+The paper trains a pretrained 3B model; a model from scratch on a small budget needs its stages in this
+order: ``language`` (history and plan language, no pictures), ``ground`` (the vision tower alone), then
+``traj-only`` and ``meta-act`` with pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+from model.training.targets import PAPER_WEIGHTS, SectionWeights, Task
+
+Goal = Literal["ground", "respond"]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One stage.
+
+    Attributes:
+        name: as the command line gives it.
+        goal: ``ground`` trains the vision tower alone, ``respond`` trains everything on responses.
+        pictures: whether responses are learned with pictures.
+        tasks: share of the examples for each response format.
+        route_share: share of the examples whose route is given.
+        weights: of sections in the loss.
+        steps, batch_size: how long.
+        learning_rate, warmup_steps: cosine decay to zero behind a linear warm-up.
+        vision_rate: the tower's learning rate, relative to the rest.
+        seed: of order and initialisation.
+    """
+
+    name: str
+    goal: Goal
+    steps: int
+    batch_size: int
+    learning_rate: float
+    warmup_steps: int
+    pictures: bool = True
+    tasks: Mapping[Task, float] = field(default_factory=dict)
+    route_share: float = 0.5
+    weights: SectionWeights = field(default_factory=lambda: PAPER_WEIGHTS)
+    vision_rate: float = 1.0
+    seed: int = 0
+
+
+NANO: Final[Mapping[str, Recipe]] = {
+    recipe.name: recipe
+    for recipe in (
+        Recipe(
+            "language",
+            "respond",
+            steps=6000,
+            batch_size=32,
+            learning_rate=1e-3,
+            warmup_steps=200,
+            pictures=False,
+            tasks={"traj_only": 0.5, "cf_vla": 0.5},
+        ),
+        Recipe("ground", "ground", steps=6000, batch_size=24, learning_rate=1e-3, warmup_steps=200),
+        Recipe(
+            "traj-only",
+            "respond",
+            steps=3000,
+            batch_size=16,
+            learning_rate=5e-4,
+            warmup_steps=200,
+            tasks={"traj_only": 1.0},
+        ),
+        Recipe(
+            "meta-act",
+            "respond",
+            steps=6000,
+            batch_size=16,
+            learning_rate=5e-4,
+            warmup_steps=200,
+            tasks={"traj_only": 0.25, "cf_vla": 0.75},
+        ),
+    )
+}
+"""The stages of the shipped checkpoint."""
+
+PAPER: Final[Mapping[str, Recipe]] = {
+    recipe.name: recipe
+    for recipe in (
+        Recipe(
+            "traj-only",
+            "respond",
+            steps=300_000,
+            batch_size=1,
+            learning_rate=1e-5,
+            warmup_steps=2000,
+            tasks={"traj_only": 1.0},
+        ),
+        Recipe(
+            "meta-act",
+            "respond",
+            steps=300_000,
+            batch_size=1,
+            learning_rate=1e-5,
+            warmup_steps=2000,
+            tasks={"traj_only": 0.5, "cf_vla": 0.5},
+        ),
+    )
+}
+"""The paper's stages for a pretrained backbone; the batch is per device (64 of them there)."""

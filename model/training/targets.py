@@ -1,0 +1,93 @@
+"""What a response should say for a labelled scene, and how much each of its tokens weighs.
+
+Loss is taken on assistant tokens only; weights come from section names, 1 : 10 : 10 for trajectory,
+meta-actions and reasoning (CF-VLA sections 3.4 and 7); the first plan of a counterfactual example weighs 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, Literal
+
+from model.driving.plan import Plan
+from model.formats.cursor import CompiledFormat, Token
+from model.formats.pieces import ACTION, BRANCH, THINKING, Values
+
+SectionWeights = Mapping[str, float]
+
+PAPER_WEIGHTS: Final[SectionWeights] = MappingProxyType(
+    {"plan": 10.0, "branch": 10.0, "thinking": 10.0, "revised_plan": 10.0, "trajectory": 1.0}
+)
+"""w_act : w_meta : w_CF = 1 : 10 : 10 (CF-VLA section 7); the branch word counts as a meta-action token."""
+
+Task = Literal["traj_only", "cf_vla"]
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """A counterfactual example's own parts: a plan that is to be corrected, and why."""
+
+    first_plan: Plan
+    thinking: str
+
+
+@dataclass(frozen=True)
+class Target:
+    """A response to learn: token ids and the weight of each in the loss."""
+
+    ids: tuple[int, ...]
+    weights: tuple[float, ...]
+
+
+def target_values(
+    task: Task, plan: Plan, codes: Sequence[int], reflection: Reflection | None = None
+) -> Values:
+    """The values of the response that an expert would give.
+
+    Args:
+        task: the response format's name.
+        plan: the expert's plan.
+        codes: the expert's trajectory codes.
+        reflection: makes it a counterfactual example: first the wrong plan, then reasoning, then ``plan``.
+    """
+    trajectory = tuple(int(code) for code in codes)
+    if task == "traj_only":
+        return {"trajectory": trajectory}
+    if reflection is None:
+        return {"plan": plan, BRANCH: ACTION, "trajectory": trajectory}
+    return {
+        "plan": reflection.first_plan,
+        BRANCH: THINKING,
+        "thinking": reflection.thinking,
+        "revised_plan": plan,
+        "trajectory": trajectory,
+    }
+
+
+def weigh(tokens: Sequence[Token], weights: SectionWeights, *, counterfactual: bool = False) -> Target:
+    """A rendered response with the weight of each token's section.
+
+    Raises:
+        KeyError: a section has no weight.
+    """
+    by_section = dict(weights)
+    if counterfactual:
+        by_section["plan"] = 0.0
+    return Target(
+        tuple(token.id for token in tokens), tuple(by_section[token.section] for token in tokens)
+    )
+
+
+def make_target(
+    compiled: CompiledFormat,
+    plan: Plan,
+    codes: Sequence[int],
+    weights: SectionWeights = PAPER_WEIGHTS,
+    reflection: Reflection | None = None,
+) -> Target:
+    """Render and weigh the expert's response in ``compiled``'s format."""
+    task: Task = "traj_only" if compiled.format.name == "traj_only" else "cf_vla"
+    tokens = compiled.render(target_values(task, plan, codes, reflection))
+    return weigh(tokens, weights, counterfactual=reflection is not None)

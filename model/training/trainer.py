@@ -1,0 +1,131 @@
+"""The trainer: `transformers.Trainer` with our batches, logs as JSON lines, and validation in metres."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from torch import nn
+from torch.utils.data import DataLoader, Dataset
+from transformers import Trainer, TrainerCallback, TrainingArguments
+
+from model.training.batches import TaskSampler
+from model.training.recipes import Recipe
+
+_STATE_FILE: Final = "learner.pt"
+LOG_FILE: Final = "log.jsonl"
+
+Validate = Callable[[], Mapping[str, float]]
+
+
+class LearnerTrainer(Trainer):  # type: ignore[misc]
+    """Trains a learner (a module whose forward gives the loss) on batches of its own sampler."""
+
+    def __init__(
+        self,
+        learner: nn.Module,
+        recipe: Recipe,
+        dataset: Dataset[Any],
+        collate: Callable[[list[Any]], dict[str, torch.Tensor]],
+        folder: Path,
+        *,
+        sampler: TaskSampler | None,
+        validate: Validate | None,
+        validate_every: int,
+        save_every: int,
+        bf16: bool,
+        use_cpu: bool,
+    ) -> None:
+        arguments = TrainingArguments(
+            output_dir=str(folder / "state"),
+            max_steps=recipe.steps,
+            per_device_train_batch_size=recipe.batch_size,
+            learning_rate=recipe.learning_rate,
+            warmup_steps=recipe.warmup_steps,
+            lr_scheduler_type="cosine",
+            adam_beta1=0.9,
+            adam_beta2=0.95,
+            adam_epsilon=1e-8,
+            weight_decay=0.01,
+            max_grad_norm=1.0,
+            logging_steps=50,
+            save_steps=save_every,
+            save_total_limit=1,
+            seed=recipe.seed,
+            bf16=bf16,
+            use_cpu=use_cpu,
+            report_to=[],
+            remove_unused_columns=False,
+            dataloader_num_workers=0,
+            disable_tqdm=True,
+        )
+        folder.mkdir(parents=True, exist_ok=True)
+        super().__init__(
+            model=learner,
+            args=arguments,
+            train_dataset=dataset,
+            data_collator=collate,
+            callbacks=[_Log(folder / LOG_FILE, validate, validate_every)],
+        )
+        self._recipe, self._sampler = recipe, sampler
+
+    def get_train_dataloader(self) -> Any:
+        """Batches of equal tasks where there is a sampler for them."""
+        if self._sampler is None:
+            return super().get_train_dataloader()
+        loader = DataLoader(self.train_dataset, batch_sampler=self._sampler, collate_fn=self.data_collator)
+        return self.accelerator.prepare(loader)
+
+    def create_optimizer(self, *args: Any, **kwargs: Any) -> Any:
+        """AdamW with the vision tower's own learning rate."""
+        if self.optimizer is None:
+            assert self.model is not None
+            groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
+            for name, parameter in self.model.named_parameters():
+                if parameter.requires_grad:
+                    groups.setdefault((".visual." in name, parameter.ndim > 1), []).append(parameter)
+            arguments = self.args
+            self.optimizer = torch.optim.AdamW(
+                [
+                    {
+                        "params": parameters,
+                        "lr": arguments.learning_rate * (self._recipe.vision_rate if vision else 1.0),
+                        "weight_decay": arguments.weight_decay if decayed else 0.0,
+                    }
+                    for (vision, decayed), parameters in groups.items()
+                ],
+                betas=(arguments.adam_beta1, arguments.adam_beta2),
+                eps=arguments.adam_epsilon,
+            )
+        return self.optimizer
+
+    # Tied weights make safetensors refuse a plain module; torch's own file keeps them tied.
+    def _save(self, output_dir: str | None = None, state_dict: dict[str, Any] | None = None) -> None:
+        folder = Path(output_dir or self.args.output_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        torch.save(state_dict or self.model.state_dict(), folder / _STATE_FILE)
+
+    def _load_from_checkpoint(self, resume_from_checkpoint: str, model: nn.Module | None = None) -> None:
+        state = torch.load(Path(resume_from_checkpoint) / _STATE_FILE, map_location="cpu", weights_only=True)
+        (model or self.model).load_state_dict(state)
+
+
+class _Log(TrainerCallback):  # type: ignore[misc]
+    """Appends what the trainer logs, and validation figures, to a file of JSON lines."""
+
+    def __init__(self, path: Path, validate: Validate | None, every: int) -> None:
+        self._path, self._validate, self._every = path, validate, every
+
+    def on_log(self, args: Any, state: Any, control: Any, logs: dict[str, Any] | None = None, **_: Any) -> None:
+        self._write({"step": state.global_step, **(logs or {})})
+
+    def on_step_end(self, args: Any, state: Any, control: Any, **_: Any) -> None:
+        if self._validate and (state.global_step % self._every == 0 or state.global_step == state.max_steps):
+            self._write({"step": state.global_step, **self._validate()})
+
+    def _write(self, row: Mapping[str, Any]) -> None:
+        with self._path.open("a") as file:
+            file.write(json.dumps(row) + "\n")

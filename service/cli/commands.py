@@ -1,0 +1,19 @@
+"""All commands in one tree; each imports what it needs when it runs, so that help is instant."""
+
+from __future__ import annotations
+
+import typer
+
+from service.cli import evaluate, plan, scenes, serve, train
+
+app = typer.Typer(
+    name="looktwice",
+    help="A server for driving models that look twice before they act.",
+    no_args_is_help=True,
+    pretty_exceptions_show_locals=False,
+)
+app.command("plan")(plan.plan)
+app.command("serve")(serve.serve)
+app.command("train")(train.train)
+app.command("evaluate")(evaluate.evaluate)
+app.add_typer(scenes.app, name="scenes")

@@ -1,0 +1,33 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from model.bundled import CHECKPOINT, SCENES
+
+Checkpoint = Annotated[
+    Path, typer.Option("--checkpoint", help="Checkpoint folder.", show_default=str(CHECKPOINT.name))
+]
+ScenePath = Annotated[
+    Path, typer.Option("--scenes", help="Scene file or folder of scene files.", show_default="bundled")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+
+DEFAULT_CHECKPOINT = CHECKPOINT
+DEFAULT_SCENES = SCENES
+
+
+@contextmanager
+def told() -> Iterator[None]:
+    """Turn the project's own errors into one line on stderr and exit code 2."""
+    try:
+        yield
+    except (ValueError, FileNotFoundError, RuntimeError) as error:
+        typer.echo(f"looktwice: {error}", err=True)
+        raise typer.Exit(2) from error

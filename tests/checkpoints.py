@@ -1,0 +1,51 @@
+"""A small untrained checkpoint for tests: the nano network with fewer layers and a tiny codec."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from model.driving.images import encode_jpeg
+from model.driving.scene import CLIP_FRAMES, FRONT_TELE, FRONT_WIDE, Clip, Scene
+from model.network.checkpoint import save, write_code_embeddings
+from model.network.codec import TrajectoryCodec
+from model.network.corpus import nano_corpus
+from model.network.vla import LookTwiceVla, nano_config
+from model.network.vocabulary import Vocabulary, build_nano_tokenizer
+from tests.model.network.motions import made_up_motions
+
+CODEC_SIZE = 16
+
+
+def write_untrained(folder: Path) -> Path:
+    """Write the checkpoint and return its folder."""
+    histories, futures = made_up_motions(400)
+    codec = TrajectoryCodec.fit(histories, futures, size=CODEC_SIZE)
+    vocabulary = Vocabulary(build_nano_tokenizer(nano_corpus(), CODEC_SIZE))
+    config = nano_config(vocabulary)
+    config.text_config.num_hidden_layers = 2
+    config.text_config.layer_types = config.text_config.layer_types[:2]
+    config.vision_config.depth = 1
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = LookTwiceVla(config)
+        write_code_embeddings(model, codec, vocabulary)
+    save(folder, model, vocabulary, codec)
+    return folder
+
+
+def noisy_scene(seed: int = 0, *, route: bool = False) -> Scene:
+    """A scene with random pictures and a plausible history."""
+    random = np.random.default_rng(seed)
+    histories, _ = made_up_motions(1, seed)
+    clips = tuple(
+        Clip(
+            camera,
+            tuple(encode_jpeg(random.integers(0, 256, (112, 224, 3), np.uint8)) for _ in range(CLIP_FRAMES)),
+        )
+        for camera in (FRONT_WIDE, FRONT_TELE)
+    )
+    way = np.stack([np.arange(4.0, 84.0, 4.0), random.normal(0, 1, 20)], axis=1) if route else None
+    return Scene(f"noisy-{seed}", clips, histories[0], None if way is None else way.astype(np.float32))

@@ -1,0 +1,71 @@
+"""Dependency arrows point one way (docs/architecture.md): read from the code's own imports."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("model", "service", "clients", "loadtests")
+EVERYTHING = PACKAGES
+ALLOWED = {
+    "model": ("model",),
+    "model.driving": ("model.driving",),
+    "model.formats": ("model.formats", "model.driving"),
+    "clients": ("clients", "model.driving"),
+    "loadtests": ("loadtests", "clients", "model.driving"),
+    "service": ("service", "clients.wire", "clients.labelling.teachers", "model"),
+    "service.cli": EVERYTHING,
+}
+TORCH_FREE = ("model.driving", "model.formats", "clients", "loadtests")
+LIGHT = ("clients.wire", "clients.planner")
+LIGHT_IMPORTS = ("numpy", "PIL", "httpx", "pydantic", "model", "clients")
+
+
+def modules() -> Iterator[tuple[str, Path]]:
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
+
+
+def imports(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: imports are absolute here"
+            yield node.module or ""
+
+
+def within(name: str, packages: tuple[str, ...]) -> bool:
+    return any(name == package or name.startswith(package + ".") for package in packages)
+
+
+@pytest.mark.parametrize(("name", "path"), modules())
+def test_arrows_point_one_way(name: str, path: Path) -> None:
+    room = max((room for room in ALLOWED if within(name, (room,))), key=len)
+    ours = [imported for imported in imports(path) if within(imported, PACKAGES)]
+    assert [imported for imported in ours if not within(imported, ALLOWED[room])] == []
+
+
+@pytest.mark.parametrize(("name", "path"), modules())
+def test_torch_stays_in_the_engine_room(name: str, path: Path) -> None:
+    if within(name, TORCH_FREE):
+        assert [imported for imported in imports(path) if within(imported, ("torch", "transformers"))] == []
+
+
+@pytest.mark.parametrize(("name", "path"), modules())
+def test_the_planner_client_stays_light(name: str, path: Path) -> None:
+    if within(name, LIGHT):
+        import sys
+
+        foreign = [
+            imported
+            for imported in imports(path)
+            if imported.split(".")[0] not in sys.stdlib_module_names and not within(imported, LIGHT_IMPORTS)
+        ]
+        assert foreign == []
