@@ -46,14 +46,19 @@ WAIT_ENTER: Final = 0.3
 WAIT_LEAVE: Final = 0.5
 """m/s. Creeping up by less than this is still waiting."""
 
-CURVATURE_ENTER: Final = 1 / 100
-"""1/m. A bend of 100 m radius asks for 1.9 m/s^2 sideways at 50 km/h, about what drivers accept: a tighter
-bend is driven as a turn, a wider one by following the road. Highway curves (250 m and more) are Straight."""
-CURVATURE_LEAVE: Final = 1 / 160
+CURVATURE_ENTER: Final = 1 / 160
+"""1/m. Roads for 70 km/h and more are laid out with radii above about 200 m, and following them is Straight.
+A bend of 160 m turns by 38 degrees in 6.4 s at 60 km/h: the plan must speak of it."""
+CURVATURE_LEAVE: Final = 1 / 240
+"""1/m. Two thirds of the above."""
 CURVATURE_MIN_SPEED: Final = 2.0
 """m/s. Below it the curvature is the yaw rate over this speed, so a standing car's noise is not a turn."""
 MIN_HEADING_CHANGE: Final = float(np.deg2rad(15))
 """A turn changes the heading by at least this much; a lane change at 40 km/h swings by under 10 degrees."""
+
+LANE_CHANGE_SWING: Final = float(np.deg2rad(45))
+"""Steering for a lane change swings the heading there and back, at walking pace by up to this much; it is no
+turn. More than this is one, even when the ego changes lanes meanwhile."""
 
 LANE_MOVING: Final = 0.2
 """m/s sideways. Wandering within the lane stays below; a lane change of 3.5 m in 4 s peaks at 1.6 m/s."""
@@ -63,6 +68,8 @@ LANE_MIN_SHIFT: Final = 1.0
 """m sideways during a lane change; less is riding on the line."""
 LANE_SIDE_MAX: Final = 40
 """Steps (4 s) that a lane change may reach to each side of the moment the lane number changes."""
+
+KEEP_LANE: Final = "Keep Lane"
 
 
 def label_plan(future: npt.ArrayLike, history: npt.ArrayLike, lane_trace: LaneTrace | None) -> Plan:
@@ -87,10 +94,12 @@ def label_plan(future: npt.ArrayLike, history: npt.ArrayLike, lane_trace: LaneTr
     # Along the heading, so that reversing is negative and sliding sideways is no speed.
     raw_speed = (step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading)) / STEP_S
     speed = _smoothed(raw_speed, SPEED_WINDOW)
+    lane = None if lane_trace is None else _lane(lane_trace)
+    changing = np.array([word != KEEP_LANE for word in lane or [KEEP_LANE] * len(speed)])
     return Plan(
         longitudinal=_track(_longitudinal(speed, _slope(raw_speed, ACCELERATION_WINDOW))),
-        lateral=_track(_lateral(_smoothed(turned / STEP_S, SPEED_WINDOW), speed)),
-        lane=None if lane_trace is None else _lane_track(lane_trace),
+        lateral=_track(_lateral(_smoothed(turned / STEP_S, SPEED_WINDOW), speed, changing)),
+        lane=None if lane is None else _track(lane),
     )
 
 
@@ -105,17 +114,18 @@ def _longitudinal(speed: Array, acceleration: Array) -> list[str]:
     return list(words)
 
 
-def _lateral(yaw_rate: Array, speed: Array) -> list[str]:
+def _lateral(yaw_rate: Array, speed: Array, changing: BoolArray) -> list[str]:
     words = np.full(len(speed), "Straight", dtype=object)
     curvature = yaw_rate / np.maximum(np.abs(speed), CURVATURE_MIN_SPEED)
     for word, sign in (("Left Turn", 1), ("Right Turn", -1)):
         for start, end in _runs(_hysteresis(sign * curvature, CURVATURE_ENTER, CURVATURE_LEAVE)):
-            if sign * yaw_rate[start:end].sum() * STEP_S >= MIN_HEADING_CHANGE:
+            swing = LANE_CHANGE_SWING if changing[start:end].mean() > 0.5 else MIN_HEADING_CHANGE
+            if sign * yaw_rate[start:end].sum() * STEP_S >= swing:
                 words[start:end] = word
     return list(words)
 
 
-def _lane_track(trace: LaneTrace) -> Track | None:
+def _lane(trace: LaneTrace) -> list[str] | None:
     known = (trace.lane >= 0) & (trace.road >= 0)
     if not known[HISTORY_STEPS - 1 :].all():
         return None
@@ -123,7 +133,7 @@ def _lane_track(trace: LaneTrace) -> Track | None:
     crossing = np.where(same_road, np.sign(np.diff(trace.lane)), 0)
     offset = trace.offset_m.astype(np.float64)
     sideways = _smoothed(_sideways_speed(offset, (crossing == 0) & same_road), SPEED_WINDOW)
-    words = np.full(len(sideways), "Keep Lane", dtype=object)
+    words = np.full(len(sideways), KEEP_LANE, dtype=object)
     for step in np.flatnonzero(crossing).tolist():
         # Lane 0 is the leftmost: a number that goes down is a change to the left.
         left = crossing[step] < 0
@@ -137,7 +147,7 @@ def _lane_track(trace: LaneTrace) -> Track | None:
             end += 1
         if towards[start:end].sum() * STEP_S >= LANE_MIN_SHIFT:
             words[start:end] = "Left Lane Change" if left else "Right Lane Change"
-    return _track(list(words))
+    return list(words)
 
 
 def _sideways_speed(offset: Array, usable: BoolArray) -> Array:

@@ -133,15 +133,33 @@ def test_curves_count_as_turns_by_their_radius() -> None:
 
 
 def test_a_turn_once_begun_lasts_until_the_road_is_clearly_straighter() -> None:
-    radius = np.where(MIDDLES_S < 3, 80.0, 130.0)
+    radius = np.where(MIDDLES_S < 3, 120.0, 200.0)
     assert words(lateral(14.0, 14 / radius)) == ["Left Turn"]
-    assert words(lateral(14.0, 14 / 130)) == ["Straight"]
+    assert words(lateral(14.0, 14 / 200)) == ["Straight"]
 
 
 def test_swinging_out_and_back_is_no_turn() -> None:
     # A lane change at 40 km/h: the heading never leaves the road's by 10 degrees.
     yaw_rate = np.where(np.abs(MIDDLES_S - 3) < 1.5, 0.17 * np.sin((MIDDLES_S - 1.5) / 3 * 2 * np.pi), 0.0)
     assert words(lateral(11.0, yaw_rate)) == ["Straight"]
+
+
+def test_steering_for_a_lane_change_is_no_turn_where_the_lanes_are_known() -> None:
+    # At 18 km/h the heading swings by 30 degrees; a turn of 60 degrees meanwhile is still a turn.
+    there_and_back = np.where(np.abs(MIDDLES_S - 3) < 2, np.sin((MIDDLES_S - 1) / 4 * 2 * np.pi), 0.0)
+    future, history = drive(5.0, 0.42 * there_and_back)
+    change = lane_trace(shift(1, 4))
+    assert words(label_plan(future, history, None).lateral) == [
+        "Straight",
+        "Left Turn",
+        "Right Turn",
+        "Straight",
+    ]
+    plan = label_plan(future, history, change)
+    assert words(plan.lateral) == ["Straight"]
+    assert words(plan.lane) == ["Keep Lane", "Left Lane Change", "Keep Lane"]
+    turning = label_plan(*drive(5.0, np.where(np.abs(MIDDLES_S - 3) < 2, 0.27, 0.0)), change)
+    assert words(turning.lateral) == ["Straight", "Left Turn", "Straight"]
 
 
 def test_a_standing_car_does_not_turn() -> None:
