@@ -113,8 +113,10 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw]) -> SceneResul
     if not draws:
         raise ValueError(f"scene {labelled.scene.scene_id} has no draws to evaluate")
     expert = expert_plan(labelled)
-    first = [_iou(draw.plan, expert) for draw in draws if draw.plan is not None]
-    last = [_iou(draw.revised_plan or draw.plan, expert) for draw in draws if draw.plan is not None]
+    first = [iou_with_expert(draw.plan, expert) for draw in draws if draw.plan is not None]
+    last = [
+        iou_with_expert(draw.revised_plan or draw.plan, expert) for draw in draws if draw.plan is not None
+    ]
     branches = [draw.branch for draw in draws if draw.branch is not None]
     return replace(
         evaluate_trajectories(labelled, np.stack([draw.trajectory for draw in draws])),
@@ -170,9 +172,9 @@ def _distance_to_line(point: FloatArray, line: FloatArray) -> float:
     return float(np.linalg.norm(start + along[:, None] * step - point, axis=1).min())
 
 
-def _iou(plan: Plan | None, expert: Plan) -> float:
+def iou_with_expert(plan: Plan, expert: Plan) -> float:
     """IOU over the groups whose truth is known: without lanes, nobody knows whether the lane was kept."""
-    known = {group: track for group, track in (plan or Plan()).tracks() if expert.track(group) is not None}
+    known = {group: track for group, track in plan.tracks() if expert.track(group) is not None}
     return plan_iou(Plan(**known), expert)
 
 

@@ -126,7 +126,7 @@ def request_for(labelled: LabelledScene, variant: Variant) -> PlanRequest:
     scene = labelled.scene
     if variant.route and scene.route is None:
         raise ValueError(f"{variant.name}: scene {scene.scene_id} has no route")
-    # A draw's random numbers depend on the seed alone: one seed for all scenes would give all of them the same
+    # A draw's random numbers depend on the seed alone: one seed for all scenes would give all the same
     # luck. A seed from the scene's name does not, and variants still meet the same luck in the same scene.
     seed = variant.controls.seed ^ zlib.crc32(scene.scene_id.encode())
     return PlanRequest(
