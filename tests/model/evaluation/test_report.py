@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.driving.scene import FRONT_WIDE
+from model.driving.trajectory import FloatArray
+from model.engines.engine import Controls, DrawFinished, Event, PlanRequest
+from model.evaluation.open_loop import SceneResult
+from model.evaluation.report import LEAD_SUBGROUP, Report, evaluate_checkpoint
+from model.evaluation.variants import Variant, standard_variants
+from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
+from tests.model.evaluation.fakes import FakeEngine, draw_of
+
+SCENES = [
+    labelled_scene(
+        10.0 + 0.8 * np.maximum(MIDDLES_S, 0),
+        scene_id=f"s{i}",
+        episode_id=f"e{i // 2}",
+        pictures=i,
+        agents=(agent(18, 0, 10),) if i % 2 else (),
+    )
+    for i in range(6)
+]
+OWN_PICTURE = {labelled.scene.scene_id: labelled.scene.clip(FRONT_WIDE) for labelled in SCENES}
+
+
+class LookingEngine(FakeEngine):
+    """Plans as far off as what it lacks: the right pictures, the expert's plan, a plan at all."""
+
+    async def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
+        looks_right = request.scene.clip(FRONT_WIDE) == OWN_PICTURE[request.scene.scene_id]
+        plain = 1.0 if request.format == "traj_only" else 0.8
+        metres = plain * (0.5 if request.controls.prefill else 1.0) * (1.0 if looks_right else 2.0)
+        future: FloatArray = next(s.future for s in SCENES if s.scene.scene_id == request.scene.scene_id)
+        for index in range(request.controls.n):
+            aside = (future + np.array([0, metres, 0, 0])).astype(np.float32)
+            yield DrawFinished(draw_of(aside, request.controls.prefill, index=index))
+
+
+@pytest.fixture(scope="module")
+def report() -> Report:
+    seen: list[tuple[Variant, SceneResult]] = []
+    variants = standard_variants(["cf_vla", "traj_only"], n=2)
+    made = asyncio.run(
+        evaluate_checkpoint(
+            LookingEngine(),
+            SCENES,
+            variants,
+            on_result=lambda variant, result: seen.append((variant, result)),
+        )
+    )
+    assert len(seen) == len(variants) * len(SCENES)
+    return made
+
+
+def test_every_variant_and_baseline_has_a_row_and_one_for_scenes_with_a_lead(report: Report) -> None:
+    names = [row.name for row in report.rows]
+    assert names[:4] == ["constant velocity"] * 2 + ["constant turn rate"] * 2
+    assert len(names) == 2 * (2 + 8)
+    assert {(row.subgroup, row.scenes) for row in report.rows} == {(None, 6), (LEAD_SUBGROUP, 3)}
+    assert {row.route for row in report.rows if "route" in row.name} == {True}
+    assert report.to_json()["scenes"] == 6
+
+
+def test_what_should_differ_is_compared(report: Report) -> None:
+    ratio = {comparison.name: comparison.ratio for comparison in report.comparisons}
+    for free in ("meta-act", "meta-act + route"):
+        plain = free.replace("meta-act", "traj-only")
+        assert ratio[f"{free} : {plain}"] == pytest.approx(0.8, rel=1e-3)
+        assert ratio[f"{free}, expert plan : {free}"] == pytest.approx(0.5, rel=1e-3)
+        assert ratio[f"{free}, shuffled images : {free}"] == pytest.approx(2.0, rel=1e-3)
+        assert ratio[f"{free}, shuffled images : {free} [{LEAD_SUBGROUP}]"] == pytest.approx(2.0, rel=1e-3)
+    baseline = min(row.values["min_ade_m"] or 0 for row in report.rows if row.name.startswith("constant"))
+    assert baseline > 1
+    assert "meta-act : constant velocity" in ratio or "meta-act : constant turn rate" in ratio
+    assert "meta-act + route : meta-act" not in ratio
+
+
+def test_the_text_holds_rows_and_comparisons(report: Report) -> None:
+    text = str(report)
+    assert "meta-act, shuffled images : meta-act" in text
+    assert text.count("\n") == 1 + len(report.rows) + len(report.comparisons)
+
+
+def test_a_variant_without_its_free_counterpart_is_only_a_row() -> None:
+    alone = Variant("given", controls=Controls(n=1), expert_plan=True)
+    scenes = [replace(scene, agents=()) for scene in SCENES]
+    report = asyncio.run(evaluate_checkpoint(FakeEngine(), scenes, [alone]))
+    assert report.comparisons == ()
+    assert [row.subgroup for row in report.rows] == [None] * 3
