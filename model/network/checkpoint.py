@@ -11,9 +11,10 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import torch
+from safetensors import SafetensorError
 from transformers import AutoTokenizer, Qwen2_5_VLConfig
 from transformers.utils import logging as transformers_logging
 
@@ -24,6 +25,13 @@ from model.network.inputs import InputBuilder
 from model.network.settings import CONFIG_KEY, SettingsError, VlaSettings
 from model.network.vla import LookTwiceVla, VlaConfig, nano_config, padded_size, parameters_of, with_settings
 from model.network.vocabulary import Vocabulary, VocabularyError, expand_tokenizer
+
+_PUBLISHED_NAMES: Final = {
+    r"^visual\.": "model.visual.",
+    r"^model\.(?!language_model\.|visual\.)": "model.language_model.",
+}
+"""Names of weights as Qwen published them, and what `transformers` calls them now. It knows this by the
+name of its own class only, so a subclass has to say it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,10 +132,9 @@ def load(folder: Path, dtype: torch.dtype = torch.float32, device: str = "cpu") 
         raise CheckpointError(f"{folder}: its tokenizer cannot be loaded: {error}") from error
     _check_sizes(codec, vocabulary)
     model = _load_model(folder, config, dtype)
-    model.eval()
     network: Any = model
     return Loaded(
-        model=network.to(device),
+        model=network.to(device).eval(),
         vocabulary=vocabulary,
         codec=codec,
         inputs=InputBuilder(vocabulary, settings),
@@ -246,9 +253,14 @@ def _load_model(
         with _without_progress_bars():
             loader: Any = LookTwiceVla
             model, report = loader.from_pretrained(
-                folder, config=config, dtype=dtype, local_files_only=True, output_loading_info=True
+                folder,
+                config=config,
+                dtype=dtype,
+                key_mapping=_PUBLISHED_NAMES,
+                local_files_only=True,
+                output_loading_info=True,
             )
-    except (OSError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
         raise CheckpointError(f"{folder}: its weights cannot be loaded: {error}") from error
     absent = [
         name

@@ -91,9 +91,13 @@ class TrajectoryCodec:
         self, histories: npt.NDArray[np.floating], futures: npt.NDArray[np.floating]
     ) -> npt.NDArray[np.int64]:
         """Codes int64 [n, 6], each 0..K-1, of futures [n, 64, 4] with histories [n, 16, 4]."""
+        return quantiser.encode(self.vectors(histories, futures), self.books)
+
+    def vectors(self, histories: npt.NDArray[np.floating], futures: npt.NDArray[np.floating]) -> FloatArray:
+        """What is quantised, float32 [n, d]; a sum of one codeword per stage approximates it."""
         curves = _curves(np.asarray(histories, np.float64), np.asarray(futures, np.float64))
-        vectors = ((curves - self.mean) @ self.axes.T).astype(np.float32)
-        return quantiser.encode(vectors, self.books)
+        vectors: FloatArray = ((curves - self.mean) @ self.axes.T).astype(np.float32)
+        return vectors
 
     def decode(
         self,

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from model.network.attention import attend
+
 
 def attends_to_whole_pictures(vision_config: Any) -> bool:
     """Whether no block of the tower uses windowed attention."""
@@ -49,9 +51,7 @@ def _attention(module: Any, x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     pictures, tokens, width = x.shape
     qkv = module.qkv(x).view(pictures, tokens, 3, module.num_heads, width // module.num_heads)
     query, key, value = qkv.permute(2, 0, 3, 1, 4).unbind(0)
-    attended = functional.scaled_dot_product_attention(
-        _rotate(query, cos, sin), _rotate(key, cos, sin), value
-    )
+    attended = attend(_rotate(query, cos, sin), _rotate(key, cos, sin), value)
     projected: Tensor = module.proj(attended.transpose(1, 2).reshape(pictures, tokens, width))
     return projected
 

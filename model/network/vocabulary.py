@@ -83,7 +83,7 @@ class Vocabulary:
         self.tokenizer = tokenizer
         self._backend: Any = self.tokenizer.backend_tokenizer
         self._ids: dict[str, int] = self._backend.get_vocab(with_added_tokens=True)
-        self._length: int = max(self._ids.values()) + 1
+        self._length: int = max(self._ids.values(), default=-1) + 1
         missing = [token for token in (*QWEN_TOKENS, *OUR_TOKENS) if token not in self._ids]
         if missing:
             raise VocabularyError(f"the tokenizer lacks {', '.join(missing)}")

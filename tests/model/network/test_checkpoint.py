@@ -1,0 +1,230 @@
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tokenizers import AddedToken, Tokenizer
+from transformers import (
+    AutoModelForImageTextToText,
+    PreTrainedTokenizerFast,
+    Qwen2_5_VLConfig,
+    Qwen2_5_VLForConditionalGeneration,
+)
+
+from model.network.card import CARD_FILE, CheckpointError, weights_revision
+from model.network.checkpoint import Loaded, create_nano, expand_stock, load, save
+from model.network.codec import CODEC_FILE, TrajectoryCodec
+from model.network.settings import VlaSettings
+from model.network.vocabulary import QWEN_TOKENS, Vocabulary, build_nano_tokenizer
+from tests.model.network.conftest import made_up_scene
+
+
+@pytest.fixture(scope="module")
+def nano(nano_folder: Path) -> Loaded:
+    return load(nano_folder)
+
+
+@torch.no_grad()
+def logits_of(loaded: Loaded) -> torch.Tensor:
+    inputs = loaded.inputs.build(made_up_scene(4), "cf_vla")
+    prompt = loaded.model.encode_prompt_embeddings(inputs)
+    model: Any = loaded.model
+    logits: torch.Tensor = model(
+        inputs_embeds=prompt.embeddings[None], position_ids=prompt.position_ids[:, None]
+    ).logits
+    return logits.float()
+
+
+def test_card_says_what_it_is(nano: Loaded, nano_folder: Path) -> None:
+    card = nano.card
+    assert card.name == "looktwice-nano"
+    assert card.engine == "torch"
+    assert card.formats == ("cf_vla", "traj_only")
+    assert card.image_size == (224, 112)
+    assert 6e6 < card.parameters < 10e6
+    assert card.revision == weights_revision(nano_folder)
+    assert not nano.model.training
+
+
+def test_seed_decides_the_weights(
+    nano_folder: Path, small_codec: TrajectoryCodec, vocabulary: Vocabulary, tmp_path: Path
+) -> None:
+    create_nano(tmp_path / "same", small_codec, vocabulary, seed=3)
+    create_nano(tmp_path / "other", small_codec, vocabulary, seed=4)
+    assert weights_revision(tmp_path / "same") == weights_revision(nano_folder)
+    assert weights_revision(tmp_path / "other") != weights_revision(nano_folder)
+
+
+def test_saved_in_half_and_loaded(nano: Loaded, tmp_path: Path) -> None:
+    save(tmp_path, nano.model, nano.vocabulary, nano.codec, dtype=torch.bfloat16, details={"recipe": "none"})
+    assert next(iter(nano.model.parameters())).dtype == torch.float32
+    again = load(tmp_path)
+    assert again.card.details == {"recipe": "none"}
+    assert (tmp_path / "model.safetensors").stat().st_size < 40e6
+    # Stored and read back once more, nothing changes any more.
+    save(tmp_path / "again", again.model, again.vocabulary, again.codec, dtype=torch.bfloat16)
+    assert weights_revision(tmp_path) == weights_revision(tmp_path / "again")
+    torch.testing.assert_close(logits_of(load(tmp_path / "again")), logits_of(again))
+    torch.testing.assert_close(logits_of(again), logits_of(nano), atol=0.05, rtol=0.05)
+
+
+def test_near_codes_begin_near(nano: Loaded) -> None:
+    model: Any = nano.model
+    rows = model.get_input_embeddings().weight.detach()
+    words = torch.from_numpy(nano.codec.code_vectors())
+    for stage in range(2):
+        ids = nano.vocabulary.code_ids(stage)
+        embedded = torch.pdist(rows[ids.start : ids.stop])
+        assert np.corrcoef(embedded, torch.pdist(words[stage]))[0, 1] > 0.8
+    ordinary = rows[: nano.vocabulary.code_ids(0).start].std()
+    assert 0.5 < float(rows[nano.vocabulary.code_ids(0).start :][:96].std() / ordinary) < 2
+
+
+@torch.no_grad()
+def test_transformers_loads_the_backbone(nano: Loaded, nano_folder: Path) -> None:
+    stock: Any = AutoModelForImageTextToText.from_pretrained(nano_folder)
+    assert type(stock) is Qwen2_5_VLForConditionalGeneration
+    ids = torch.from_numpy(nano.inputs.prompt("cf_vla", route=False).ids[:10])[None]
+    ours: Any = nano.model
+    torch.testing.assert_close(stock(input_ids=ids).logits, ours(input_ids=ids).logits)
+
+
+@pytest.mark.parametrize(
+    ("missing", "message"),
+    [
+        (CARD_FILE, "not a LookTwice checkpoint"),
+        ("config.json", "no config.json"),
+        ("tokenizer.json", "tokenizer"),
+        ("model.safetensors", "no model.safetensors"),
+        (CODEC_FILE, CODEC_FILE),
+    ],
+)
+def test_missing_parts_are_named(nano_folder: Path, tmp_path: Path, missing: str, message: str) -> None:
+    folder = tmp_path / "broken"
+    shutil.copytree(nano_folder, folder)
+    (folder / missing).unlink()
+    with pytest.raises(CheckpointError, match=message):
+        load(folder)
+
+
+@pytest.mark.parametrize(
+    "name", [CARD_FILE, "config.json", "model.safetensors", CODEC_FILE, "tokenizer.json"]
+)
+def test_damaged_parts_are_named(nano_folder: Path, tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "broken"
+    shutil.copytree(nano_folder, folder)
+    (folder / name).write_bytes((folder / name).read_bytes()[:100])
+    with pytest.raises(CheckpointError, match="broken"):
+        load(folder)
+
+
+def test_other_versions_and_kinds_are_refused(nano_folder: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "other"
+    shutil.copytree(nano_folder, folder)
+    card = json.loads((folder / CARD_FILE).read_text())
+    (folder / CARD_FILE).write_text(json.dumps(card | {"version": 99}))
+    with pytest.raises(CheckpointError, match="version 99"):
+        load(folder)
+    (folder / CARD_FILE).write_text(json.dumps({"version": 1}))
+    with pytest.raises(CheckpointError, match="details, name, revision"):
+        load(folder)
+    (folder / CARD_FILE).write_text(json.dumps(card))
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({k: v for k, v in config.items() if k != "looktwice"}))
+    with pytest.raises(CheckpointError, match="expand a stock checkpoint"):
+        load(folder)
+    (folder / "config.json").write_text(json.dumps(config | {"model_type": "llama"}))
+    with pytest.raises(CheckpointError, match="'llama'"):
+        load(folder)
+
+
+def test_codec_and_vocabulary_must_agree(small_codec: TrajectoryCodec, tmp_path: Path) -> None:
+    other = Vocabulary(build_nano_tokenizer(["a b"], 8, size=260))
+    with pytest.raises(CheckpointError, match="16 codes per stage, the vocabulary 8"):
+        create_nano(tmp_path, small_codec, other)
+
+
+def write_stock(folder: Path, spare_rows: int) -> PreTrainedTokenizerFast:
+    """A tiny random Qwen2.5-VL as Qwen lays it out: windowed vision blocks, no tokens of ours."""
+    made = build_nano_tokenizer(["slow down and keep the lane"] * 3, 1, size=300)
+    plain = made.backend_tokenizer.to_str()
+    text = json.loads(plain)
+    text["added_tokens"] = []
+    tokenizer: Any = PreTrainedTokenizerFast
+    stock = tokenizer(
+        tokenizer_object=Tokenizer.from_str(json.dumps(text)), clean_up_tokenization_spaces=False
+    )
+    stock.add_tokens([AddedToken(token, special=True, normalized=False) for token in QWEN_TOKENS], True)
+    ids = {token: stock.convert_tokens_to_ids(token) for token in QWEN_TOKENS}
+    config = Qwen2_5_VLConfig(
+        text_config={
+            "vocab_size": len(stock) + spare_rows,
+            "hidden_size": 64,
+            "intermediate_size": 96,
+            "num_hidden_layers": 2,
+            "num_attention_heads": 4,
+            "num_key_value_heads": 2,
+            "bos_token_id": ids["<|endoftext|>"],
+            "eos_token_id": ids["<|im_end|>"],
+            "pad_token_id": ids["<|endoftext|>"],
+            "rope_parameters": {"rope_type": "default", "mrope_section": [2, 3, 3], "rope_theta": 1e6},
+        },
+        vision_config={
+            "depth": 2,
+            "hidden_size": 32,
+            "intermediate_size": 48,
+            "num_heads": 2,
+            "out_hidden_size": 64,
+            "window_size": 56,
+            "fullatt_block_indexes": [1],
+            "tokens_per_second": 2,
+        },
+        image_token_id=ids["<|image_pad|>"],
+        video_token_id=ids["<|video_pad|>"],
+        vision_start_token_id=ids["<|vision_start|>"],
+        vision_end_token_id=ids["<|vision_end|>"],
+    )
+    torch.manual_seed(1)
+    Qwen2_5_VLForConditionalGeneration(config).save_pretrained(folder)
+    stock.save_pretrained(folder)
+    result: PreTrainedTokenizerFast = stock
+    return result
+
+
+@pytest.mark.parametrize("spare_rows", [0, 500])
+@torch.no_grad()
+def test_a_stock_checkpoint_is_expanded(
+    small_codec: TrajectoryCodec, tmp_path: Path, spare_rows: int
+) -> None:
+    stock = write_stock(tmp_path / "stock", spare_rows)
+    settings = VlaSettings(name="tiny", image_width=112, image_height=56, formats=("cf_vla",))
+    expand_stock(tmp_path / "stock", tmp_path / "ours", small_codec, settings, dtype=torch.float32)
+    loaded = load(tmp_path / "ours", dtype=torch.float64)
+    assert loaded.card.name == "tiny"
+    assert loaded.settings.tokens_per_second == 2
+    assert loaded.settings.codec_size == small_codec.size
+    text = "slow down<|im_end|>\n"
+    assert loaded.vocabulary.encode(text) == tuple(stock.encode(text))
+    before: Any = Qwen2_5_VLForConditionalGeneration.from_pretrained(tmp_path / "stock", dtype=torch.float64)
+    ids = torch.tensor([stock.encode(text)])
+    ours: Any = loaded.model
+    size = len(stock)
+    assert ours.config.text_config.vocab_size == ours.lm_head.weight.shape[0] >= len(loaded.vocabulary)
+    torch.testing.assert_close(
+        ours(input_ids=ids).logits[..., :size], before(input_ids=ids).logits[..., :size]
+    )
+    logits = logits_of(loaded)
+    assert torch.isfinite(logits).all()
+
+
+def test_expanding_needs_a_qwen(small_codec: TrajectoryCodec, tmp_path: Path) -> None:
+    settings = VlaSettings()
+    with pytest.raises(CheckpointError, match=r"no config\.json"):
+        expand_stock(tmp_path / "none", tmp_path / "ours", small_codec, settings)
+    with pytest.raises(CheckpointError, match="another folder"):
+        expand_stock(tmp_path, tmp_path, small_codec, settings)

@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.driving.images import decode_image
+from model.driving.scene import FRONT_TELE, FRONT_WIDE, Scene, SceneError
+from model.network.inputs import InputBuilder, rotary_positions
+from model.network.prompts import PromptError
+from model.network.settings import SettingsError, VlaSettings
+from model.network.vocabulary import HISTORY, ROUTE, VIDEO_PAD, Vocabulary
+from tests.model.network.conftest import made_up_scene
+
+SETTINGS = VlaSettings(codec_size=16)
+
+
+def test_a_scene_becomes_inputs(vocabulary: Vocabulary, scene: Scene) -> None:
+    inputs = InputBuilder(vocabulary, SETTINGS).build(scene, "cf_vla")
+    ids = inputs.prompt.ids
+    assert (ids == vocabulary.id_of(VIDEO_PAD)).sum() == 128
+    assert (ids == vocabulary.id_of(HISTORY)).sum() == 1
+    assert (ids == vocabulary.id_of(ROUTE)).sum() == 1
+    assert inputs.patches.shape == (512, 1176)
+    assert inputs.patches.dtype == np.uint8
+    assert inputs.pixel_values_videos.dtype == np.float32
+    np.testing.assert_array_equal(inputs.video_grid_thw, [[2, 8, 16], [2, 8, 16]])
+    assert inputs.route is not None
+    assert len(ids) - 128 <= 72, "the text of a prompt is meant to be short"
+
+
+def test_cameras_in_the_order_of_the_checkpoint(vocabulary: Vocabulary, scene: Scene) -> None:
+    frames = InputBuilder(vocabulary, SETTINGS).frames(scene)
+    np.testing.assert_array_equal(frames[1], decode_image(scene.clip(FRONT_WIDE).images[1]))
+    np.testing.assert_array_equal(frames[4], decode_image(scene.clip(FRONT_TELE).images[0]))
+
+
+def test_prompts_share_their_beginning(vocabulary: Vocabulary) -> None:
+    builder = InputBuilder(vocabulary, SETTINGS)
+    with_route, without = builder.prompt("cf_vla", route=True), builder.prompt("cf_vla", route=False)
+    history = int(np.flatnonzero(without.ids == vocabulary.id_of(HISTORY))[0])
+    np.testing.assert_array_equal(with_route.ids[: history + 1], without.ids[: history + 1])
+    assert vocabulary.decode(without.ids).endswith("<|im_end|>\n<|im_start|>assistant\n")
+    assert builder.prompt("traj_only", route=False).ids.shape != without.ids.shape
+
+
+def test_without_route(vocabulary: Vocabulary) -> None:
+    scene = made_up_scene(1, route=False)
+    assert InputBuilder(vocabulary, SETTINGS).build(scene, "cf_vla").route is None
+    blind = InputBuilder(vocabulary, replace(SETTINGS, with_route=False))
+    inputs = blind.build(made_up_scene(1), "cf_vla")
+    assert inputs.route is None
+    assert not (inputs.prompt.ids == vocabulary.id_of(ROUTE)).any()
+
+
+def test_what_cannot_be_built(vocabulary: Vocabulary, scene: Scene) -> None:
+    builder = InputBuilder(vocabulary, SETTINGS)
+    with pytest.raises(PromptError, match="poem"):
+        builder.build(scene, "poem")
+    with pytest.raises(SceneError, match=FRONT_WIDE):
+        builder.build(Scene("x", scene.clips[:1], scene.history), "cf_vla")
+
+
+def test_rotary_positions_of_a_small_clip() -> None:
+    settings = VlaSettings(image_width=56, image_height=28)  # 2 slices of 1 x 2 tokens
+    is_video = np.array([False, *[True] * 4, False])
+    np.testing.assert_array_equal(
+        rotary_positions(is_video, settings),
+        [[0, 1, 1, 5, 5, 3], [0, 1, 1, 1, 1, 3], [0, 1, 2, 1, 2, 3]],
+    )
+    with pytest.raises(ValueError, match="placeholders"):
+        rotary_positions(is_video[:4], settings)
+
+
+def test_settings_that_do_not_fit() -> None:
+    assert VlaSettings.from_dict(SETTINGS.to_dict()) == SETTINGS
+    with pytest.raises(SettingsError, match="multiple of 28"):
+        VlaSettings(image_width=200)
+    with pytest.raises(SettingsError, match="unknown camera"):
+        VlaSettings(cameras=("periscope",))
+    with pytest.raises(SettingsError, match="must divide"):
+        VlaSettings(temporal_patch_size=3)
+    with pytest.raises(SettingsError, match="at least one"):
+        VlaSettings(formats=())
+    with pytest.raises(SettingsError, match="not LookTwice"):
+        VlaSettings.from_dict({"colour": "red"})
