@@ -14,11 +14,13 @@ from torch.utils.data import BatchSampler, Dataset
 from model.driving.images import decode_image
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat
+from model.network.codec import TrajectoryCodec
 from model.network.inputs import InputBuilder
 from model.network.patches import patchify, resize
 from model.network.prompts import prompt_text
 from model.network.vocabulary import Vocabulary
 from model.training.examples import Examples
+from model.training.soft_codes import SoftCodes
 from model.training.targets import SectionWeights, Task, make_target
 
 Batch = dict[str, Tensor]
@@ -42,6 +44,7 @@ class Sample:
     patches: np.ndarray[tuple[int, ...], np.dtype[np.uint8]] | None
     history: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
     route: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+    code_shares: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
 
 class ResponseDataset(Dataset[Sample]):
@@ -50,14 +53,18 @@ class ResponseDataset(Dataset[Sample]):
     def __init__(
         self,
         examples: Examples,
-        codes: np.ndarray[tuple[int, int], np.dtype[np.int64]],
+        codec: TrajectoryCodec,
         inputs: InputBuilder,
         vocabulary: Vocabulary,
         weights: SectionWeights,
         *,
         pictures: bool,
+        seed: int = 0,
     ) -> None:
-        self._examples, self._codes, self._inputs = examples, codes, inputs
+        self._examples, self._inputs = examples, inputs
+        self._vectors = codec.vectors(examples.history, examples.future)
+        self._soft = SoftCodes(codec, self._vectors)
+        self._random = np.random.default_rng(seed)
         self._weights, self._pictures, self._vocabulary = weights, pictures, vocabulary
         self._formats = {name: CompiledFormat(FORMATS[name], vocabulary) for name in ("cf_vla", "traj_only")}
 
@@ -66,8 +73,9 @@ class ResponseDataset(Dataset[Sample]):
 
     def __getitem__(self, item: Item) -> Sample:
         examples, index = self._examples, item.index
+        soft = self._soft.draw(self._vectors[index], self._random)
         target = make_target(
-            self._formats[item.task], examples.plan(index), self._codes[index].tolist(), self._weights
+            self._formats[item.task], examples.plan(index), soft.codes.tolist(), self._weights
         )
         prompt = self._prompt(item)
         return Sample(
@@ -76,6 +84,7 @@ class ResponseDataset(Dataset[Sample]):
             patches=patchify(self.frames(index), self._inputs.settings) if self._pictures else None,
             history=examples.history[index],
             route=np.nan_to_num(examples.route[index]),
+            code_shares=soft.shares,
         )
 
     def _prompt(self, item: Item) -> list[int]:
@@ -164,6 +173,7 @@ def collate(samples: list[Sample]) -> Batch:
         "loss_weights": torch.from_numpy(weights),
         "history": torch.from_numpy(np.stack([sample.history for sample in samples])),
         "route": torch.from_numpy(np.stack([sample.route for sample in samples])),
+        "code_shares": torch.from_numpy(np.stack([sample.code_shares for sample in samples])),
     }
     if samples[0].patches is not None:
         batch["patches"] = torch.from_numpy(np.concatenate([sample.patches for sample in samples]))  # type: ignore[misc]

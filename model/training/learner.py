@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from model.network.vla import LookTwiceVla
-from model.training.loss import weighted_token_loss
+from model.training.loss import response_loss
 
 
 class ResponseLearner(nn.Module):
@@ -17,9 +17,10 @@ class ResponseLearner(nn.Module):
     The loss is worked out inside ``forward``, so wrappers (FSDP, DDP) see every use of the weights.
     """
 
-    def __init__(self, vla: LookTwiceVla, *, compiled: bool = False) -> None:
+    def __init__(self, vla: LookTwiceVla, first_code_id: int, *, compiled: bool = False) -> None:
         super().__init__()
         self.vla = vla
+        self._first_code_id = first_code_id
         decoder = vla.model.language_model
         # Kept out of the registered modules: it is the same module, and must not be saved twice.
         self._decoder: list[Any] = [torch.compile(decoder) if compiled else decoder]
@@ -31,6 +32,7 @@ class ResponseLearner(nn.Module):
         loss_weights: Tensor,
         history: Tensor,
         route: Tensor,
+        code_shares: Tensor,
         patches: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """The loss of a batch from `collate`; weights and ids are shifted against each other here."""
@@ -51,5 +53,5 @@ class ResponseLearner(nn.Module):
         # Logits only where a token is predicted that counts: a third of the positions.
         counts = loss_weights[:, 1:] > 0
         logits = vla.lm_head(hidden[:, :-1][counts])
-        loss = weighted_token_loss(logits[None], input_ids[:, 1:][counts][None], loss_weights[:, 1:][counts][None])
-        return {"loss": loss}
+        labels, weights = input_ids[:, 1:][counts], loss_weights[:, 1:][counts]
+        return {"loss": response_loss(logits, labels, weights, self._first_code_id, code_shares)}

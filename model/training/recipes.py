@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Final, Literal
 
 from model.training.targets import PAPER_WEIGHTS, SectionWeights, Task
@@ -46,6 +47,10 @@ class Recipe:
     vision_rate: float = 1.0
     seed: int = 0
 
+
+NANO_WEIGHTS: Final[SectionWeights] = MappingProxyType(PAPER_WEIGHTS | {"trajectory": 10.0 / 3})
+"""A model from scratch learns trajectories too, which the paper's brings along: there 10 plan tokens weigh as
+much as 10 codes in all; here three quarters of a plan's tokens are forced and teach nothing."""
 
 NANO: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe

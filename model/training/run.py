@@ -1,0 +1,131 @@
+"""Running a recipe: from scenes and a checkpoint to the next checkpoint, resumable after a kill."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+from torch.utils.data import Dataset
+
+from model.driving.scene import LabelledScene
+from model.network.checkpoint import Loaded, create_nano, load, save
+from model.network.codec import TrajectoryCodec
+from model.network.corpus import nano_corpus
+from model.network.settings import VlaSettings
+from model.network.vocabulary import Vocabulary, build_nano_tokenizer
+from model.training.batches import ResponseDataset, TaskSampler, collate
+from model.training.examples import Examples, load_examples
+from model.training.grounding import GroundingDataset, GroundingLearner, collate_grounding
+from model.training.learner import ResponseLearner
+from model.training.recipes import Recipe
+from model.training.trainer import LOG_FILE, LearnerTrainer, Validate
+from model.training.validation import open_loop
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """How a recipe is run, apart from what decides its outcome.
+
+    Attributes:
+        cache: folder for scenes brought into arrays.
+        validate_every, save_every: steps.
+        bf16: mixed precision.
+        compiled: compile the decoder; pays after a few hundred steps.
+        use_cpu: stay off accelerators.
+    """
+
+    cache: Path
+    validate_every: int = 500
+    save_every: int = 250
+    bf16: bool = True
+    compiled: bool = False
+    use_cpu: bool = True
+
+
+def create(scenes: Path, cache: Path, target: Path, *, codec_size: int = 512, seed: int = 0) -> dict[str, float]:
+    """Write an untrained nano checkpoint whose codec is fitted to ``scenes``; returns the codec's error."""
+    examples = load_examples(scenes, cache, VlaSettings().cameras)
+    codec = TrajectoryCodec.fit(examples.history, examples.future, size=codec_size, seed=seed)
+    create_nano(target, codec, Vocabulary(build_nano_tokenizer(nano_corpus(), codec_size)), seed=seed)
+    return codec.reconstruction_error(examples.history, examples.future)
+
+
+def run(
+    recipe: Recipe,
+    scenes: Path,
+    source: Path,
+    target: Path,
+    settings: RunSettings,
+    validation: Sequence[LabelledScene] = (),
+) -> None:
+    """Train ``source`` by a recipe and write the outcome to ``target``.
+
+    State is kept in ``target/state`` while the run lasts: started again after a kill, it goes on from there.
+
+    Args:
+        recipe: what to do.
+        scenes: training scenes, a file or folder.
+        source: the checkpoint to start from.
+        target: the checkpoint to write.
+        settings: see there.
+        validation: scenes to report open-loop errors on while training with pictures.
+    """
+    loaded = load(source)
+    loaded.model.train()
+    torch.manual_seed(recipe.seed)
+    examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
+    validate: Validate | None = None
+    if recipe.goal == "respond" and recipe.pictures and validation:
+        validate = partial(open_loop, loaded, validation, list(recipe.tasks))
+    learner, dataset, sampler, collator = _prepare(recipe, loaded, examples, settings.compiled)
+    trainer = LearnerTrainer(
+        learner,
+        recipe,
+        dataset,
+        collator,
+        target,
+        sampler=sampler,
+        validate=validate,
+        validate_every=settings.validate_every,
+        save_every=settings.save_every,
+        bf16=settings.bf16,
+        use_cpu=settings.use_cpu,
+    )
+    trainer.train(resume_from_checkpoint=any((target / "state").glob("checkpoint-*")))
+    save(target, loaded.model.eval(), loaded.vocabulary, loaded.codec, details=_details(recipe, loaded, examples))
+
+
+def _prepare(
+    recipe: Recipe, loaded: Loaded, examples: Examples, compiled: bool
+) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
+    if recipe.goal == "ground":
+        shape = examples.dense_classes.shape[2:4]
+        learner = GroundingLearner(loaded.model, (shape[0], shape[1]))
+        return learner, GroundingDataset(examples, loaded.inputs), None, collate_grounding
+    dataset = ResponseDataset(
+        examples,
+        loaded.codec,
+        loaded.inputs,
+        loaded.vocabulary,
+        recipe.weights,
+        pictures=recipe.pictures,
+        seed=recipe.seed,
+    )
+    has_route = np.isfinite(examples.route).all(axis=(1, 2))
+    sampler = TaskSampler(has_route, recipe.batch_size, recipe.tasks, recipe.route_share, recipe.seed)
+    first_code_id = loaded.vocabulary.code_ids(0).start
+    return ResponseLearner(loaded.model, first_code_id, compiled=compiled), dataset, sampler, collate
+
+
+def _details(recipe: Recipe, loaded: Loaded, examples: Examples) -> Mapping[str, Any]:
+    stages = list(loaded.card.details.get("stages", []))
+    about = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
+    about |= {"tasks": dict(recipe.tasks), "weights": dict(recipe.weights)}
+    about |= {"examples": len(examples), "episodes": len(np.unique(examples.episode)), "log": LOG_FILE}
+    return {"stages": [*stages, about]}

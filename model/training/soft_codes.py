@@ -1,0 +1,56 @@
+"""Soft targets for trajectory codes.
+
+Many code sequences spell nearly the same trajectory. Instead of one winner per stage, a stage's target is a
+distribution over codewords by their distance, and the code fed on is drawn from it: later stages then learn to
+correct whatever earlier ones chose. A small model learns far faster from this than from winners alone.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from model.driving.trajectory import FloatArray
+from model.network.codec import TrajectoryCodec
+
+_SOFTNESS: Final = 0.5
+"""Width of the target, in mean squared distances to the nearest codeword: about four codes share a target."""
+
+
+class SoftTarget(NamedTuple):
+    """Codes int64 [6] drawn for one trajectory, and for each stage the distribution float32 [6, K] they came from."""
+
+    codes: npt.NDArray[np.int64]
+    shares: FloatArray
+
+
+class SoftCodes:
+    """Draws soft targets for one codec; ``vectors`` [n, d] from `TrajectoryCodec.vectors` set their width."""
+
+    def __init__(self, codec: TrajectoryCodec, vectors: FloatArray) -> None:
+        self._books = codec.books
+        self._squares = (codec.books**2).sum(axis=-1)
+        rest = vectors[np.random.default_rng(0).permutation(len(vectors))[:2000]].copy()
+        widths = []
+        for book, squares in zip(self._books, self._squares, strict=True):
+            cost = squares - 2 * rest @ book.T
+            nearest = cost.argmin(axis=1)
+            rest -= book[nearest]
+            widths.append(_SOFTNESS * float((rest**2).sum(axis=1).mean()))
+        self._widths = np.maximum(widths, 1e-6)
+
+    def draw(self, vector: FloatArray, random: np.random.Generator) -> SoftTarget:
+        """A target for one vector [d]."""
+        stages, size = self._squares.shape
+        codes, shares = np.empty(stages, np.int64), np.empty((stages, size), np.float32)
+        rest = vector.astype(np.float32)
+        for stage, book in enumerate(self._books):
+            cost = (self._squares[stage] - 2 * book @ rest) / self._widths[stage]
+            weights = np.exp(cost.min() - cost)
+            shares[stage] = weights / weights.sum()
+            codes[stage] = np.searchsorted(np.cumsum(shares[stage]), random.random() * shares[stage].sum())
+            codes[stage] = min(codes[stage], size - 1)
+            rest = rest - book[codes[stage]]
+        return SoftTarget(codes, shares)

@@ -1,0 +1,69 @@
+"""`looktwice scenes`: make driving scenes in the simulator, count them, look at them."""
+
+from __future__ import annotations
+
+import json
+from itertools import islice
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.options import DEFAULT_SCENES, Json, told
+
+app = typer.Typer(help="Make, count and look at driving scenes.", no_args_is_help=True)
+_Scenes = Annotated[Path, typer.Argument(help="Scene file or folder; the bundled test scenes without one.")]
+
+
+@app.command("generate")
+def generate(
+    out: Annotated[Path, typer.Argument(help="Folder for the scene files.")],
+    first_seed: Annotated[int, typer.Option(help="Train < 500000 <= validation < 600000 <= test < 700000.")],
+    episodes: Annotated[int, typer.Option(help="Episodes, one a seed.", min=1)],
+    workers: Annotated[int, typer.Option(help="Processes that render.", min=1)] = 2,
+    stride: Annotated[float, typer.Option(help="Seconds between the scenes of an episode.")] = 0.5,
+    surround: Annotated[bool, typer.Option(help="Render the six surround cameras too.")] = False,
+) -> None:
+    """Drive episodes in MetaDrive and store their scenes; run again after a kill, it resumes."""
+    with told():
+        from clients.metadrive.generate import GenerateConfig, generate
+
+        config = GenerateConfig(stride_s=stride, surround=surround)
+        report = generate(out, range(first_seed, first_seed + episodes), workers=workers, config=config)
+        typer.echo(str(report))
+
+
+@app.command("stats")
+def stats(path: _Scenes = DEFAULT_SCENES, as_json: Json = False) -> None:
+    """Count scenes per tag and per meta-action, and check the expert."""
+    with told():
+        from clients.metadrive.stats import scene_stats
+
+        figures = scene_stats(path)
+        if as_json:
+            typer.echo(json.dumps(figures))
+            return
+        for name, value in figures.items():
+            if isinstance(value, dict):
+                typer.echo(name)
+                for key, count in value.items():
+                    typer.echo(f"  {key:24} {count}")
+            else:
+                typer.echo(f"{name:26} {value}")
+
+
+@app.command("show")
+def show(
+    path: _Scenes = DEFAULT_SCENES,
+    out: Annotated[Path, typer.Option(help="Picture to write.")] = Path("out/scenes.png"),
+    limit: Annotated[int, typer.Option(help="How many scenes.", min=1)] = 12,
+    every: Annotated[int, typer.Option(help="Take every so-many-th scene.", min=1)] = 1,
+) -> None:
+    """Write a contact sheet: cameras and bird's-eye view of scenes."""
+    with told():
+        from clients.metadrive.sheet import contact_sheet
+        from model.driving.scene_store import read_scenes
+
+        out.parent.mkdir(parents=True, exist_ok=True)
+        contact_sheet(islice(read_scenes(path, dense=False), 0, limit * every, every), out)
+        typer.echo(str(out))

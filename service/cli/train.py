@@ -1,0 +1,75 @@
+"""`looktwice train`: run a recipe, or create an untrained checkpoint to start from."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.options import told
+
+
+def train(
+    recipe: Annotated[str, typer.Argument(help="create, language, ground, traj-only or meta-act.")],
+    scenes: Annotated[Path, typer.Option(help="Training scenes: a file or a folder.")],
+    target: Annotated[Path, typer.Option("--to", help="Checkpoint folder to write.")],
+    source: Annotated[Path | None, typer.Option("--from", help="Checkpoint folder to start from.")] = None,
+    validation: Annotated[Path | None, typer.Option(help="Scenes to report errors on while training.")] = None,
+    validation_scenes: Annotated[int, typer.Option(help="How many of them.", min=1)] = 96,
+    cache: Annotated[Path, typer.Option(help="Folder for scenes brought into arrays.")] = Path("data/cache"),
+    paper: Annotated[bool, typer.Option(help="The paper's recipe, for a pretrained backbone.")] = False,
+    steps: Annotated[int | None, typer.Option(help="Instead of the recipe's.", min=1)] = None,
+    batch_size: Annotated[int | None, typer.Option(help="Instead of the recipe's.", min=1)] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="Instead of the recipe's.")] = None,
+    seed: Annotated[int, typer.Option(help="Of order and initialisation.")] = 0,
+    threads: Annotated[int | None, typer.Option(help="CPU threads.", min=1)] = None,
+    bf16: Annotated[bool, typer.Option(help="Mixed precision.")] = True,
+    compiled: Annotated[bool, typer.Option(help="Compile the decoder; pays on long runs.")] = False,
+    gpu: Annotated[bool, typer.Option(help="Use the accelerators that are there.")] = False,
+) -> None:
+    """Train a checkpoint by a recipe; started again after a kill, it goes on where it was."""
+    from dataclasses import replace
+
+    import torch
+
+    from model.driving.scene_store import count_scenes, read_scenes
+    from model.evaluation.curves import training_curves
+    from model.training.recipes import NANO, PAPER
+    from model.training.run import RunSettings, create, run
+    from model.training.trainer import LOG_FILE
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+    with told():
+        if recipe == "create":
+            for name, value in create(scenes, cache, target, seed=seed).items():
+                typer.echo(f"codec {name} {value:.3f}")
+            return
+        recipes = PAPER if paper else NANO
+        if recipe not in recipes:
+            raise ValueError(f"unknown recipe {recipe!r}; known are create, {', '.join(recipes)}")
+        if source is None:
+            raise ValueError("give the checkpoint to start from: --from FOLDER")
+        chosen = recipes[recipe]
+        chosen = replace(
+            chosen,
+            steps=steps or chosen.steps,
+            batch_size=batch_size or chosen.batch_size,
+            learning_rate=learning_rate or chosen.learning_rate,
+            seed=seed,
+        )
+        held_out = []
+        if validation is not None:
+            every = max(1, count_scenes(validation) // validation_scenes)
+            held_out = list(islice(read_scenes(validation, dense=False), 0, every * validation_scenes, every))
+        run(
+            chosen,
+            scenes,
+            source,
+            target,
+            RunSettings(cache, bf16=bf16, compiled=compiled, use_cpu=not gpu),
+            held_out,
+        )
+        training_curves(target / LOG_FILE, target / "curves.png")
