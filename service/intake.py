@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from clients import wire
+import clients.wire as wire
 from model.driving.images import ImageError, check_image
 from model.driving.plan import GROUPS, TICKS, MetaAction, Plan, PlanError, parse_plan
 from model.driving.scene import Clip, Scene, SceneError

@@ -10,7 +10,7 @@ from typing import Final
 
 import structlog
 
-from clients import wire
+import clients.wire as wire
 from model.driving.images import ImageError
 from model.driving.plan import GROUPS, Plan, PlanError
 from model.driving.scene import SceneError

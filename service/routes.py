@@ -11,7 +11,7 @@ from fastapi import APIRouter, Body, Request
 from fastapi.openapi.models import Example
 from starlette.responses import Response
 
-from clients import wire
+import clients.wire as wire
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.engines.engine import Engine
 from service.examples import example_request

@@ -13,7 +13,7 @@ from typing import Final, cast
 import numpy as np
 import pyarrow.parquet as pq
 
-from clients import wire
+import clients.wire as wire
 from model.driving.scene import Agent, LabelledScene
 from model.driving.scene_store import SceneFileError, count_scenes, read_scenes
 from model.driving.trajectory import FloatArray

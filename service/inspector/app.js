@@ -32,10 +32,12 @@ function redraw() {
 
 function forgetDraws() {
   state.running?.abort();
+  state.running = null;
   state.draws = [];
   state.chosen = 0;
   byId("draws").hidden = true;
   byId("timeline").replaceChildren();
+  byId("plan-title").textContent = "Plan";
   for (const empty of document.querySelectorAll(".empty")) empty.hidden = false;
 }
 
@@ -96,7 +98,7 @@ async function plan() {
     if (state.running === running) say("No plan.");
     throw error;
   } finally {
-    byId("plan").disabled = false;
+    if (state.running === running || !state.running) byId("plan").disabled = false;
   }
 }
 
@@ -122,7 +124,7 @@ function drawRow(draw, index) {
   const branch = element("span", { className: `branch${thinks ? " think" : ""}`, textContent: thinks ? "second look" : "direct" });
   const tokens = Object.values(draw.tokens).reduce((sum, count) => sum + count, 0);
   const row = element("tr", {},
-    element("td", {}, element("label", {}, radio, `draw ${draw.index + 1}`)),
+    element("td", {}, element("label", {}, radio, `draw ${draw.index}`)),
     element("td", {}, draw.branch === null ? "–" : branch),
     element("td", {}, draw.think_probability === null ? "–" : probability(draw.think_probability)),
     element("td", { className: "number", textContent: tokens }),
@@ -144,7 +146,7 @@ function choose(index) {
     row.classList.toggle("is-chosen", position === index);
     row.querySelector("input").checked = position === index;
   });
-  byId("plan-title").textContent = `Plan of draw ${state.draws[index].index + 1}`;
+  byId("plan-title").textContent = `Plan of draw ${state.draws[index].index}`;
   showDraw(state.draws[index]);
   redraw();
 }

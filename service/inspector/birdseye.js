@@ -31,7 +31,7 @@ export function drawBirdseye(view, draws, chosen) {
   line(map, view.scene.history, "ego", 2, [3, 4], 0.5);
   for (const agent of view.agents) agentFuture(map, agent);
   for (const agent of view.agents) if (agent.poses[NOW]) box(map, agent.poses[NOW], agent, tint(agent), 1);
-  draws.forEach((draw, index) => index !== chosen && line(map, start(draw.trajectory), "draw", 1.5, [], 0.45));
+  draws.forEach((draw, index) => index !== chosen && line(map, start(draw.trajectory), "draw", 2, [], 0.5));
   if (view.future) line(map, start(view.future), "expert", 2.5, [7, 5]);
   if (draws[chosen]) chosenDraw(map, draws[chosen].trajectory);
   box(map, [0, 0, 0], EGO, "ego", 1);
@@ -65,7 +65,7 @@ function road(map, view) {
   }
   pen.fillStyle = map.color("road");
   pen.fill("evenodd"); // holes are rings too
-  for (const lane of view.lane_lines) line(map, lane, "lane", 1.5, [8, 8]);
+  for (const lane of view.lane_lines) line(map, lane, "lane", 1, [1, 5]);
 }
 
 function distances({ pen, color, at, width, height }) {

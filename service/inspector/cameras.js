@@ -32,7 +32,7 @@ function show(frame) {
   slider.value = frame;
   const seconds = (Number(frame) - Number(slider.max)) * FRAME_MS / 1000;
   const when = seconds === 0 ? "now" : `${seconds.toFixed(1).replace("-", "−")} s`;
-  byId("frame-time").value = when;
+  byId("frame-time").textContent = when;
   slider.setAttribute("aria-valuetext", when);
   for (const { image, sources, camera } of clips) {
     image.src = sources[Math.min(frame, sources.length - 1)];

@@ -132,7 +132,7 @@ def _draw(request: PlanRequest, index: int) -> Draw:
 
 def _drive(plan: Plan, speed: float, luck: random.Random) -> FloatArray:
     """What a car does that follows ``plan``, with a little variation in strength and curvature."""
-    zeal, bend = luck.uniform(0.6, 1.3), luck.gauss(0.0, 0.0012)
+    zeal, bend = luck.uniform(0.6, 1.3), luck.gauss(0.0, 0.004)
     rows = np.zeros((FUTURE_STEPS, 4), np.float32)
     x = y = heading = shift = 0.0
     for tick in range(FUTURE_STEPS):

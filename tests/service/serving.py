@@ -57,7 +57,7 @@ class Served:
     def until_ready(self) -> None:
         self.until(lambda: self.http.get("/readyz").status_code == 200)
 
-    def metric(self, name: str, **labels: str) -> float:
+    def metric(self, name: str, /, **labels: str) -> float:
         """The value of one sample; 0 where there is none yet."""
         for family in text_string_to_metric_families(self.http.get("/metrics").text):
             for sample in family.samples:

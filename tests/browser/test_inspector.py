@@ -1,0 +1,270 @@
+"""The inspector page in a real Chromium, against a real server."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Page, expect
+
+from model.driving.scene_store import write_scenes
+from model.engines.engine import EngineError
+from service.settings import Settings
+from tests.service.scenes import labelled
+from tests.service.scripted_engine import REASONING, ScriptedEngine
+from tests.service.serving import Served, body, serve
+
+CHOSEN_RGB = (29, 95, 209)  # --chosen of the light theme
+DARK_PAGE_RGB = (18, 22, 28)  # --page of the dark theme
+
+
+@pytest.fixture(scope="module")
+def engine() -> ScriptedEngine:
+    return ScriptedEngine()
+
+
+@pytest.fixture(scope="module")
+def served(engine: ScriptedEngine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    path = tmp_path_factory.mktemp("scenes") / "scenes.parquet"
+    write_scenes(path, [labelled("slow-leader"), labelled("second/scene")])
+    with serve(engine, Settings(bundled_scenes=path)) as running:
+        yield running
+
+
+@pytest.fixture
+def inspector(page: Page, served: Served, engine: ScriptedEngine) -> Page:
+    engine.submitted.clear()
+    page.goto(served.url)
+    expect(page.locator("#clips img")).to_have_count(2)
+    return page
+
+
+def plan(page: Page) -> None:
+    page.get_by_role("button", name="Plan", exact=True).click()
+
+
+def pixels(page: Page, selector: str) -> np.ndarray:
+    encoded = page.locator(selector).screenshot()
+    return np.asarray(Image.open(io.BytesIO(encoded)).convert("RGB"))
+
+
+def near(image: np.ndarray, rgb: tuple[int, int, int]) -> np.ndarray:
+    found: np.ndarray = np.abs(image.astype(int) - rgb).max(axis=-1) < 12
+    return found
+
+
+def test_shows_a_scene_before_anything_is_asked(inspector: Page, engine: ScriptedEngine) -> None:
+    expect(inspector.locator("#model")).to_contain_text("scripted r1")
+    expect(inspector.get_by_label("Scene", exact=True)).to_have_value("slow-leader")
+    expect(inspector.locator("#tags")).to_contain_text("lead vehicle")
+    expect(inspector.get_by_role("img", name="front_wide_120, now")).to_be_visible()
+    expect(inspector.locator("#birdseye")).to_have_attribute(
+        "aria-label", "The scene from above with 3 agents"
+    )
+    assert engine.submitted == []
+
+
+def test_plans_with_the_controls(inspector: Page, engine: ScriptedEngine) -> None:
+    inspector.get_by_label("Thinking").select_option("always")
+    inspector.get_by_role("spinbutton", name="Draws").fill("3")
+    inspector.get_by_label("Temperature").fill("0.5")
+    inspector.get_by_label("Seed").fill("42")
+    inspector.get_by_label("give the route").uncheck()
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(3)
+    (asked,) = engine.submitted
+    controls = asked.controls
+    assert (controls.thinking, controls.n, controls.temperature, controls.seed) == ("always", 3, 0.5, 42)
+    assert asked.scene.route is None
+    assert asked.scene.scene_id == "slow-leader"
+    expect(inspector.get_by_role("status")).to_contain_text("3 draws in")
+
+
+def test_a_second_look_is_shown_with_what_it_changed(inspector: Page) -> None:
+    inspector.get_by_label("Thinking").select_option("always")
+    plan(inspector)
+    panel = inspector.locator("#plan-panel")
+    expect(panel.get_by_role("heading", name="Plan of draw 0")).to_be_visible()
+    expect(panel.locator("blockquote")).to_have_text(REASONING)
+    first, revised = panel.locator(".tracks").all()
+    expect(first.get_by_role("list", name="longitudinal track").get_by_role("listitem")).to_have_text(
+        ["Keep Speed", "Accelerate"]
+    )
+    expect(revised.get_by_role("list", name="lane track").get_by_role("listitem")).to_have_text(
+        ["Keep Lane", "Left Lane Change"]
+    )
+    expect(first.locator(".changed")).to_have_count(0)
+    expect(revised.locator(".changed")).to_have_text(["Decelerate", "Keep Speed", "Left Lane Change"])
+    expect(panel.locator("#tokens li")).to_have_text(
+        ["plan 40", "branch 1", "thinking 48", "revised plan 52", "trajectory 8"]
+    )
+    word = revised.get_by_text("Left Lane Change").bounding_box()
+    track = revised.get_by_role("list", name="lane track").bounding_box()
+    assert word is not None
+    assert track is not None
+    assert (word["x"] - track["x"]) / track["width"] == pytest.approx(2.4 / 6.4, abs=0.01)
+
+
+def test_a_direct_draw_has_one_timeline(inspector: Page) -> None:
+    inspector.get_by_label("Thinking").select_option("never")
+    plan(inspector)
+    expect(inspector.locator(".tracks")).to_have_count(1)
+    expect(inspector.locator("blockquote")).to_have_count(0)
+    expect(inspector.locator("#draws .branch")).to_have_text(["direct"] * 6)
+
+
+def test_draws_are_chosen_by_keyboard(inspector: Page) -> None:
+    plan(inspector)
+    inspector.get_by_role("radio", name="draw 0").focus()
+    before = pixels(inspector, "#birdseye")
+    inspector.keyboard.press("ArrowDown")
+    expect(inspector.get_by_role("radio", name="draw 1")).to_be_checked()
+    expect(inspector.get_by_role("heading", name="Plan of draw 1")).to_be_visible()
+    assert (pixels(inspector, "#birdseye") != before).any()
+
+
+def test_the_birdseye_view_draws_ahead_upwards_and_left_to_the_left(inspector: Page) -> None:
+    assert not near(pixels(inspector, "#birdseye"), CHOSEN_RGB).any()
+    inspector.get_by_label("Thinking").select_option("always")  # a lane change to the left
+    inspector.get_by_role("spinbutton", name="Draws").fill("1")
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(1)
+    image = pixels(inspector, "#birdseye")
+    rows, columns = np.nonzero(near(image, CHOSEN_RGB))
+    middle = image.shape[1] / 2
+    lowest, highest = columns[rows > rows.max() - 20], columns[rows < rows.min() + 20]
+    assert lowest.mean() == pytest.approx(middle, abs=3), "it starts at the ego, in the middle"
+    assert highest.mean() < middle - 3
+    assert rows.min() < image.shape[0] / 2
+    label = inspector.locator("#birdseye").get_attribute("aria-label") or ""
+    assert "1 draws" in label
+    assert "to the left" in label
+
+
+def test_clips_can_be_scrubbed(inspector: Page) -> None:
+    latest = inspector.locator("#clips img").first.get_attribute("src")
+    inspector.get_by_label("Frame").focus()
+    inspector.keyboard.press("Home")
+    expect(inspector.locator("#frame-time")).to_have_text("\N{MINUS SIGN}1.5 s")
+    assert inspector.locator("#clips img").first.get_attribute("src") != latest
+
+
+def test_clips_can_be_played(inspector: Page) -> None:
+    inspector.clock.install()
+    play = inspector.locator("#play")
+    play.click()
+    expect(play).to_have_attribute("aria-pressed", "true")
+    for when in ("\N{MINUS SIGN}1.5 s", "\N{MINUS SIGN}1.0 s", "\N{MINUS SIGN}0.5 s", "now"):
+        inspector.clock.run_for(500)
+        expect(inspector.locator("#frame-time")).to_have_text(when)
+    play.click()
+    expect(play).to_have_text("Play")
+    inspector.clock.run_for(2000)
+    expect(inspector.locator("#frame-time")).to_have_text("now")
+
+
+def test_another_scene_clears_the_draws(inspector: Page, engine: ScriptedEngine) -> None:
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+    inspector.get_by_label("Scene", exact=True).select_option("second/scene")
+    expect(inspector.locator("#draws")).to_be_hidden()
+    plan(inspector)
+    expect(inspector.locator("#draws")).to_be_visible()
+    assert engine.submitted[-1].scene.scene_id == "second/scene"
+
+
+def test_opens_a_parquet_scene_file(inspector: Page, engine: ScriptedEngine, tmp_path: Path) -> None:
+    path = tmp_path / "mine.parquet"
+    write_scenes(path, [labelled("from-a-file")])
+    inspector.get_by_label("Open a scene file").set_input_files(path)
+    expect(inspector.get_by_role("status")).to_contain_text("Scene from-a-file")
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+    assert engine.submitted[-1].scene.scene_id == "from-a-file"
+
+
+def test_opens_a_json_scene_that_is_dropped(inspector: Page, engine: ScriptedEngine) -> None:
+    document = body()["scene"] | {"scene_id": "dropped"}
+    inspector.locator("body").evaluate(
+        """(target, text) => {
+            const dataTransfer = new DataTransfer();
+            dataTransfer.items.add(new File([text], "scene.json", {type: "application/json"}));
+            target.dispatchEvent(new DragEvent("drop", {dataTransfer, bubbles: true, cancelable: true}));
+        }""",
+        json.dumps(document),
+    )
+    expect(inspector.get_by_role("status")).to_contain_text("Scene dropped")
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+    expect(inspector.locator("#draws tbody tr").first).to_contain_text(
+        "\N{EN DASH}"
+    )  # no expert to compare with
+    assert engine.submitted[-1].scene.scene_id == "dropped"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("broken.parquet", b"PAR1 and nothing", "truncated"),
+        ("broken.json", b"{", "broken.json is not JSON"),
+        ("other.json", b'{"hello": 1}', "other.json holds no scene"),
+    ],
+)
+def test_a_bad_file_is_told_and_the_scene_stays(
+    inspector: Page, name: str, content: bytes, said: str
+) -> None:
+    chosen = {"name": name, "mimeType": "application/octet-stream", "buffer": content}
+    inspector.get_by_label("Open a scene file").set_input_files(chosen)  # type: ignore[arg-type]
+    expect(inspector.get_by_role("alert")).to_contain_text(said)
+    expect(inspector.get_by_label("Scene", exact=True)).to_have_value("slow-leader")
+
+
+def test_a_problem_is_told_and_goes_away(inspector: Page, engine: ScriptedEngine) -> None:
+    engine.failure = EngineError("out of memory")
+    plan(inspector)
+    alert = inspector.get_by_role("alert")
+    expect(alert).to_contain_text("The engine failed")
+    expect(alert).to_contain_text("out of memory")
+    expect(alert).to_contain_text("request ")
+    engine.failure = None
+    plan(inspector)
+    expect(alert).to_be_hidden()
+    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+
+
+def test_needs_nothing_from_elsewhere(page: Page, served: Served) -> None:
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    answer = page.goto(served.url)
+    expect(page.locator("#clips img")).to_have_count(2)
+    assert answer is not None
+    policy = answer.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert [url for url in asked if not url.startswith((served.url, "data:"))] == []
+
+
+@pytest.mark.parametrize("width", [360, 820, 1800])
+def test_fits_any_width(inspector: Page, width: int) -> None:
+    inspector.set_viewport_size({"width": width, "height": 800})
+    inspector.get_by_label("Thinking").select_option("always")
+    plan(inspector)
+    expect(inspector.locator("blockquote")).to_be_visible()
+    page_width = inspector.locator("html").evaluate("page => page.scrollWidth")
+    assert page_width <= width
+
+
+def test_honours_the_dark_scheme(browser: Browser, served: Served) -> None:
+    context = browser.new_context(color_scheme="dark", viewport={"width": 1360, "height": 950})
+    page = context.new_page()
+    page.goto(served.url)
+    expect(page.locator("#clips img")).to_have_count(2)
+    image = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+    assert near(image[:5], DARK_PAGE_RGB).all()
+    assert not near(pixels(page, "#birdseye"), (255, 255, 255)).mean() > 0.05
+    context.close()

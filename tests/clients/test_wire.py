@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import json
+from typing import Any, get_args
+
+import pytest
+from pydantic import ValidationError
+
+from clients import wire
+from model.driving import plan, scene, trajectory
+from model.engines import engine
+from tests.service.serving import body
+
+
+def test_the_contract_speaks_the_words_of_the_model() -> None:
+    assert get_args(wire.Camera) == scene.CAMERAS
+    assert get_args(wire.Thinking) == get_args(engine.Thinking)
+    assert get_args(wire.Branch) == get_args(engine.Branch)
+    assert tuple(wire.Tracks.model_fields) == plan.GROUPS
+    asked = wire.Controls()
+    assert engine.Controls(**asked.model_dump()) == engine.Controls()
+
+
+def test_shapes_are_those_of_the_model() -> None:
+    properties = wire.Scene.model_json_schema()["properties"]
+    assert properties["history"]["minItems"] == properties["history"]["maxItems"] == trajectory.HISTORY_STEPS
+    route = properties["route"]["anyOf"][0]
+    assert route["minItems"] == route["maxItems"] == trajectory.ROUTE_POINTS
+    future = wire.Draw.model_json_schema()["properties"]["trajectory"]
+    assert future["minItems"] == future["maxItems"] == trajectory.FUTURE_STEPS
+
+
+def test_a_request_survives_json() -> None:
+    asked = wire.PlanRequest.model_validate(body())
+    assert wire.PlanRequest.model_validate_json(asked.model_dump_json()) == asked
+
+
+def change(document: dict[str, Any], *path: Any, to: Any) -> dict[str, Any]:
+    *parents, last = path
+    node: Any = document
+    for part in parents:
+        node = node[part]
+    node[last] = to
+    return document
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("surprise",), 1),
+        (("scene", "surprise"), 1),
+        (("controls", "surprise"), 1),
+        (("scene", "clips", 0, "surprise"), 1),
+        (("scene", "clips", 0, "camera"), "rear_spoiler"),
+        (("scene", "clips"), []),
+        (("scene", "history", 3, 1), float("nan")),
+        (("scene", "history", 3, 1), float("inf")),
+        (("scene", "history", 3, 1), "1.0"),
+        (("scene", "history", 3, 1), 10**400),
+        (("scene", "route", 3), [1.0, 2.0, 3.0]),
+        (("controls", "n"), 0),
+        (("controls", "n"), 65),
+        (("controls", "n"), 2.0),
+        (("controls", "temperature"), 2.1),
+        (("controls", "top_p"), 0),
+        (("controls", "seed"), -1),
+        (("controls", "seed"), True),
+        (("controls", "thinking"), "sometimes"),
+        (("controls", "prefill"), {"longitudinal": [{"start_s": 0.0, "end_s": 6.4}]}),
+        (("controls", "prefill"), ["Accelerate"]),
+    ],
+)
+def test_strictness(path: tuple[Any, ...], value: Any) -> None:
+    with pytest.raises(ValidationError):
+        wire.PlanRequest.model_validate(change(body(), *path, to=value))
+
+
+def test_answers_may_grow() -> None:
+    problem = {"type": "t", "title": "t", "status": 418, "detail": "d", "request_id": "r", "new": 1}
+    assert wire.Problem.model_validate_json(json.dumps(problem)).status == 418

@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from service.settings import Settings
+from tests.service.scripted_engine import ScriptedEngine
+from tests.service.serving import Served, body
+from tests.service.test_errors import JSON, problem
+
+
+def chunks(total: int) -> Iterator[bytes]:
+    for _ in range(total // 1_000_000):
+        yield b" " * 1_000_000
+
+
+def test_50_mb_announced(served: Served, engine: ScriptedEngine) -> None:
+    answer = served.http.post("/v1/plan", content=b" " * 50_000_000, headers=JSON)
+    assert "24000000" in problem(answer, "body-too-large").detail
+    assert engine.submitted == []
+    assert served.metric("looktwice_requests_total", endpoint="/v1/plan", status="413") == 1
+
+
+def test_50_mb_unannounced(served: Served, engine: ScriptedEngine) -> None:
+    problem(served.http.post("/v1/plan", content=chunks(50_000_000), headers=JSON), "body-too-large")
+    assert engine.submitted == []
+
+
+def test_a_lie_about_the_length_ends_the_answer_not_the_server(served: Served) -> None:
+    answer = served.http.post("/v1/plan", content=b"{}", headers=JSON | {"Content-Length": "2"})
+    assert answer.status_code == 422
+    assert served.http.get("/healthz").status_code == 200
+
+
+def test_who_asks_first_is_answered_before_sending(served: Served) -> None:
+    host, port = served.url.removeprefix("http://").split(":")
+    head = (
+        "POST /v1/plan HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+        "Content-Length: 50000000\r\nExpect: 100-continue\r\n\r\n"
+    )
+    with socket.create_connection((host, int(port)), timeout=30) as connection:
+        connection.sendall(head.encode())
+        assert connection.recv(100).startswith(b"HTTP/1.1 413")
+
+
+@pytest.fixture
+def settings() -> Settings:
+    return Settings(max_scene_file_bytes=1000)
+
+
+def test_large_bodies_below_the_limit_are_served(served: Served) -> None:
+    padded = json.dumps(body()) + " " * 20_000_000
+    assert served.http.post("/v1/plan", content=padded, headers=JSON).status_code == 200
+
+
+def test_scene_files_have_a_limit_of_their_own(served: Served) -> None:
+    problem(served.http.post("/v1/scenes:read", content=b"x" * 1001), "body-too-large")
+    problem(served.http.post("/v1/scenes:read", content=b"x" * 1000), "invalid-scene-file")

@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clients import wire
+from service.intake import MAX_STEP_CHANGE_M, engine_request
+from service.problems import ProblemError
+from tests.service.scripted_engine import CARD
+from tests.service.serving import body
+
+
+def with_history(rows: np.ndarray) -> wire.PlanRequest:
+    document = body()
+    document["scene"]["history"] = rows.tolist()
+    return wire.PlanRequest.model_validate(document)
+
+
+def driven(speeds_mps: np.ndarray) -> np.ndarray:
+    """Straight on with these 15 speeds, ending at the present."""
+    rows = np.zeros((16, 4))
+    rows[:-1, 0] = -np.cumsum(0.1 * speeds_mps[::-1])[::-1]
+    return rows
+
+
+@pytest.mark.parametrize(
+    "speeds",
+    [
+        np.zeros(15),
+        np.full(15, 40.0),
+        np.linspace(13, 0, 15),  # an emergency stop, 9 m/s²
+        np.full(15, -2.0),
+    ],
+    ids=["standing", "fast", "emergency stop", "reverse"],
+)
+def test_what_cars_do_is_accepted(speeds: np.ndarray) -> None:
+    engine_request(with_history(driven(speeds)), CARD, "id")
+
+
+def test_measured_poses_may_be_noisy() -> None:
+    rows = driven(np.full(15, 20.0))
+    rows[:-1, :2] += np.random.default_rng(0).normal(0, 0.1, (15, 2)).clip(-0.2, 0.2)
+    engine_request(with_history(rows), CARD, "id")
+
+
+def test_a_heading_may_wrap_around() -> None:
+    rows = driven(np.full(15, 1.0))
+    rows[:-1, 3] = 0.05 * np.arange(15, 0, -1)
+    rows[:8, 3] -= 2 * np.pi
+    engine_request(with_history(rows), CARD, "id")
+
+
+@pytest.mark.parametrize("row", range(1, 14))
+def test_any_two_rows_out_of_order_are_found(row: int) -> None:
+    rows = driven(np.full(15, 8.0))
+    rows[[row, row + 1]] = rows[[row + 1, row]]
+    with pytest.raises(ProblemError, match="in order of time") as caught:
+        engine_request(with_history(rows), CARD, "id")
+    assert f"{3 * 0.8:.1f} m" in caught.value.detail
+    assert MAX_STEP_CHANGE_M < 3 * 0.8
+
+
+def test_cameras_the_model_does_not_need_are_welcome() -> None:
+    document = body()
+    document["scene"]["clips"].append(document["scene"]["clips"][0] | {"camera": "back"})
+    request = engine_request(wire.PlanRequest.model_validate(document), CARD, "id")
+    assert [clip.camera for clip in request.scene.clips] == ["front_wide_120", "front_tele_30", "back"]

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clients.wire import PlanRequest
+from service.app import create_app
+from service.settings import Settings
+from tests.service.scripted_engine import ScriptedEngine
+from tests.service.serving import Served
+
+
+@pytest.fixture(scope="module")
+def description(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    none: Path = tmp_path_factory.mktemp("none") / "none.parquet"
+    return create_app(ScriptedEngine(), Settings(bundled_scenes=none)).openapi()
+
+
+def test_every_error_is_described_as_a_problem(description: dict[str, Any]) -> None:
+    for operations in description["paths"].values():
+        for operation in operations.values():
+            responses = operation["responses"]
+            assert {"200", "500"} <= responses.keys()
+            for status, response in responses.items():
+                if status != "200":
+                    (media_type,) = response["content"]
+                    assert media_type == "application/problem+json"
+                    assert response["content"][media_type]["schema"] == {
+                        "$ref": "#/components/schemas/Problem"
+                    }
+    plan = description["paths"]["/v1/plan"]["post"]["responses"]
+    assert plan.keys() == {"200", "400", "413", "415", "422", "500", "503"}
+    assert "image" not in description["components"]["schemas"]
+    assert "HTTPValidationError" not in description["components"]["schemas"]
+
+
+def test_every_reference_leads_somewhere(description: dict[str, Any]) -> None:
+    def references(node: Any) -> list[str]:
+        if isinstance(node, dict):
+            own = [node["$ref"]] if "$ref" in node else []
+            return own + [found for value in node.values() for found in references(value)]
+        return [found for value in node for found in references(value)] if isinstance(node, list) else []
+
+    known = description["components"]["schemas"]
+    assert {reference.removeprefix("#/components/schemas/") for reference in references(description)} <= set(
+        known
+    )
+
+
+def test_the_example_can_be_sent_as_it_is(description: dict[str, Any], served: Served) -> None:
+    content = description["paths"]["/v1/plan"]["post"]["requestBody"]["content"]["application/json"]
+    (example,) = content["examples"].values()
+    PlanRequest.model_validate(example["value"])
+    assert served.http.post("/v1/plan", json=example["value"]).status_code == 200
+
+
+def test_fields_say_their_units(description: dict[str, Any]) -> None:
+    schemas = description["components"]["schemas"]
+    history = schemas["Scene"]["properties"]["history"]
+    assert "10 Hz" in history["description"]
+    assert "rad" in history["items"]["description"]
+    assert "4 m" in str(schemas["Scene"]["properties"]["route"])
+    assert schemas["PlanRequest"]["additionalProperties"] is False

@@ -1,0 +1,130 @@
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from model.driving.scene_store import write_scenes
+from service import views
+from service.problems import ProblemError
+from service.settings import Settings
+from service.views import BundledScenes, scenes_of_file, view
+from tests.service.scenes import labelled
+from tests.service.scripted_engine import ScriptedEngine
+from tests.service.serving import Served, serve
+from tests.service.test_errors import problem
+
+
+def test_a_view_tells_everything_the_page_draws() -> None:
+    shown, original = view(labelled()), labelled()
+    assert base64.b64decode(shown.scene.clips[1].images[3]) == original.scene.clips[1].images[3]
+    assert np.allclose(shown.scene.history, original.scene.history, atol=1e-3)
+    assert np.allclose(shown.future, original.future, atol=1e-3)
+    assert np.allclose(shown.drivable[0], original.drivable[0])
+    assert len(shown.lane_lines) == 4
+    assert shown.tags == ["lane_change", "lead_vehicle"]
+    leader, _, walker = shown.agents
+    assert (leader.kind, leader.length_m, leader.poses[15]) == ("vehicle", 4.5, [24.0, 0.0, 0.0])
+    assert walker.poses[:4] == [None] * 4, "absent is null: JSON has no NaN"
+    assert walker.poses[4] is not None
+
+
+def test_bundled_scenes_can_be_planned_for_as_they_come(served: Served, engine: ScriptedEngine) -> None:
+    entries = served.http.get("/v1/scenes").json()["scenes"]
+    assert [entry["scene_id"] for entry in entries] == ["slow-leader", "second/scene"]
+    assert entries[0]["tags"] == ["lane_change", "lead_vehicle"]
+    for entry in entries:
+        shown = served.http.get(f"/v1/scenes/{entry['scene_id'].replace('/', '%2F')}").json()
+        assert served.http.post("/v1/plan", json={"scene": shown["scene"]}).status_code == 200
+    assert [request.scene.scene_id for request in engine.submitted] == ["slow-leader", "second/scene"]
+
+
+def test_an_unknown_scene(served: Served) -> None:
+    problem(served.http.get("/v1/scenes/nobody"), "unknown-scene")
+
+
+def test_no_bundled_scenes_are_an_empty_list(engine: ScriptedEngine, tmp_path: Path) -> None:
+    with serve(engine, Settings(bundled_scenes=tmp_path / "none.parquet")) as served:
+        assert served.http.get("/v1/scenes").json() == {"scenes": []}
+        problem(served.http.get("/v1/scenes/any"), "unknown-scene")
+
+
+def test_damaged_bundled_scenes_are_told(engine: ScriptedEngine, scene_file: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.parquet"
+    damaged.write_bytes(scene_file.read_bytes()[:-100])
+    with serve(engine, Settings(bundled_scenes=damaged)) as served:
+        found = problem(served.http.get("/v1/scenes"), "scenes-unreadable")
+        assert "truncated" in found.detail
+        assert str(tmp_path) not in found.detail, "paths of the server are nobody's business"
+        assert served.http.get("/readyz").status_code == 200
+
+
+def test_bundled_scenes_are_read_once(scene_file: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.parquet"
+    copy.write_bytes(scene_file.read_bytes())
+    scenes = BundledScenes(copy)
+    first = scenes.all()
+    copy.unlink()
+    assert scenes.all() is first
+
+
+def test_an_uploaded_file(served: Served, scene_file: Path) -> None:
+    answer = served.http.post("/v1/scenes:read", content=scene_file.read_bytes())
+    assert answer.status_code == 200
+    first, second = answer.json()["scenes"]
+    assert first == served.http.get("/v1/scenes/slow-leader").json()
+    assert second["scene"]["scene_id"] == "second/scene"
+
+
+def test_a_truncated_file_says_so(served: Served, scene_file: Path) -> None:
+    for kept in (0, 1, 1000, -1):
+        content = scene_file.read_bytes()[:kept]
+        found = problem(served.http.post("/v1/scenes:read", content=content), "invalid-scene-file")
+        assert "truncated" in found.detail
+
+
+def test_a_damaged_page_says_so(scene_file: Path) -> None:
+    content = bytearray(scene_file.read_bytes())
+    content[4:20_000] = bytes(19_996)
+    with pytest.raises(ProblemError, match=r"scenes\.parquet"):
+        scenes_of_file(bytes(content))
+
+
+def rewritten(path: Path, metadata: dict[bytes, bytes] | None) -> bytes:
+    table = pq.read_table(path).replace_schema_metadata(metadata)
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    content: bytes = sink.getvalue().to_pybytes()
+    return content
+
+
+def test_another_version_says_so(served: Served, scene_file: Path) -> None:
+    content = rewritten(scene_file, {b"looktwice.scene_version": b"99"})
+    found = problem(served.http.post("/v1/scenes:read", content=content), "invalid-scene-file")
+    assert "version 99" in found.detail
+
+
+def test_another_parquet_file_says_so(served: Served, scene_file: Path) -> None:
+    content = rewritten(scene_file, None)
+    found = problem(served.http.post("/v1/scenes:read", content=content), "invalid-scene-file")
+    assert "no LookTwice scenes" in found.detail
+
+
+def test_a_file_that_would_fill_the_memory(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(views, "MAX_UNPACKED_BYTES", 1000)
+    with pytest.raises(ProblemError, match="would unpack to"):
+        scenes_of_file(scene_file.read_bytes())
+
+
+def test_a_file_with_too_many_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "many.parquet"
+    write_scenes(path, (labelled(str(number)) for number in range(4)))
+    monkeypatch.setattr(views, "MAX_SCENES_SHOWN", 3)
+    assert len(scenes_of_file(path.read_bytes())) == 3
+    monkeypatch.setattr(views, "MAX_SCENES_IN_FILE", 3)
+    with pytest.raises(ProblemError, match="more than 3 scenes"):
+        scenes_of_file(path.read_bytes())
