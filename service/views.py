@@ -42,7 +42,7 @@ class BundledScenes:
         try:
             return self._scenes
         except SceneFileError as error:
-            raise ProblemError(SCENES_UNREADABLE, _without_folder(error, self._path)) from error
+            raise ProblemError(SCENES_UNREADABLE, _told(error, self._path, self._path.name)) from error
 
     def one(self, scene_id: str) -> LabelledScene:
         """The scene of that name; raises `ProblemError`."""
@@ -67,7 +67,7 @@ def scenes_of_file(content: bytes) -> list[wire.LabelledScene]:
             _refuse_bombs(path)
             return [view(scene) for scene in islice(read_scenes(path, dense=False), MAX_SCENES_SHOWN)]
         except SceneFileError as error:
-            raise ProblemError(INVALID_SCENE_FILE, _without_folder(error, path)) from error
+            raise ProblemError(INVALID_SCENE_FILE, _told(error, path, "the file")) from error
 
 
 def view(labelled: LabelledScene) -> wire.LabelledScene:
@@ -121,5 +121,6 @@ def _refuse_bombs(path: Path) -> None:
         )
 
 
-def _without_folder(error: SceneFileError, path: Path) -> str:
-    return str(error).replace(str(path), path.name)
+def _told(error: SceneFileError, path: Path, name: str) -> str:
+    # Where files lie on the server is nobody's business.
+    return str(error).replace(str(path), name)

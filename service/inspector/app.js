@@ -59,7 +59,13 @@ async function chooseScene() {
 
 async function openFile(file) {
   say(`Reading ${file.name} …`);
-  const views = await api.scenesOfFile(file);
+  let views;
+  try {
+    views = await api.scenesOfFile(file);
+  } catch (error) {
+    say(`${file.name} was not opened.`);
+    throw error;
+  }
   if (!views.length) throw new Error(`${file.name} holds no scenes.`);
   const options = views.map((view, index) => {
     const id = `file:${file.name}:${index}`;

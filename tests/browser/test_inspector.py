@@ -221,6 +221,7 @@ def test_a_bad_file_is_told_and_the_scene_stays(
     chosen = {"name": name, "mimeType": "application/octet-stream", "buffer": content}
     inspector.get_by_label("Open a scene file").set_input_files(chosen)  # type: ignore[arg-type]
     expect(inspector.get_by_role("alert")).to_contain_text(said)
+    expect(inspector.get_by_role("status")).to_have_text(f"{name} was not opened.")
     expect(inspector.get_by_label("Scene", exact=True)).to_have_value("slow-leader")
 
 
