@@ -123,4 +123,4 @@ def _refuse_bombs(path: Path) -> None:
 
 def _told(error: SceneFileError, path: Path, name: str) -> str:
     # Where files lie on the server is nobody's business.
-    return str(error).replace(str(path), name)
+    return str(error).replace(str(path), name).strip()
