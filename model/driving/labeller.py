@@ -161,8 +161,7 @@ def _sideways_speed(offset: Array, usable: BoolArray) -> Array:
 
 def _track(words: list[str]) -> Track:
     """Words of the 79 steps, history first, as the track of the 64 steps ahead."""
-    # First with the history, so that what began before the present is not taken for short.
-    return track_from_words(_absorb_short(_absorb_short(words)[-TICKS:]))
+    return track_from_words(_absorb_short(words[-TICKS:]))
 
 
 def _absorb_short(words: list[str]) -> list[str]:

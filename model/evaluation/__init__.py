@@ -1,0 +1,1 @@
+"""Open-loop evaluation: measures per scene, tables with intervals, pictures."""

@@ -204,6 +204,15 @@ def test_a_lane_change_that_crosses_in_time_but_does_not_finish() -> None:
     assert words(lane(lane_trace(shift(4, 4)))) == ["Keep Lane", "Left Lane Change"]
 
 
+def test_a_lane_change_that_pauses_astride_the_line_is_one() -> None:
+    # 2.4 m by 2 s, a second's pause 1.1 m from the new lane's centre, then the rest.
+    track = lane(lane_trace(shift(0, 2, 2.4) + shift(3, 2, 1.1)))
+    assert track is not None
+    assert words(track)[-2:] == ["Left Lane Change", "Keep Lane"]
+    assert track[-2].start < 10
+    assert 40 <= track[-2].end <= 50
+
+
 def test_two_lanes_at_once_are_one_long_lane_change() -> None:
     assert words(lane(lane_trace(shift(1, 5, 2 * LANE_WIDTH_M)))) == [
         "Keep Lane",

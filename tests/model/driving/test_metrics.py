@@ -134,10 +134,10 @@ def test_collisions_equal_the_slow_ones(seed: int, within_s: float) -> None:
 
 
 def test_a_crash_after_five_seconds_does_not_count() -> None:
-    # Bumper to bumper after 50 m at 10 m/s minus half the lengths of both.
+    # Bumpers meet after x - 4.5 m, at 10 m/s: just before and just after 5.0 s.
     future, _ = drive(10.0)
-    near = agent(x=49.0, y=0.0)
-    far = agent(x=55.0, y=0.0)
+    near = agent(x=54.0, y=0.0)
+    far = agent(x=54.6, y=0.0)
     assert collides(future[None], [near]).tolist() == [True]
     assert collides(future[None], [far]).tolist() == [False]
     assert collides(future[None], [far], within_s=6.4).tolist() == [True]
@@ -151,6 +151,13 @@ def test_boxes_that_only_circles_would_touch_do_not_collide() -> None:
     assert collides(future[None], [diagonal]).tolist() == [False]
     assert collides(future[None], [beside]).tolist() == [False]
     assert collides(future[None], [touching]).tolist() == [True]
+
+
+def test_corners_that_barely_overlap_collide() -> None:
+    # Both stand; the boxes share a few centimetres at a corner, their centres are far apart.
+    future, _ = drive(0.0)
+    at_the_corner = agent(x=EGO_LENGTH_M / 2 + 2.15, y=EGO_WIDTH_M / 2 + 0.85)
+    assert collides(future[None], [at_the_corner]).tolist() == [True]
 
 
 def test_nobody_there_is_no_collision() -> None:

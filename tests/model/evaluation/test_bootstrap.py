@@ -54,6 +54,11 @@ def test_scenes_of_one_episode_are_not_counted_as_independent() -> None:
     assert alike[1] - alike[0] > 4 * (apart[1] - apart[0])
 
 
+def test_episodes_of_any_length_weigh_by_their_scenes() -> None:
+    _, interval = mean_interval(results([[4.0], [4.0] * 9, [4.0] * 3]), "min_ade_m")
+    assert interval == pytest.approx((4.0, 4.0))
+
+
 def test_scenes_without_the_measure_do_not_count() -> None:
     with_gaps = results([[1.0, None], [None, None], [3.0]], "think_rate")
     assert mean_interval(with_gaps, "think_rate")[0] == pytest.approx(2.0)
