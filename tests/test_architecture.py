@@ -45,20 +45,20 @@ def within(name: str, packages: tuple[str, ...]) -> bool:
     return any(name == package or name.startswith(package + ".") for package in packages)
 
 
-@pytest.mark.parametrize(("name", "path"), modules())
+@pytest.mark.parametrize(("name", "path"), list(modules()))
 def test_arrows_point_one_way(name: str, path: Path) -> None:
     room = max((room for room in ALLOWED if within(name, (room,))), key=len)
     ours = [imported for imported in imports(path) if within(imported, PACKAGES)]
     assert [imported for imported in ours if not within(imported, ALLOWED[room])] == []
 
 
-@pytest.mark.parametrize(("name", "path"), modules())
+@pytest.mark.parametrize(("name", "path"), list(modules()))
 def test_torch_stays_in_the_engine_room(name: str, path: Path) -> None:
     if within(name, TORCH_FREE):
         assert [imported for imported in imports(path) if within(imported, ("torch", "transformers"))] == []
 
 
-@pytest.mark.parametrize(("name", "path"), modules())
+@pytest.mark.parametrize(("name", "path"), list(modules()))
 def test_the_planner_client_stays_light(name: str, path: Path) -> None:
     if within(name, LIGHT):
         import sys

@@ -51,9 +51,7 @@ CF_VLA: Final = Format(
 )
 """plan, branch { Action: trajectory | Thinking: free text, revised plan, Action: trajectory }"""
 
-TRAJ_ONLY: Final = Format(
-    "traj_only", Section("trajectory", Sequence((Literal(ACTION), _TRAJECTORY)))
-)
+TRAJ_ONLY: Final = Format("traj_only", Section("trajectory", Sequence((Literal(ACTION), _TRAJECTORY))))
 """The trajectory at once, without a plan."""
 
 FORMATS: Final = {format.name: format for format in (CF_VLA, TRAJ_ONLY)}

@@ -341,9 +341,7 @@ class Cursor:
                 stop = self.compiled.literal(piece.stop)[:1] if len(ids) < piece.max_tokens else ()
                 return ids + stop
             case _AtCode(piece, _) if isinstance(value, tuple) and len(value) == piece.count:
-                return tuple(
-                    int(self.compiled.codes(stage)[code]) for stage, code in enumerate(value)
-                )
+                return tuple(int(self.compiled.codes(stage)[code]) for stage, code in enumerate(value))
         raise FormatError(f"section {self.section!r} cannot be written from {value!r}")
 
     def _at(self, active: _Active) -> Cursor:
@@ -364,10 +362,12 @@ def _with_given(piece: Piece, given: Mapping[str, Value], section: str | None) -
             return Sequence(tuple(_with_given(part, given, section) for part in parts))
         case Choice(options, name):
             return Choice(
-                tuple(type(option)(option.text, _with_given(option.then, given, section)) for option in options),
+                tuple(
+                    type(option)(option.text, _with_given(option.then, given, section)) for option in options
+                ),
                 name,
             )
-        case PlanTracks() if section in given:
+        case PlanTracks() if section is not None and section in given:
             plan = given[section]
             if not isinstance(plan, Plan):
                 raise FormatError(f"section {section!r} needs a plan")
@@ -404,5 +404,3 @@ def _written_plan(plan: Plan, section: str) -> Sequence:
                 case _:
                     raise FormatError(f"a plan holds no {type(piece).__name__}")
     return Sequence(tuple(parts))
-
-

@@ -81,7 +81,8 @@ def _add_track_rules(group: Group, rules: dict[str, str]) -> None:
     for start in range(TICKS):
         bullet = json.dumps(f"  - {format_tick(start)}s-")
         ends = [
-            f'"{format_tick(end)}s:" {group}_word {_track_name(group, end)}' for end in range(start + 1, TICKS)
+            f'"{format_tick(end)}s:" {group}_word {_track_name(group, end)}'
+            for end in range(start + 1, TICKS)
         ]
         ends.append(f'"{format_tick(TICKS)}s:" {group}_word')
         rules[_track_name(group, start)] = f"{bullet} ({' | '.join(ends)})"

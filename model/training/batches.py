@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset
@@ -106,7 +107,7 @@ class ResponseDataset(Dataset[Sample]):
 
 
 class TaskSampler(BatchSampler):
-    """Epochs of batches; within a batch the task and the presence of a route are the same, so little is padded.
+    """Epochs of batches; a batch has one task, with or without route, so little is padded.
 
     Args:
         examples: how many there are, and which have a route.
@@ -118,7 +119,7 @@ class TaskSampler(BatchSampler):
 
     def __init__(
         self,
-        has_route: np.ndarray[tuple[int], np.dtype[np.bool_]],
+        has_route: npt.NDArray[np.bool_],
         batch_size: int,
         tasks: Mapping[Task, float],
         route_share: float,
@@ -176,5 +177,5 @@ def collate(samples: list[Sample]) -> Batch:
         "code_shares": torch.from_numpy(np.stack([sample.code_shares for sample in samples])),
     }
     if samples[0].patches is not None:
-        batch["patches"] = torch.from_numpy(np.concatenate([sample.patches for sample in samples]))  # type: ignore[misc]
+        batch["patches"] = torch.from_numpy(np.concatenate([sample.patches for sample in samples]))
     return batch

@@ -97,7 +97,7 @@ class Examples:
             )
             columns["facts"].append(scene_facts(labelled))
             columns["episode"].append(labelled.seed)
-        types = {"picture_spans": np.int64, "plan_bins": np.int8, "dense_classes": np.uint8}
+        types: dict[str, Any] = {"picture_spans": np.int64, "plan_bins": np.int8, "dense_classes": np.uint8}
         types |= {"dense_range_log": np.float16, "episode": np.int64}
         arrays = {
             name: np.asarray(values, types.get(name, np.float32))
@@ -121,7 +121,9 @@ class Examples:
 
 def load_examples(scenes: Path, cache: Path, cameras: Sequence[str], workers: int = 2) -> Examples:
     """The examples of a scene file or folder, through the cache folder."""
-    jobs = [(file, cache / f"{file.parent.name}-{file.stem}.v{CACHE_VERSION}.npz") for file in scene_files(scenes)]
+    jobs = [
+        (file, cache / f"{file.parent.name}-{file.stem}.v{CACHE_VERSION}.npz") for file in scene_files(scenes)
+    ]
     stale = [
         (file, cached)
         for file, cached in jobs
@@ -143,5 +145,5 @@ def load_examples(scenes: Path, cache: Path, cameras: Sequence[str], workers: in
 def _fill_cache(file: Path, cached: Path, cameras: tuple[str, ...]) -> None:
     examples = Examples.from_scenes(read_scenes(file), cameras)
     temporary = cached.with_name(f".{cached.name}.{os.getpid()}.npz")
-    np.savez(temporary, **{field.name: getattr(examples, field.name) for field in fields(Examples)})  # type: ignore[arg-type]
+    np.savez(temporary, **{field.name: getattr(examples, field.name) for field in fields(Examples)})
     os.replace(temporary, cached)

@@ -8,7 +8,7 @@ thousands of things), and for the whole scene the facts of `model.training.facts
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -90,18 +90,18 @@ class GroundingLearner(nn.Module):
         merge = vla.settings.spatial_merge_size
         self._rows, self._columns = (side // merge for side in vla.settings.grid[1:])
         self._cell = (dense_shape[0] // self._rows, dense_shape[1] // self._columns)
-        hidden = vla.config.text_config.hidden_size
+        text: Any = vla.config.text_config
+        hidden = text.hidden_size
         cells = self._cell[0] * self._cell[1]
         self.dense_head = nn.Linear(hidden, cells * (_CLASSES + 1))
         # One head over everything seen, with places kept: where something stands is what counts.
         places = len(vla.settings.cameras) * self._rows * self._columns
         self.squeeze = nn.Linear(hidden, 24)
-        self.fact_head = nn.Sequential(
-            nn.Linear(places * 24, 256), nn.SiLU(), nn.Linear(256, len(FACTS))
-        )
-        self.register_buffer("class_weights", torch.tensor(_CLASS_WEIGHTS))
+        self.fact_head = nn.Sequential(nn.Linear(places * 24, 256), nn.SiLU(), nn.Linear(256, len(FACTS)))
 
-    def forward(self, patches: Tensor, classes: Tensor, range_log: Tensor, facts: Tensor) -> dict[str, Tensor]:
+    def forward(
+        self, patches: Tensor, classes: Tensor, range_log: Tensor, facts: Tensor
+    ) -> dict[str, Tensor]:
         """The loss of a batch from `collate_grounding`, and its parts without gradients."""
         batch, cameras = classes.shape[:2]
         grid = torch.tensor([[1, *self.vla.settings.grid[1:]]] * (batch * cameras))
@@ -111,7 +111,7 @@ class GroundingLearner(nn.Module):
         dense = dense.permute(0, 1, 2, 4, 3, 5, 6).reshape(*classes.shape, _CLASSES + 1)
         labels = classes.long()
         class_loss = F.cross_entropy(
-            dense[..., :_CLASSES].flatten(0, -2), labels.flatten(), weight=self.class_weights
+            dense[..., :_CLASSES].flatten(0, -2), labels.flatten(), weight=dense.new_tensor(_CLASS_WEIGHTS)
         )
         shown = range_log > 0
         weight = torch.where(labels >= 3, _OBJECT_RANGE_WEIGHT, 1.0)[shown]

@@ -48,7 +48,7 @@ class Recipe:
     seed: int = 0
 
 
-NANO_WEIGHTS: Final[SectionWeights] = MappingProxyType(PAPER_WEIGHTS | {"trajectory": 10.0 / 3})
+NANO_WEIGHTS: Final[SectionWeights] = MappingProxyType(dict(PAPER_WEIGHTS) | {"trajectory": 10.0 / 3})
 """A model from scratch learns trajectories too, which the paper's brings along: there 10 plan tokens weigh as
 much as 10 codes in all; here three quarters of a plan's tokens are forced and teach nothing."""
 

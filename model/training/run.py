@@ -48,7 +48,9 @@ class RunSettings:
     use_cpu: bool = True
 
 
-def create(scenes: Path, cache: Path, target: Path, *, codec_size: int = 512, seed: int = 0) -> dict[str, float]:
+def create(
+    scenes: Path, cache: Path, target: Path, *, codec_size: int = 512, seed: int = 0
+) -> dict[str, float]:
     """Write an untrained nano checkpoint whose codec is fitted to ``scenes``; returns the codec's error."""
     examples = load_examples(scenes, cache, VlaSettings().cameras)
     codec = TrajectoryCodec.fit(examples.history, examples.future, size=codec_size, seed=seed)
@@ -63,6 +65,7 @@ def run(
     target: Path,
     settings: RunSettings,
     validation: Sequence[LabelledScene] = (),
+    vision_source: Path | None = None,
 ) -> None:
     """Train ``source`` by a recipe and write the outcome to ``target``.
 
@@ -75,8 +78,12 @@ def run(
         target: the checkpoint to write.
         settings: see there.
         validation: scenes to report open-loop errors on while training with pictures.
+        vision_source: a checkpoint whose vision tower replaces the source's; so the tower can be grounded
+            while another process trains the language.
     """
     loaded = load(source)
+    if vision_source is not None:
+        loaded.model.model.visual.load_state_dict(load(vision_source).model.model.visual.state_dict())
     loaded.model.train()
     torch.manual_seed(recipe.seed)
     examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
@@ -98,7 +105,14 @@ def run(
         use_cpu=settings.use_cpu,
     )
     trainer.train(resume_from_checkpoint=any((target / "state").glob("checkpoint-*")))
-    save(target, loaded.model.eval(), loaded.vocabulary, loaded.codec, details=_details(recipe, loaded, examples))
+    loaded.model.train(False)
+    save(
+        target,
+        loaded.model,
+        loaded.vocabulary,
+        loaded.codec,
+        details=_details(recipe, loaded, examples),
+    )
 
 
 def _prepare(
@@ -117,7 +131,7 @@ def _prepare(
         pictures=recipe.pictures,
         seed=recipe.seed,
     )
-    has_route = np.isfinite(examples.route).all(axis=(1, 2))
+    has_route = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
     sampler = TaskSampler(has_route, recipe.batch_size, recipe.tasks, recipe.route_share, recipe.seed)
     first_code_id = loaded.vocabulary.code_ids(0).start
     return ResponseLearner(loaded.model, first_code_id, compiled=compiled), dataset, sampler, collate

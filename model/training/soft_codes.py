@@ -1,8 +1,8 @@
 """Soft targets for trajectory codes.
 
-Many code sequences spell nearly the same trajectory. Instead of one winner per stage, a stage's target is a
-distribution over codewords by their distance, and the code fed on is drawn from it: later stages then learn to
-correct whatever earlier ones chose. A small model learns far faster from this than from winners alone.
+Many code sequences spell nearly the same trajectory. Instead of one winner per stage, a stage's target is
+a distribution over codewords by their distance, and the code fed on is drawn from it: later stages then
+learn to correct whatever earlier ones chose. A small model learns far faster from this than from winners.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _SOFTNESS: Final = 0.5
 
 
 class SoftTarget(NamedTuple):
-    """Codes int64 [6] drawn for one trajectory, and for each stage the distribution float32 [6, K] they came from."""
+    """Codes int64 [6] drawn for one trajectory, and the distributions float32 [6, K] they came from."""
 
     codes: npt.NDArray[np.int64]
     shares: FloatArray

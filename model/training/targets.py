@@ -75,9 +75,7 @@ def weigh(tokens: Sequence[Token], weights: SectionWeights, *, counterfactual: b
     by_section = dict(weights)
     if counterfactual:
         by_section["plan"] = 0.0
-    return Target(
-        tuple(token.id for token in tokens), tuple(by_section[token.section] for token in tokens)
-    )
+    return Target(tuple(token.id for token in tokens), tuple(by_section[token.section] for token in tokens))
 
 
 def make_target(

@@ -21,7 +21,7 @@ LOG_FILE: Final = "log.jsonl"
 Validate = Callable[[], Mapping[str, float]]
 
 
-class LearnerTrainer(Trainer):  # type: ignore[misc]
+class LearnerTrainer(Trainer):
     """Trains a learner (a module whose forward gives the loss) on batches of its own sampler."""
 
     def __init__(
@@ -70,21 +70,20 @@ class LearnerTrainer(Trainer):  # type: ignore[misc]
             data_collator=collate,
             callbacks=[_Log(folder / LOG_FILE, validate, validate_every)],
         )
-        self._recipe, self._sampler = recipe, sampler
+        self._recipe, self._sampler, self._dataset, self._learner = recipe, sampler, dataset, learner
 
     def get_train_dataloader(self) -> Any:
         """Batches of equal tasks where there is a sampler for them."""
         if self._sampler is None:
             return super().get_train_dataloader()
-        loader = DataLoader(self.train_dataset, batch_sampler=self._sampler, collate_fn=self.data_collator)
+        loader = DataLoader(self._dataset, batch_sampler=self._sampler, collate_fn=self.data_collator)
         return self.accelerator.prepare(loader)
 
     def create_optimizer(self, *args: Any, **kwargs: Any) -> Any:
         """AdamW with the vision tower's own learning rate."""
         if self.optimizer is None:
-            assert self.model is not None
             groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
-            for name, parameter in self.model.named_parameters():
+            for name, parameter in self._learner.named_parameters():
                 if parameter.requires_grad:
                     groups.setdefault((".visual." in name, parameter.ndim > 1), []).append(parameter)
             arguments = self.args
@@ -104,22 +103,24 @@ class LearnerTrainer(Trainer):  # type: ignore[misc]
 
     # Tied weights make safetensors refuse a plain module; torch's own file keeps them tied.
     def _save(self, output_dir: str | None = None, state_dict: dict[str, Any] | None = None) -> None:
-        folder = Path(output_dir or self.args.output_dir)
+        folder = Path(str(output_dir or self.args.output_dir))
         folder.mkdir(parents=True, exist_ok=True)
-        torch.save(state_dict or self.model.state_dict(), folder / _STATE_FILE)
+        torch.save(state_dict or self._learner.state_dict(), folder / _STATE_FILE)
 
     def _load_from_checkpoint(self, resume_from_checkpoint: str, model: nn.Module | None = None) -> None:
         state = torch.load(Path(resume_from_checkpoint) / _STATE_FILE, map_location="cpu", weights_only=True)
-        (model or self.model).load_state_dict(state)
+        (model or self._learner).load_state_dict(state)
 
 
-class _Log(TrainerCallback):  # type: ignore[misc]
+class _Log(TrainerCallback):
     """Appends what the trainer logs, and validation figures, to a file of JSON lines."""
 
     def __init__(self, path: Path, validate: Validate | None, every: int) -> None:
         self._path, self._validate, self._every = path, validate, every
 
-    def on_log(self, args: Any, state: Any, control: Any, logs: dict[str, Any] | None = None, **_: Any) -> None:
+    def on_log(
+        self, args: Any, state: Any, control: Any, logs: dict[str, Any] | None = None, **_: Any
+    ) -> None:
         self._write({"step": state.global_step, **(logs or {})})
 
     def on_step_end(self, args: Any, state: Any, control: Any, **_: Any) -> None:

@@ -29,8 +29,9 @@ def open_loop(
     The network is put into evaluation mode meanwhile.
     """
     futures = {labelled.scene.scene_id: labelled for labelled in scenes}
-    was_training = loaded.model.training
-    loaded.model.eval()
+    network: torch.nn.Module = loaded.model
+    was_training = network.training
+    network.eval()
     figures: dict[str, float] = {}
     with torch.inference_mode():
         for format in formats:
@@ -59,5 +60,5 @@ def open_loop(
                 figures[f"min_ade_m/{label}"] = float(np.mean(errors))
                 if ious:
                     figures[f"plan_iou/{label}"] = float(np.mean(ious))
-    loaded.model.train(was_training)
+    network.train(was_training)
     return figures

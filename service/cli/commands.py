@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import typer
 
-from service.cli import evaluate, plan, scenes, serve, train
+import service.cli.evaluate as evaluate
+import service.cli.plan as plan
+import service.cli.scenes as scenes
+import service.cli.serve as serve
+import service.cli.train as train
 
 app = typer.Typer(
     name="looktwice",

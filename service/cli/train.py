@@ -16,7 +16,10 @@ def train(
     scenes: Annotated[Path, typer.Option(help="Training scenes: a file or a folder.")],
     target: Annotated[Path, typer.Option("--to", help="Checkpoint folder to write.")],
     source: Annotated[Path | None, typer.Option("--from", help="Checkpoint folder to start from.")] = None,
-    validation: Annotated[Path | None, typer.Option(help="Scenes to report errors on while training.")] = None,
+    vision_from: Annotated[Path | None, typer.Option(help="Checkpoint whose vision tower is taken.")] = None,
+    validation: Annotated[
+        Path | None, typer.Option(help="Scenes to report errors on while training.")
+    ] = None,
     validation_scenes: Annotated[int, typer.Option(help="How many of them.", min=1)] = 96,
     cache: Annotated[Path, typer.Option(help="Folder for scenes brought into arrays.")] = Path("data/cache"),
     paper: Annotated[bool, typer.Option(help="The paper's recipe, for a pretrained backbone.")] = False,
@@ -71,5 +74,6 @@ def train(
             target,
             RunSettings(cache, bf16=bf16, compiled=compiled, use_cpu=not gpu),
             held_out,
+            vision_from,
         )
         training_curves(target / LOG_FILE, target / "curves.png")

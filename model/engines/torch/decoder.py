@@ -40,7 +40,9 @@ class Decoder:
         self._waiting: deque[Request] = deque()
         self._running: list[RunningDraw] = []
         vocabulary = runner.loaded.vocabulary
-        self._formats = {name: CompiledFormat(FORMATS[name], vocabulary) for name in runner.loaded.card.formats}
+        self._formats = {
+            name: CompiledFormat(FORMATS[name], vocabulary) for name in runner.loaded.card.formats
+        }
 
     @property
     def idle(self) -> bool:
@@ -59,7 +61,9 @@ class Decoder:
             known = ", ".join(self._formats)
             raise RequestError(f"unknown format {plan_request.format!r}; this checkpoint writes {known}")
         if controls.n > self._runner.rows:
-            raise RequestError(f"n is {controls.n}; this engine runs at most {self._runner.rows} draws at once")
+            raise RequestError(
+                f"n is {controls.n}; this engine runs at most {self._runner.rows} draws at once"
+            )
         cameras = {clip.camera for clip in plan_request.scene.clips}
         if missing := [camera for camera in loaded.card.cameras if camera not in cameras]:
             raise RequestError(f"the scene lacks camera {', '.join(missing)}, which this checkpoint needs")
@@ -135,6 +139,7 @@ class Decoder:
         text = loaded.vocabulary.decode([token.id for token in draw.tokens])
         values = parse(FORMATS[request.format], text)
         codes = values["trajectory"]
+        assert isinstance(codes, tuple)
         trajectory = loaded.codec.decode(request.scene.history[None], [codes])[0]
         return DrawFinished(draw.finished(text, values, trajectory))
 

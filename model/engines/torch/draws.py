@@ -99,7 +99,8 @@ class RunningDraw:
             wanted = THINKING if self.think_probability > controls.think_threshold else ACTION
         if wanted is None:
             return allowed.ids
-        return allowed.ids[leads if wanted == THINKING else ~leads]
+        left: npt.NDArray[np.int64] = allowed.ids[leads if wanted == THINKING else ~leads]
+        return left
 
     def _section_finished(self, vocabulary: Vocabulary) -> SectionFinished:
         section = self.tokens[-1].section

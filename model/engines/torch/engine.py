@@ -9,9 +9,21 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
-from model.engines.engine import DrawFinished, EngineError, Event, ModelCard, PlanRequest, RequestError
+from model.driving.images import encode_jpeg
+from model.driving.scene import CLIP_FRAMES, Clip, Scene
+from model.driving.trajectory import HISTORY_STEPS
+from model.engines.engine import (
+    Controls,
+    DrawFinished,
+    EngineError,
+    Event,
+    ModelCard,
+    PlanRequest,
+    RequestError,
+)
 from model.engines.torch.decoder import Decoder, Failed
 from model.engines.torch.runner import Runner
 from model.network.checkpoint import load
@@ -36,6 +48,14 @@ class TorchSettings:
     jump: bool = True
 
 
+def grey_scene(card: ModelCard) -> Scene:
+    """A standing ego that sees nothing but grey, through the cameras of a checkpoint."""
+    width, height = card.image_size
+    picture = encode_jpeg(np.full((height, width, 3), 128, np.uint8))
+    clips = tuple(Clip(camera, (picture,) * CLIP_FRAMES) for camera in card.cameras)
+    return Scene("grey", clips, np.zeros((HISTORY_STEPS, 4), np.float32))
+
+
 class TorchEngine:
     """`model.engines.engine.Engine` over a checkpoint folder; see there for the contract."""
 
@@ -52,11 +72,15 @@ class TorchEngine:
         return self._loaded.card
 
     async def start(self) -> None:
-        """Start the decoding thread."""
+        """Start the decoding thread and plan once for a grey scene in every format."""
         if self._thread is not None:
             raise EngineError("the engine runs already")
         self._thread = threading.Thread(target=self._run, name="looktwice-engine", daemon=True)
         self._thread.start()
+        for format in self.card.formats:
+            warm_up = PlanRequest(f"warm-up {format}", grey_scene(self.card), format, Controls(n=1))
+            async for _ in self.submit(warm_up):
+                pass
 
     async def stop(self) -> None:
         """Cancel everything and end the thread; running requests get an `EngineError`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -36,7 +36,7 @@ class Runner:
     def __init__(self, loaded: Loaded, rows: int, length: int) -> None:
         self.loaded = loaded
         self.rows = rows
-        text = loaded.model.config.text_config
+        text: Any = loaded.model.config.text_config
         self._kv = KvRows(
             layers=text.num_hidden_layers,
             heads=text.num_key_value_heads,

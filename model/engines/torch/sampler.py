@@ -33,8 +33,9 @@ def _mix(value: int) -> int:
 def probabilities(logits: Array, temperature: float = 1.0) -> Array:
     """Softmax of logits [k] at a temperature above 0, in float64."""
     scaled = (logits - logits.max()) / temperature
-    exponentials: Array = np.exp(scaled)
-    return exponentials / exponentials.sum()
+    exponentials = np.exp(scaled)
+    shares: Array = exponentials / exponentials.sum()
+    return shares
 
 
 def choose(logits: Array, temperature: float, top_p: float, number: float) -> int:

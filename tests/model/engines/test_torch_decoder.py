@@ -122,7 +122,9 @@ def test_a_prefilled_plan_stands(exact: Loaded) -> None:
 
 
 def test_a_passed_deadline_leaves_thinking_out(exact: Loaded) -> None:
-    draws = decode(Decoder(Runner(exact, rows=2, length=1536)), request("a", n=2, thinking="always", deadline_ms=0))
+    draws = decode(
+        Decoder(Runner(exact, rows=2, length=1536)), request("a", n=2, thinking="always", deadline_ms=0)
+    )
     assert all(draw.branch == "Action:" for draw in draws.values())
 
 

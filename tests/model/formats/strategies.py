@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import string
+from itertools import pairwise
 
 from hypothesis import strategies as st
 
 from model.driving.plan import GROUPS, TICKS, WORDS, MetaAction, Plan
-from model.formats.pieces import CODES, MAX_SEGMENTS, Values
+from model.formats.pieces import CODES, MAX_SEGMENTS, Value, Values
 
 
 @st.composite
@@ -18,8 +19,7 @@ def plans(draw: st.DrawFn) -> Plan:
         cuts = draw(st.sets(st.integers(1, TICKS - 1), max_size=MAX_SEGMENTS - 1))
         edges = [0, *sorted(cuts), TICKS]
         tracks[group] = tuple(
-            MetaAction(start, end, draw(st.sampled_from(WORDS[group])))
-            for start, end in zip(edges, edges[1:], strict=False)
+            MetaAction(start, end, draw(st.sampled_from(WORDS[group]))) for start, end in pairwise(edges)
         )
     return Plan(**tracks)
 
@@ -27,7 +27,7 @@ def plans(draw: st.DrawFn) -> Plan:
 @st.composite
 def cf_vla_values(draw: st.DrawFn, codes: int = 16) -> Values:
     """Values of a whole CF-VLA response."""
-    values = {
+    values: dict[str, Value] = {
         "plan": draw(plans()),
         "branch": draw(st.sampled_from(["Action:", "Thinking:"])),
         "trajectory": tuple(draw(st.lists(st.integers(0, codes - 1), min_size=CODES, max_size=CODES))),

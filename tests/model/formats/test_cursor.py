@@ -62,7 +62,7 @@ def test_whatever_is_written_parses_and_renders_back(name: str, seed: int) -> No
 @given(plans(), st.integers(0, 1000))
 def test_a_given_plan_is_forced_and_tokenised_as_the_model_writes_it(plan: Plan, seed: int) -> None:
     forced, _ = COMPILED.start({"plan": plan}).forced()
-    values = {"plan": plan, "branch": "Action:", "trajectory": (0,) * 6}
+    values: Values = {"plan": plan, "branch": "Action:", "trajectory": (0,) * 6}
     assert forced == [token for token in COMPILED.render(values) if token.section == "plan"]
     written = walk(COMPILED.start({"plan": plan}), seed)
     assert parse(CF_VLA, VOCABULARY.decode([token.id for token in written]))["plan"] == plan

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import ClassVar
+
 import llguidance
 import pytest
 from hypothesis import given, settings
@@ -20,8 +22,8 @@ class _Tokenizer:
 
     eos_token_id = SPECIAL.index("<|endoftext|>")
     bos_token_id = None
-    special_token_ids = list(range(len(SPECIAL) + 6 * VOCABULARY.size))
-    tokens = [text.encode() for text in VOCABULARY.texts]
+    special_token_ids: ClassVar = list(range(len(SPECIAL) + 6 * VOCABULARY.size))
+    tokens: ClassVar = [text.encode() for text in VOCABULARY.texts]
 
     def __call__(self, text: str | bytes) -> list[int]:
         return list(VOCABULARY.encode(text if isinstance(text, str) else text.decode()))

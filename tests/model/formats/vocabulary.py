@@ -44,5 +44,8 @@ class ByteVocabulary:
     def free_text_ids(self) -> npt.NDArray[np.bool_]:
         first = len(SPECIAL) + CODES * self.size
         return np.array(
-            [index >= first and "\n" not in text and text.isprintable() for index, text in enumerate(self.texts)]
+            [
+                index >= first and "\n" not in text and text.isprintable()
+                for index, text in enumerate(self.texts)
+            ]
         )

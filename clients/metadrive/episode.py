@@ -1,0 +1,316 @@
+"""One episode: the expert among traffic and hazards, step by step, without pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import count
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from clients.metadrive.actors import STEP_S, VEHICLE_MODELS, Body, Pedestrian, Vehicle
+from clients.metadrive.driver import SpeedLimits, Style
+from clients.metadrive.expert import Expert, varied
+from clients.metadrive.hazards import Director
+from clients.metadrive.maps import make_map
+from clients.metadrive.roads import Array, RoadMap
+from model.driving.metrics import box_corners
+from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, AgentKind
+
+Outcome = Literal["time", "route_end", "collision"]
+
+_AHEAD_M: Final = 170.0
+_BEHIND_M: Final = 80.0
+BRAKE_LIGHT: Final = 1
+LEFT_LIGHT: Final = 2
+RIGHT_LIGHT: Final = 4
+
+
+@dataclass(frozen=True, eq=False)
+class ActorLog:
+    """One actor over the episode.
+
+    Attributes:
+        poses: float64 [steps, 3] x, y, heading in the world; NaN while it is far away.
+        lights: uint8 [steps], bits `BRAKE_LIGHT`, `LEFT_LIGHT`, `RIGHT_LIGHT`.
+        phase: float32 [steps], metres walked, for the gait.
+    """
+
+    actor_id: int
+    kind: AgentKind
+    model: str
+    tint: float
+    size: tuple[float, float, float]
+    poses: Array
+    lights: npt.NDArray[np.uint8]
+    phase: Array
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeLog:
+    """What happened at 10 Hz.
+
+    Attributes:
+        ego: float64 [steps, 4] x, y, heading, signed speed.
+        lanes: int64 [steps] the lane the ego's centre is in.
+        lane_offsets: float64 [steps] metres to the left of that lane's centre.
+        rails, progress: the rail followed and the place along the route.
+    """
+
+    seed: int
+    road_map: RoadMap
+    outcome: Outcome
+    ego: Array
+    lanes: npt.NDArray[np.int64]
+    lane_offsets: Array
+    rails: npt.NDArray[np.int64]
+    progress: Array
+    actors: tuple[ActorLog, ...]
+
+
+def run_episode(seed: int, duration_s: float = 48.0) -> EpisodeLog:
+    """Drive one episode; the same seed gives the same episode.
+
+    Raises:
+        MapError: no map fits the seed.
+    """
+    rng = np.random.default_rng([seed, 2])
+    speed = float(
+        rng.choice([rng.uniform(22, 42), rng.uniform(42, 62), rng.uniform(62, 80)], p=[0.04, 0.14, 0.82])
+    )
+    style = varied(Style(speed / 3.6), rng)
+    road_map = make_map(seed, max(320.0, 1.15 * duration_s * style.speed))
+    return _Episode(seed, road_map, style, rng).run(duration_s)
+
+
+class _Episode:
+    def __init__(self, seed: int, road_map: RoadMap, style: Style, rng: np.random.Generator) -> None:
+        self._seed = seed
+        self._map = road_map
+        self._rng = rng
+        self._ids = count(1)
+        self._limits = SpeedLimits(road_map.rails, style.lateral)
+        self._oncoming_limits = SpeedLimits(road_map.oncoming_rails, 2.0)
+        self._ego = self._new_ego(style)
+        self._style = style
+        self._expert = Expert(road_map, style, self._limits, True, bool(rng.random() < 0.75))
+        self._director = Director(road_map, rng, self._next_id, style.speed)
+        self._bodies: list[Body] = self._director.place(self._ego.progress)
+        self._fill_oncoming_s()
+        self._drivers: dict[int, Expert] = {}
+        self._bodies += self._traffic()
+        for body in self._bodies:
+            if isinstance(body, Vehicle) and body.actor_id not in self._drivers:
+                self._drivers[body.actor_id] = self._driver(body, float(rng.uniform(0.75, 1.0)) * style.speed)
+
+    def _next_id(self) -> int:
+        return next(self._ids)
+
+    def _new_ego(self, style: Style) -> Vehicle:
+        rng, rails = self._rng, self._map.rails
+        first = [i for i, rail in enumerate(rails) if rail.breaks_progress[0] < 1.0]
+        rail = int(rng.choice(first))
+        ego = Vehicle(0, "vehicle", "130", 0, 0, 0, 0, 0)
+        ego.rail, ego.s = rail, 30.0
+        ego.wander_m, ego.rng_phase = float(rng.uniform(0.02, 0.12)), float(rng.uniform(0, 6))
+        ego.place(rails)
+        if rng.random() > 0.24:
+            ego.speed = min(style.speed * float(rng.uniform(0.5, 0.95)), self._limits.at(rail, ego.s))
+        return ego
+
+    def _driver(self, car: Vehicle, speed: float) -> Expert:
+        limits = self._limits if car.on_route else self._oncoming_limits
+        return Expert(self._map, replace(varied(Style(speed), self._rng), lateral=2.0), limits, False, False)
+
+    def _fill_oncoming_s(self) -> None:
+        if not self._map.oncoming_rails:
+            return
+        rail = self._map.oncoming_rails[0]
+        for body in self._bodies:
+            gap = np.hypot(rail.points[:, 0] - body.x, rail.points[:, 1] - body.y)
+            body.oncoming_s = 0.5 * float(np.argmin(gap)) if gap.min() < 25 else -1e6
+
+    def _traffic(self) -> Iterator[Vehicle]:
+        rng, ego = self._rng, self._ego
+        density = float(rng.choice([2.0, 3.4, 6.0]))
+        taken = [(b.progress, b.rail) for b in self._bodies if isinstance(b, Vehicle)]
+        blocked = [b.progress for b in self._bodies if not isinstance(b, (Vehicle, Pedestrian))]
+        for index, rail in enumerate(self._map.rails):
+            if rail.length < 120:
+                continue
+            s = rail.s_at(ego.progress) + float(rng.uniform(16, 55))
+            if index != ego.rail:
+                s += float(rng.uniform(-25, 10))
+                if abs(rail.progress(s) - ego.progress) < 12:
+                    s += 15
+            while s < rail.length - 40:
+                progress = rail.progress(s)
+                clear = all(abs(progress - p) > 14 for p, r in taken if r == index)
+                clear = clear and all(not -20 < p - progress < 25 for p in blocked)
+                if clear:
+                    yield self._moving(index, s, True, progress - ego.progress)
+                s += float(rng.exponential(55 * density)) + 14
+        for index, rail in enumerate(self._map.oncoming_rails):
+            s = float(rng.uniform(0, 60))
+            while s < rail.length - 20:
+                yield self._moving(index, s, False, 1e3)
+                s += float(rng.exponential(60 * density)) + 20
+
+    def _moving(self, rail: int, s: float, on_route: bool, ahead_m: float) -> Vehicle:
+        rng = self._rng
+        rails = self._map.rails if on_route else self._map.oncoming_rails
+        limits = self._limits if on_route else self._oncoming_limits
+        car = Vehicle(self._next_id(), "vehicle", str(rng.choice(VEHICLE_MODELS)), 0, 0, 0, 0, 0)
+        car.rail, car.s, car.on_route = rail, s, on_route
+        car.wander_m, car.rng_phase = float(rng.uniform(0, 0.12)), float(rng.uniform(0, 6))
+        car.tint = float(rng.random())
+        car.place(rails)
+        wish = float(rng.uniform(0.78, 1.18)) * self._style.speed
+        self._drivers[car.actor_id] = self._driver(car, max(wish, 4.0))
+        car.speed = min(wish, limits.at(rail, s))
+        if on_route and abs(ahead_m) < 60:
+            car.speed = min(car.speed, self._ego.speed + float(rng.uniform(-2, 2)))
+            car.speed = 0.0 if self._ego.speed == 0 else max(car.speed, 0.0)
+        return car
+
+    def run(self, duration_s: float) -> EpisodeLog:
+        """Step until the time, the route or the expert's luck ends."""
+        ego, steps = self._ego, round(duration_s / STEP_S)
+        track, lanes, offsets, rails, progress = [], [], [], [], []
+        seen: list[dict[int, tuple[float, float, float, int, float]]] = []
+        outcome: Outcome = "time"
+        for step in range(steps):
+            time_s = step * STEP_S
+            near = self._near()
+            lane, offset = self._lane()
+            track.append((ego.x, ego.y, ego.heading, ego.speed))
+            lanes.append(lane)
+            offsets.append(offset)
+            rails.append(ego.rail)
+            progress.append(ego.progress)
+            seen.append({b.actor_id: (b.x, b.y, b.heading, _lights(b), b.phase) for b in near})
+            if self._hits(near):
+                outcome = "collision"
+                break
+            if ego.progress > self._map.length - 25:
+                outcome = "route_end"
+                break
+            self._director.step(time_s, ego, near)
+            everyone = [ego, *near]
+            self._expert.step(ego, near)
+            for body in near:
+                if isinstance(body, Pedestrian):
+                    body.step()
+                elif isinstance(body, Vehicle):
+                    self._drive(body, time_s, everyone)
+        return EpisodeLog(
+            self._seed,
+            self._map,
+            outcome,
+            np.array(track),
+            np.array(lanes),
+            np.array(offsets),
+            np.array(rails),
+            np.array(progress),
+            self._actor_logs(seen),
+        )
+
+    def _near(self) -> list[Body]:
+        ego = self._ego
+        near: list[Body] = []
+        for body in self._bodies:
+            if isinstance(body, Vehicle):
+                if body.gone:
+                    continue
+                if not body.on_route:
+                    if math.hypot(body.x - ego.x, body.y - ego.y) < _AHEAD_M:
+                        near.append(body)
+                    continue
+            ahead = body.progress - ego.progress
+            if -_BEHIND_M < ahead < _AHEAD_M:
+                near.append(body)
+                if isinstance(body, Vehicle):
+                    body.seen = True
+            elif isinstance(body, Vehicle) and body.seen:
+                body.gone = True
+        return near
+
+    def _drive(self, car: Vehicle, time_s: float, everyone: list[Body]) -> None:
+        if car.hold:
+            return
+        if car.brake_until_s > time_s:
+            rails = self._map.rails
+            wanted = -car.brake_rate if car.speed > car.brake_to + 0.1 else 0.0
+            change = min(max(wanted - car.acceleration, -0.9), 0.9)
+            car.advance(rails, min(car.acceleration + change, 0.0) if car.speed > car.brake_to else 0.0)
+            if car.brake_until_s > 1e8 and car.stopped_for_s > 1.0:
+                car.hazard_lights, car.hold = True, True
+            return
+        self._drivers[car.actor_id].step(car, everyone)
+
+    def _lane(self) -> tuple[int, float]:
+        ego, road_map = self._ego, self._map
+        rail = road_map.rails[ego.rail]
+        lane = road_map.lanes[rail.lane_at(ego.s)]
+        offset, _ = ego.offset_at(ego.s)
+        if abs(offset) > 0.5 * lane.width:
+            side = 1 if offset > 0 else -1
+            beside = road_map.neighbour(ego.rail, ego.progress, side)
+            if beside is not None:
+                other = road_map.rails[beside]
+                return other.lane_at(other.s_at(ego.progress)), offset - side * lane.width
+        return lane.lane_id, offset
+
+    def _hits(self, near: list[Body]) -> bool:
+        ego = self._ego
+        for body in near:
+            if math.hypot(body.x - ego.x, body.y - ego.y) > 6.0:
+                continue
+            mine = box_corners(np.array([ego.x, ego.y, ego.heading]), EGO_LENGTH_M, EGO_WIDTH_M)
+            theirs = box_corners(np.array([body.x, body.y, body.heading]), *body.size[:2])
+            if _overlap(mine, theirs):
+                return True
+        return False
+
+    def _actor_logs(
+        self, seen: list[dict[int, tuple[float, float, float, int, float]]]
+    ) -> tuple[ActorLog, ...]:
+        logs = []
+        for body in self._bodies:
+            poses = np.full((len(seen), 3), np.nan)
+            lights = np.zeros(len(seen), np.uint8)
+            phase = np.zeros(len(seen))
+            for step, row in enumerate(seen):
+                if body.actor_id in row:
+                    *pose, lights[step], phase[step] = row[body.actor_id]
+                    poses[step] = pose
+            if np.isfinite(poses).any():
+                logs.append(
+                    ActorLog(body.actor_id, body.kind, body.model, body.tint, body.size, poses, lights, phase)
+                )
+        return tuple(logs)
+
+
+def _lights(body: Body) -> int:
+    if not isinstance(body, Vehicle):
+        return 0
+    lights = 0
+    if body.acceleration < -0.6 or (body.speed < 0.1 and not body.hazard_lights):
+        lights |= BRAKE_LIGHT
+    if body.hazard_lights or body.indicator > 0:
+        lights |= LEFT_LIGHT
+    if body.hazard_lights or body.indicator < 0:
+        lights |= RIGHT_LIGHT
+    return lights
+
+
+def _overlap(first: Array, second: Array) -> bool:
+    for box in (first, second):
+        for axis in (box[0] - box[1], box[1] - box[2]):
+            a, b = first @ axis, second @ axis
+            if a.max() < b.min() or b.max() < a.min():
+                return False
+    return True

@@ -1,0 +1,231 @@
+"""Scenes at scale: one episode a seed, one Parquet file a block of seeds, resumable after any end."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import multiprocessing.connection
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow.parquet as pq
+import shapely
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from clients.metadrive import simulator
+from clients.metadrive.episode import run_episode
+from clients.metadrive.maps import MapError
+from clients.metadrive.rig import FRONT_CAMERAS, SURROUND_CAMERAS, Rig
+from clients.metadrive.windows import labelled_scenes, window_steps
+from model.driving.scene import LabelledScene, split_of_seed
+from model.driving.scene_store import SCENE_VERSION, write_scenes
+
+MANIFEST: Final = "manifest.json"
+GENERATOR_VERSION: Final = "1"
+_EPISODES_KEY: Final = "looktwice.episodes"
+_TRIES_PER_BLOCK: Final = 3
+
+
+class GenerationError(RuntimeError):
+    """Generation could not go on; what was written stays, and running again resumes."""
+
+
+@dataclass(frozen=True)
+class GenerateConfig:
+    """What to generate.
+
+    Attributes:
+        stride_s: seconds between the scenes of an episode.
+        duration_s: seconds an episode lasts.
+        block: seeds in one file; a worker process lives for one block, so its memory stays bounded.
+        surround: also render the six surround cameras.
+        dense: also store per-pixel targets.
+    """
+
+    stride_s: float = 0.5
+    duration_s: float = 48.0
+    block: int = 20
+    surround: bool = False
+    dense: bool = True
+
+
+@dataclass(frozen=True)
+class EpisodeOutcome:
+    """How one seed went."""
+
+    seed: int
+    outcome: str
+    blocks: str
+    scenes: int
+    dropped: int
+    seconds: float
+
+
+@dataclass
+class GenerateReport:
+    """What a call of `generate` did."""
+
+    scenes: int = 0
+    blocks_written: int = 0
+    blocks_resumed: int = 0
+    seconds: float = 0.0
+    outcomes: dict[str, int] = field(default_factory=dict)
+
+
+def generate(
+    out_dir: Path,
+    seeds: range,
+    workers: int = 2,
+    config: GenerateConfig | None = None,
+    console: Console | None = None,
+) -> GenerateReport:
+    """Generate the scenes of ``seeds`` into ``out_dir``; blocks that are there already are left alone.
+
+    Raises:
+        SimulatorMissing: MetaDrive is not installed.
+        SceneError: a seed that belongs to no split.
+        GenerationError: a block failed again and again, or ``out_dir`` was made with another config.
+    """
+    config = config or GenerateConfig()
+    if not simulator.is_installed():
+        raise simulator.SimulatorMissing("MetaDrive is not installed; install it with `make sim`")
+    for seed in (seeds[0], seeds[-1]):
+        split_of_seed(seed)
+    out_dir.mkdir(parents=True, exist_ok=True)
+    _check_config(out_dir, config)
+    report, started = GenerateReport(), time.monotonic()
+    blocks = [seeds[i : i + config.block] for i in range(0, len(seeds), config.block)]
+    missing = [block for block in blocks if not block_file(out_dir, block).exists()]
+    report.blocks_resumed = len(blocks) - len(missing)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
+        task = progress.add_task(out_dir.name, total=len(blocks), completed=report.blocks_resumed)
+        for _ in _run_blocks(out_dir, missing, workers, config):
+            report.blocks_written += 1
+            progress.advance(task)
+            write_manifest(out_dir, config)
+    manifest = write_manifest(out_dir, config)
+    report.scenes = manifest["scenes"]
+    report.outcomes = manifest["outcomes"]
+    report.seconds = time.monotonic() - started
+    return report
+
+
+def block_file(out_dir: Path, seeds: range) -> Path:
+    """The file of a block of seeds."""
+    return out_dir / f"scenes-{seeds[0]:06d}-{seeds[-1]:06d}.parquet"
+
+
+def _check_config(out_dir: Path, config: GenerateConfig) -> None:
+    manifest = out_dir / MANIFEST
+    if not manifest.exists():
+        return
+    there = json.loads(manifest.read_text())["config"]
+    if there != asdict(config):
+        raise GenerationError(f"{out_dir} was generated with another config {there}; choose another folder")
+
+
+def _run_blocks(
+    out_dir: Path, blocks: Sequence[range], workers: int, config: GenerateConfig
+) -> Iterator[range]:
+    """Run every block in a process of its own, ``workers`` at a time; a dead worker's is tried again."""
+    context = multiprocessing.get_context("spawn")
+    waiting = [(block, 1) for block in blocks]
+    running: dict[Any, tuple[range, int]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < workers:
+                block, attempt = waiting.pop(0)
+                process = context.Process(target=_work, args=(out_dir, block, config), daemon=True)
+                process.start()
+                running[process] = (block, attempt)
+            multiprocessing.connection.wait([process.sentinel for process in running])
+            for process in [p for p in running if p.exitcode is not None]:
+                block, attempt = running.pop(process)
+                process.join()
+                if process.exitcode == 0:
+                    yield block
+                elif attempt < _TRIES_PER_BLOCK:
+                    waiting.insert(0, (block, attempt + 1))
+                else:
+                    raise GenerationError(
+                        f"the worker for seeds {block[0]} to {block[-1]} ended with code {process.exitcode} "
+                        f"{_TRIES_PER_BLOCK} times"
+                    )
+    finally:
+        for process in running:
+            process.kill()
+            process.join()
+
+
+def _work(out_dir: Path, seeds: range, config: GenerateConfig) -> None:
+    """A worker process: one block, then gone at once, for Panda3D's own tear-down crashes now and then."""
+    write_block(out_dir, seeds, config)
+    os._exit(0)
+
+
+def write_block(out_dir: Path, seeds: range, config: GenerateConfig) -> None:
+    """Generate one block in this process and put its file in place."""
+    rig = Rig(FRONT_CAMERAS + (SURROUND_CAMERAS if config.surround else ()))
+    scenes: list[LabelledScene] = []
+    outcomes: list[EpisodeOutcome] = []
+    for seed in seeds:
+        made, outcome = run_seed(seed, rig, config)
+        scenes += made
+        outcomes.append(outcome)
+    rig.close()
+    described = json.dumps([asdict(outcome) for outcome in outcomes])
+    for stale in out_dir.glob(f".{block_file(out_dir, seeds).name}.*.tmp"):
+        stale.unlink(missing_ok=True)
+    write_scenes(block_file(out_dir, seeds), scenes, {_EPISODES_KEY: described})
+
+
+def run_seed(seed: int, rig: Rig, config: GenerateConfig) -> tuple[list[LabelledScene], EpisodeOutcome]:
+    """One episode's scenes, and how it went."""
+    started = time.monotonic()
+    try:
+        log = run_episode(seed, config.duration_s)
+        made = list(labelled_scenes(log, rig, config.stride_s, config.dense))
+    except (MapError, shapely.errors.GEOSException) as error:
+        return [], EpisodeOutcome(seed, type(error).__name__, "", 0, 0, time.monotonic() - started)
+    dropped = len(window_steps(log, config.stride_s)) - len(made)
+    seconds = round(time.monotonic() - started, 2)
+    return made, EpisodeOutcome(seed, log.outcome, log.road_map.blocks, len(made), dropped, seconds)
+
+
+def write_manifest(out_dir: Path, config: GenerateConfig) -> dict[str, Any]:
+    """Write what ``out_dir`` holds, as told by its files, to ``manifest.json``; returns it."""
+    episodes: list[dict[str, Any]] = []
+    for file in sorted(out_dir.glob("scenes-*.parquet")):
+        metadata = pq.read_schema(file).metadata or {}
+        episodes += json.loads(metadata.get(_EPISODES_KEY.encode(), b"[]"))
+    counts: dict[str, int] = {}
+    for episode in episodes:
+        counts[episode["outcome"]] = counts.get(episode["outcome"], 0) + 1
+    manifest = {
+        "generator_version": GENERATOR_VERSION,
+        "scene_version": SCENE_VERSION,
+        "simulator": f"metadrive-simulator {simulator.version()}",
+        "config": asdict(config),
+        "scenes": sum(episode["scenes"] for episode in episodes),
+        "dropped": sum(episode["dropped"] for episode in episodes),
+        "outcomes": counts,
+        "seeds": [episode["seed"] for episode in episodes],
+        "episodes": episodes,
+    }
+    temporary = out_dir / f".{MANIFEST}.tmp"
+    temporary.write_text(json.dumps(manifest, indent=1))
+    temporary.replace(out_dir / MANIFEST)
+    return manifest

@@ -1,0 +1,176 @@
+"""Cameras on the ego, rendered without a window: pictures and metric depth in one pass."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from clients.metadrive import simulator
+from model.driving.scene import FRONT_TELE, FRONT_WIDE
+
+JPEG_QUALITY: Final = 85
+NEAR_M: Final = 0.3
+FAR_M: Final = 320.0
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """One camera: where it looks and how.
+
+    Attributes:
+        name: one of `model.driving.scene.CAMERAS`.
+        hfov_degrees: horizontal field of view.
+        horizon: where the horizon lies, as a share of the picture's height from the top; the lens is
+            shifted for it, not tilted, so upright things stay upright.
+        heading_degrees: direction of view, counter-clockwise from straight ahead.
+        forward_m, left_m, up_m: place relative to the ego's centre on the ground.
+    """
+
+    name: str
+    hfov_degrees: float
+    horizon: float
+    heading_degrees: float = 0.0
+    forward_m: float = 1.2
+    left_m: float = 0.0
+    up_m: float = 1.5
+    width: int = 224
+    height: int = 112
+
+    @cached_property
+    def focal_px(self) -> float:
+        """Focal length in pixels, both directions."""
+        return self.width / 2 / math.tan(math.radians(self.hfov_degrees) / 2)
+
+    def project(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """Column, row and depth [n, 3] of points [n, 3] in the ego frame; rows count downwards."""
+        turn = math.radians(self.heading_degrees)
+        moved = np.asarray(points, np.float64) - [self.forward_m, self.left_m, self.up_m]
+        depth = moved[:, 0] * math.cos(turn) + moved[:, 1] * math.sin(turn)
+        left = -moved[:, 0] * math.sin(turn) + moved[:, 1] * math.cos(turn)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            column = self.width / 2 - self.focal_px * left / depth
+            row = self.horizon * self.height - self.focal_px * moved[:, 2] / depth
+        return np.stack([column, row, depth], axis=1)
+
+    def unproject(self, column: Any, row: Any, depth: Any) -> npt.NDArray[np.float64]:
+        """Points [..., 3] in the ego frame seen at pixel positions with metric ``depth``."""
+        left = (self.width / 2 - column) / self.focal_px * depth
+        up = (self.horizon * self.height - row) / self.focal_px * depth
+        turn = math.radians(self.heading_degrees)
+        x = depth * math.cos(turn) - left * math.sin(turn) + self.forward_m
+        y = depth * math.sin(turn) + left * math.cos(turn) + self.left_m
+        return np.stack([x, y, up + self.up_m], axis=-1)
+
+
+FRONT_CAMERAS: Final = (
+    CameraSpec(FRONT_WIDE, 120.0, 0.30),
+    CameraSpec(FRONT_TELE, 30.0, 0.38),
+)
+SURROUND_CAMERAS: Final = (
+    CameraSpec("front", 70.0, 0.35),
+    CameraSpec("front_left", 70.0, 0.35, heading_degrees=55.0, left_m=0.5, forward_m=0.9),
+    CameraSpec("front_right", 70.0, 0.35, heading_degrees=-55.0, left_m=-0.5, forward_m=0.9),
+    CameraSpec("back", 110.0, 0.35, heading_degrees=180.0, forward_m=-1.6),
+    CameraSpec("back_left", 70.0, 0.35, heading_degrees=110.0, left_m=0.5, forward_m=0.0),
+    CameraSpec("back_right", 70.0, 0.35, heading_degrees=-110.0, left_m=-0.5, forward_m=0.0),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One camera's view: JPEG bytes, and float32 [h, w] metric depth along the axis (inf for the sky)."""
+
+    camera: str
+    jpeg: bytes
+    depth_m: npt.NDArray[np.float32]
+
+
+class Rig:
+    """A set of off-screen cameras over one scene graph, kept for the life of a process."""
+
+    def __init__(self, specs: tuple[CameraSpec, ...] = FRONT_CAMERAS) -> None:
+        core = simulator.panda()
+        self.specs = specs
+        self.root = core.NodePath("world")
+        self._engine = core.GraphicsEngine.getGlobalPtr()
+        self._pipe = core.GraphicsPipeSelection.getGlobalPtr().makeDefaultPipe()
+        if self._pipe is None:
+            raise simulator.SimulatorMissing(
+                "no EGL graphics pipe: install the system's EGL libraries (libegl1)"
+            )
+        self._host: Any = None
+        self.ego = self.root.attachNewNode("ego")
+        self._cameras = [self._camera(spec) for spec in specs]
+
+    def _camera(self, spec: CameraSpec) -> tuple[Any, Any, Any]:
+        core = simulator.panda()
+        wanted = core.FrameBufferProperties()
+        wanted.setRgbaBits(8, 8, 8, 8)
+        wanted.setDepthBits(24)
+        size = core.WindowProperties.size(spec.width, spec.height)
+        arguments = [self._pipe, spec.name, 0, wanted, size, core.GraphicsPipe.BFRefuseWindow]
+        if self._host is not None:
+            arguments += [self._host.getGsg(), self._host]
+        buffer = self._engine.makeOutput(*arguments)
+        if buffer is None:
+            raise simulator.SimulatorMissing(
+                "no off-screen buffer could be made: install the system's EGL libraries"
+            )
+        self._host = self._host or buffer
+        colour, depth = core.Texture(f"{spec.name}-colour"), core.Texture(f"{spec.name}-depth")
+        depth.setFormat(core.Texture.FDepthComponent32)
+        depth.setComponentType(core.Texture.TFloat)
+        output = core.GraphicsOutput
+        buffer.addRenderTexture(colour, output.RTMCopyRam, output.RTPColor)
+        buffer.addRenderTexture(depth, output.RTMCopyRam, output.RTPDepth)
+        buffer.setClearColorActive(True)
+        lens = core.PerspectiveLens()
+        lens.setFilmSize(spec.width, spec.height)
+        lens.setFocalLength(spec.focal_px)
+        lens.setNearFar(NEAR_M, FAR_M)
+        lens.setFilmOffset(0.0, (spec.horizon - 0.5) * spec.height)
+        node = core.Camera(spec.name, lens)
+        node.setScene(self.root)
+        holder = self.ego.attachNewNode(node)
+        holder.setPos(spec.forward_m, spec.left_m, spec.up_m)
+        holder.setH(spec.heading_degrees - 90.0)
+        buffer.makeDisplayRegion().setCamera(holder)
+        return buffer, colour, depth
+
+    def set_sky(self, colour: tuple[float, float, float]) -> None:
+        """The colour behind everything."""
+        for buffer, _, _ in self._cameras:
+            buffer.setClearColor((*colour, 1.0))
+
+    def shoot(self) -> list[Picture]:
+        """Render all cameras from where the ego stands."""
+        self._engine.renderFrame()
+        pictures = []
+        for spec, (_, colour, depth) in zip(self.specs, self._cameras, strict=True):
+            shape = (spec.height, spec.width)
+            image = np.frombuffer(colour.getRamImageAs("RGB"), np.uint8).reshape(*shape, 3)[::-1]
+            raw = np.frombuffer(memoryview(depth.getRamImage()), np.float32).reshape(shape)[::-1]
+            linear = NEAR_M * FAR_M / (FAR_M - raw.astype(np.float64) * (FAR_M - NEAR_M))
+            metres = np.where(raw >= 0.999999, np.inf, linear).astype(np.float32)
+            pictures.append(Picture(spec.name, encode_jpeg(image), metres))
+        return pictures
+
+    def close(self) -> None:
+        """Give the off-screen buffers back."""
+        for buffer, _, _ in self._cameras:
+            self._engine.removeWindow(buffer)
+        self._cameras = []
+
+
+def encode_jpeg(image: npt.NDArray[np.uint8]) -> bytes:
+    """An RGB picture [h, w, 3] as JPEG bytes."""
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, "JPEG", quality=JPEG_QUALITY)
+    return stream.getvalue()

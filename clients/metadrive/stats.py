@@ -1,0 +1,122 @@
+"""What labelled scenes contain: how often each difficulty, each meta-action and each mistake occurs."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from clients.metadrive.generate import MANIFEST
+from model.driving.labeller import label_plan
+from model.driving.metrics import collides, leaves_road
+from model.driving.plan import TICKS, Plan
+from model.driving.scene import TAGS, LabelledScene
+from model.driving.scene_store import read_scenes
+from model.driving.trajectory import HORIZON_S, STEP_S
+
+_LEAD_OFFSET_M: Final = 1.6
+_LEAD_NEAR_M: Final = 20.0
+_TURNS: Final = ("Left Turn", "Right Turn")
+_ENDED_BADLY: Final = ("collision", "off_road")
+
+
+def scene_stats(path: Path, limit: int | None = None) -> dict[str, Any]:
+    """Count what the scenes of a file or folder hold; ``limit`` looks at the first ones only.
+
+    Shares are of scenes; ``share_of_time`` is of the seconds that plans cover.
+    """
+    tags: Counter[str] = Counter()
+    words_in: Counter[str] = Counter()
+    word_ticks: Counter[str] = Counter()
+    episodes: set[str] = set()
+    collisions = off_road = near = turning = scenes = stationary = 0
+    speeds, accelerations, jerks = [], [], []
+    for labelled in islice(read_scenes(path, dense=False), limit):
+        scenes += 1
+        episodes.add(labelled.episode_id)
+        tags.update(labelled.tags)
+        plan = label_plan(labelled.future, labelled.scene.history, labelled.lane_trace)
+        ticks = _word_ticks(plan)
+        words_in.update(ticks.keys())
+        word_ticks.update(ticks)
+        turning += any(word in ticks for word in _TURNS)
+        future = labelled.future[None]
+        collisions += bool(collides(future, labelled.agents, HORIZON_S)[0])
+        off_road += bool(leaves_road(future, labelled.drivable)[0])
+        near += _lead_near(labelled)
+        speed = _speeds(labelled)
+        speeds.append(speed.mean())
+        stationary += int((np.abs(speed) < 0.2).sum())
+        acceleration = np.diff(speed) / STEP_S
+        accelerations.append(acceleration)
+        jerks.append(np.abs(np.diff(np.convolve(acceleration, np.full(3, 1 / 3), "valid"))) / STEP_S)
+    if not scenes:
+        return {
+            "scenes": 0,
+            "episodes": 0,
+            "tags": {},
+            "meta_actions": {},
+            "expert_collisions": 0,
+            "expert_off_road": 0,
+        }
+    acceleration, jerk = np.concatenate(accelerations), np.concatenate(jerks)
+    return {
+        "scenes": scenes,
+        "episodes": len(episodes),
+        "tags": {tag: {"scenes": tags[tag], "share": tags[tag] / scenes} for tag in TAGS},
+        "meta_actions": {
+            word: {
+                "scenes": words_in[word],
+                "share": words_in[word] / scenes,
+                "share_of_time": word_ticks[word] / (TICKS * scenes),
+            }
+            for word in sorted(words_in)
+        },
+        "expert_collisions": collisions,
+        "expert_off_road": off_road,
+        "turning_share": turning / scenes,
+        "mean_speed": float(np.mean(speeds)),
+        "stationary_share_of_time": stationary / (len(speeds) * 64),
+        "lead_within_20_m_share": near / scenes,
+        "acceleration_p01": float(np.percentile(acceleration, 1)),
+        "acceleration_p99": float(np.percentile(acceleration, 99)),
+        "jerk_p99": float(np.percentile(jerk, 99)),
+        **_outcomes(path),
+    }
+
+
+def _word_ticks(plan: Plan) -> Counter[str]:
+    ticks: Counter[str] = Counter()
+    for track in (plan.longitudinal, plan.lateral, plan.lane):
+        for action in track or ():
+            ticks[action.word] += action.end - action.start
+    return ticks
+
+
+def _speeds(labelled: LabelledScene) -> Any:
+    poses = np.concatenate([labelled.scene.history[-1:], labelled.future]).astype(np.float64)
+    step = np.diff(poses[:, :2], axis=0)
+    heading = 0.5 * (poses[1:, 3] + poses[:-1, 3])
+    return (step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading)) / STEP_S
+
+
+def _lead_near(labelled: LabelledScene) -> bool:
+    for agent in labelled.agents:
+        x, y, _ = agent.present
+        if agent.kind == "vehicle" and 0 < x < _LEAD_NEAR_M and abs(y) < _LEAD_OFFSET_M:
+            return True
+    return False
+
+
+def _outcomes(path: Path) -> dict[str, Any]:
+    manifest = (path if path.is_dir() else path.parent) / MANIFEST
+    if not manifest.exists():
+        return {}
+    outcomes: dict[str, int] = json.loads(manifest.read_text())["outcomes"]
+    total = sum(outcomes.values())
+    badly = sum(outcomes.get(name, 0) for name in _ENDED_BADLY)
+    return {"outcomes": outcomes, "ended_badly_share": badly / total if total else 0.0}

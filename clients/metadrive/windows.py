@@ -1,0 +1,166 @@
+"""Labelled scenes cut out of an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+import shapely
+import shapely.affinity
+
+from clients.metadrive.annotate import Tagger, dense_target, route_ahead, to_ego
+from clients.metadrive.episode import EpisodeLog
+from clients.metadrive.rig import Picture, Rig
+from clients.metadrive.stage import Stage
+from model.driving.metrics import collides, leaves_road
+from model.driving.scene import (
+    CLIP_FRAMES,
+    CLIP_PERIOD_S,
+    Agent,
+    Clip,
+    DenseTarget,
+    LabelledScene,
+    LaneTrace,
+    Scene,
+)
+from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
+
+PICTURE_STEPS: Final = round(CLIP_PERIOD_S / STEP_S)
+AGENT_REACH_M: Final = 80.0
+ROAD_REACH_M: Final = 165.0
+"""Beyond what can be driven in 6.4 s at 80 km/h."""
+LANE_REACH_M: Final = 80.0
+_LANE_POINT_STEP: Final = 3
+_SIMPLIFY_M: Final = 0.06
+
+
+def window_steps(log: EpisodeLog, stride_s: float) -> range:
+    """The steps with a whole past and a whole future; a collision at the end is in nobody's future."""
+    first = HISTORY_STEPS - 1
+    last = len(log.ego) - FUTURE_STEPS - (1 if log.outcome != "collision" else 10)
+    stride = max(PICTURE_STEPS, round(stride_s / STEP_S / PICTURE_STEPS) * PICTURE_STEPS)
+    return range(first, max(last, first), stride)
+
+
+def labelled_scenes(
+    log: EpisodeLog, rig: Rig, stride_s: float, with_dense: bool = True
+) -> Iterator[LabelledScene]:
+    """Render and annotate the windows of ``log``, but none whose future collides or leaves the road."""
+    moments = ((step, _Moment(log, step)) for step in window_steps(log, stride_s))
+    usable = [(step, moment) for step, moment in moments if moment.is_safe]
+    if not usable:
+        return
+    stage = Stage(log, rig)
+    tagger = Tagger(log)
+    shots: dict[int, list[Picture]] = {}
+    try:
+        for step, moment in usable:
+            wanted = [step - PICTURE_STEPS * k for k in reversed(range(CLIP_FRAMES))]
+            for at in wanted:
+                if at not in shots:
+                    shots[at] = stage.shoot(at)
+            for old in [at for at in shots if at < wanted[0]]:
+                del shots[old]
+            clips = tuple(
+                Clip(spec.name, tuple(shots[at][index].jpeg for at in wanted))
+                for index, spec in enumerate(rig.specs)
+            )
+            dense: tuple[DenseTarget, ...] = ()
+            if with_dense:
+                dense = tuple(
+                    dense_target(spec, picture.depth_m, log, step, moment.area)
+                    for spec, picture in zip(rig.specs, shots[step], strict=True)
+                )
+            yield LabelledScene(
+                Scene(f"{log.seed:06d}-{step:04d}", clips, moment.history, route_ahead(log, step)),
+                f"{log.seed:06d}",
+                log.seed,
+                moment.future,
+                moment.agents,
+                moment.drivable,
+                moment.lane_lines(),
+                moment.lane_trace(),
+                tagger.tags(step),
+                dense,
+            )
+    finally:
+        stage.close()
+
+
+class _Moment:
+    """One step of an episode seen from the ego."""
+
+    def __init__(self, log: EpisodeLog, step: int) -> None:
+        self._log, self._step = log, step
+        self._window = slice(step - HISTORY_STEPS + 1, step + FUTURE_STEPS + 1)
+        self._ego = log.ego[step]
+        poses = np.zeros((HISTORY_STEPS + FUTURE_STEPS, 4))
+        poses[:, :2], poses[:, 3] = log.ego[self._window, :2], log.ego[self._window, 2]
+        seen = to_ego_frame(poses, poses[HISTORY_STEPS - 1])
+        seen[:, 3] = np.unwrap(seen[:, 3])
+        seen[:, 3] -= seen[HISTORY_STEPS - 1, 3]
+        self.history: FloatArray = seen[:HISTORY_STEPS].astype(np.float32)
+        self.future: FloatArray = seen[HISTORY_STEPS:].astype(np.float32)
+        self.area = self._area()
+        self.drivable = _rings(self.area)
+        self.agents = tuple(self._agents())
+
+    @property
+    def is_safe(self) -> bool:
+        """Whether the expert's future neither collides nor leaves the road."""
+        future = self.future[None]
+        return not (collides(future, self.agents, 6.4)[0] or leaves_road(future, self.drivable)[0])
+
+    def _area(self) -> Any:
+        x, y, heading, _ = self._ego
+        near = shapely.clip_by_rect(
+            self._log.road_map.drivable,
+            x - ROAD_REACH_M,
+            y - ROAD_REACH_M,
+            x + ROAD_REACH_M,
+            y + ROAD_REACH_M,
+        )
+        cos, sin = np.cos(heading), np.sin(heading)
+        matrix = [cos, sin, -sin, cos, -cos * x - sin * y, sin * x - cos * y]
+        return shapely.affinity.affine_transform(near, matrix).simplify(_SIMPLIFY_M)
+
+    def _agents(self) -> Iterator[Agent]:
+        ego = self._log.ego[self._window, :2]
+        for actor in self._log.actors:
+            track = actor.poses[self._window]
+            there = np.isfinite(track[:, 0])
+            if not there.any() or np.hypot(*(track[there, :2] - ego[there]).T).min() > AGENT_REACH_M:
+                continue
+            poses = np.full(track.shape, np.nan)
+            poses[there, :2] = to_ego(track[there, :2], self._ego)
+            poses[there, 2] = np.unwrap(track[there, 2] - self._ego[2])
+            yield Agent(actor.actor_id, actor.kind, *actor.size, poses.astype(np.float32))
+
+    def lane_lines(self) -> tuple[FloatArray, ...]:
+        """Centre lines of the lanes around."""
+        lines = []
+        for lane in self._log.road_map.lanes:
+            points = np.concatenate([lane.centre[::_LANE_POINT_STEP], lane.centre[-1:]])
+            seen = to_ego(points, self._ego)
+            seen = seen[np.hypot(seen[:, 0], seen[:, 1]) < LANE_REACH_M]
+            if len(seen) >= 2:
+                lines.append(seen.astype(np.float32))
+        return tuple(lines)
+
+    def lane_trace(self) -> LaneTrace:
+        """The ego's lanes over the window."""
+        lanes = [self._log.road_map.lanes[lane] for lane in self._log.lanes[self._window]]
+        return LaneTrace(
+            np.array([lane.road for lane in lanes], np.int32),
+            np.array([lane.number for lane in lanes], np.int16),
+            self._log.lane_offsets[self._window].astype(np.float32),
+        )
+
+
+def _rings(area: Any) -> tuple[FloatArray, ...]:
+    rings = []
+    for part in getattr(area, "geoms", [area]):
+        if part.geom_type == "Polygon" and not part.is_empty:
+            rings += [part.exterior, *part.interiors]
+    return tuple(np.asarray(ring.coords, np.float32) for ring in rings)

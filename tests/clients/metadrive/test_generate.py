@@ -1,0 +1,114 @@
+"""Generation in files: resumable after any end, honest in its manifest."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from clients.metadrive import simulator
+from clients.metadrive.generate import (
+    MANIFEST,
+    GenerateConfig,
+    GenerationError,
+    block_file,
+    generate,
+    write_block,
+)
+from clients.metadrive.sheet import contact_sheet
+from clients.metadrive.stats import scene_stats
+from model.driving.scene import TAGS, SceneError
+from model.driving.scene_store import read_scenes, write_scenes
+from tests.clients.metadrive.conftest import Filmed
+
+CONFIG = GenerateConfig(stride_s=2.0, duration_s=10.0, block=1)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seeds: the worker of the first is killed in the middle, then both are generated."""
+    out = tmp_path_factory.mktemp("scenes")
+    worker = multiprocessing.get_context("spawn").Process(
+        target=write_block, args=(out, range(4, 5), GenerateConfig(stride_s=0.5, duration_s=40.0, block=1))
+    )
+    worker.start()
+    time.sleep(2.0)
+    assert worker.pid is not None
+    os.kill(worker.pid, signal.SIGKILL)
+    worker.join()
+    assert not list(out.glob("*.parquet"))
+    generate(out, range(4, 6), workers=2, config=CONFIG)
+    return out
+
+
+def test_a_killed_worker_leaves_nothing_and_the_next_run_everything(folder: Path) -> None:
+    seeds = [labelled.seed for labelled in read_scenes(folder)]
+    assert set(seeds) == {4, 5}
+    names = [labelled.scene.scene_id for labelled in read_scenes(folder)]
+    assert len(names) == len(set(names))
+    assert not list(folder.glob(".*.tmp"))
+
+
+def test_a_second_run_leaves_what_is_there_alone(folder: Path) -> None:
+    file = block_file(folder, range(4, 5))
+    before = file.stat().st_mtime_ns
+    report = generate(folder, range(4, 6), workers=1, config=CONFIG)
+    assert report.blocks_resumed == 2
+    assert report.blocks_written == 0
+    assert file.stat().st_mtime_ns == before
+
+
+def test_the_manifest_counts_what_the_files_hold(folder: Path) -> None:
+    manifest = json.loads((folder / MANIFEST).read_text())
+    assert manifest["scenes"] == sum(1 for _ in read_scenes(folder))
+    assert sorted(manifest["seeds"]) == [4, 5]
+    assert manifest["simulator"].startswith("metadrive-simulator 0.3")
+
+
+def test_another_config_does_not_mix_into_a_folder(folder: Path) -> None:
+    with pytest.raises(GenerationError, match="another config"):
+        generate(folder, range(6, 7), config=GenerateConfig())
+
+
+def test_seeds_that_are_held_back_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="not in use"):
+        generate(tmp_path, range(700_000, 700_001))
+
+
+def test_a_missing_simulator_is_said_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulator, "is_installed", lambda: False)
+    with pytest.raises(simulator.SimulatorMissing, match="make sim"):
+        generate(tmp_path, range(1))
+
+
+def test_statistics_count_scenes_tags_and_words(folder: Path) -> None:
+    stats = scene_stats(folder)
+    assert stats["scenes"] == sum(1 for _ in read_scenes(folder))
+    assert stats["episodes"] == 2
+    assert set(stats["tags"]) == set(TAGS)
+    assert stats["expert_collisions"] == 0
+    assert stats["expert_off_road"] == 0
+    lane_words = ("Keep Lane", "Left Lane Change", "Right Lane Change")
+    in_time = sum(
+        stats["meta_actions"].get(word, {"share_of_time": 0})["share_of_time"] for word in lane_words
+    )
+    assert in_time == pytest.approx(1.0)
+
+
+def test_statistics_of_an_empty_file_are_zero(tmp_path: Path) -> None:
+    write_scenes(tmp_path / "none.parquet", [])
+    assert scene_stats(tmp_path)["scenes"] == 0
+
+
+def test_a_contact_sheet_shows_every_scene(filmed: Filmed, tmp_path: Path) -> None:
+    contact_sheet(filmed.scenes[:3], tmp_path / "sheet.png", columns=2)
+    one, both = Image.open(tmp_path / "sheet.png").size
+    contact_sheet(filmed.scenes[:2], tmp_path / "small.png", columns=2)
+    assert both == 2 * Image.open(tmp_path / "small.png").size[1]
+    assert one == Image.open(tmp_path / "small.png").size[0]

@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.driving.scene import Clip, Scene
+from model.engines.engine import Controls, Draw, DrawFinished, EngineError, PlanRequest, RequestError
+from model.engines.torch.engine import TorchEngine, TorchSettings
+from tests.checkpoints import noisy_scene
+
+
+def run(test: Callable[[], Awaitable[None]]) -> None:
+    asyncio.run(asyncio.wait_for(test(), 120))
+
+
+@asynccontextmanager
+async def running(checkpoint: Path, rows: int = 8) -> AsyncIterator[TorchEngine]:
+    engine = TorchEngine(checkpoint, TorchSettings(rows=rows))
+    await engine.start()
+    try:
+        yield engine
+    finally:
+        await engine.stop()
+
+
+async def plan(engine: TorchEngine, request: PlanRequest) -> list[Draw]:
+    draws = [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
+    return sorted(draws, key=lambda draw: draw.index)
+
+
+def direct(name: str, scene: Scene | None = None, **controls: object) -> PlanRequest:
+    return PlanRequest(name, scene or noisy_scene(), "traj_only", Controls(**controls))  # type: ignore[arg-type]
+
+
+def test_many_requests_at_once_get_what_they_get_alone(untrained_checkpoint: Path) -> None:
+    async def test() -> None:
+        async with running(untrained_checkpoint) as engine:
+            requests = [direct(f"{k}", noisy_scene(k), n=2, seed=k) for k in range(10)]
+            together = await asyncio.gather(*(plan(engine, request) for request in requests))
+            for request, draws in zip(requests, together, strict=True):
+                alone = await plan(engine, request)
+                assert [draw.codes for draw in alone] == [draw.codes for draw in draws]
+                assert [draw.index for draw in draws] == [0, 1]
+                assert np.isfinite([draw.trajectory for draw in draws]).all()
+
+    run(test)
+
+
+def test_leaving_early_frees_the_rows(untrained_checkpoint: Path) -> None:
+    async def test() -> None:
+        async with running(untrained_checkpoint, rows=2) as engine:
+            waiting = PlanRequest("slow", noisy_scene(), controls=Controls(n=2, thinking="always"))
+            async for _ in (events := engine.submit(waiting)):
+                break
+            await events.aclose()  # type: ignore[attr-defined]
+            assert len(await plan(engine, direct("next", n=2))) == 2
+
+    run(test)
+
+
+def test_bad_requests_fail_alone(untrained_checkpoint: Path) -> None:
+    scene = noisy_scene()
+    damaged = Scene(
+        "damaged", (Clip(scene.clips[0].camera, (b"\xff\xd8no",) * 4), scene.clips[1]), scene.history
+    )
+    one_eyed = Scene("one-eyed", scene.clips[:1], scene.history)
+
+    async def test() -> None:
+        async with running(untrained_checkpoint) as engine:
+            good = asyncio.create_task(plan(engine, direct("good", n=2)))
+            for bad, message in (
+                (direct("a", damaged), "picture"),
+                (direct("b", one_eyed), "lacks camera front_tele_30"),
+                (direct("c", n=9), "at most 8 draws"),
+            ):
+                with pytest.raises(RequestError, match=message):
+                    await plan(engine, bad)
+            assert len(await good) == 2
+
+    run(test)
+
+
+def test_an_id_is_used_once_at_a_time(untrained_checkpoint: Path) -> None:
+    async def test() -> None:
+        async with running(untrained_checkpoint) as engine:
+            first = asyncio.create_task(plan(engine, direct("same", n=4)))
+            await asyncio.sleep(0)
+            with pytest.raises(RequestError, match="in use"):
+                await plan(engine, direct("same"))
+            assert len(await first) == 4
+
+    run(test)
+
+
+def test_stopping_tells_those_who_wait(untrained_checkpoint: Path) -> None:
+    async def test() -> None:
+        async with running(untrained_checkpoint) as engine:
+            request = PlanRequest("slow", noisy_scene(), controls=Controls(n=8, thinking="always"))
+            waiting = asyncio.create_task(plan(engine, request))
+            await asyncio.sleep(0.05)
+            await engine.stop()
+            with pytest.raises(EngineError, match="stopped"):
+                await waiting
+            with pytest.raises(EngineError, match="not running"):
+                await plan(engine, direct("late"))
+
+    run(test)
