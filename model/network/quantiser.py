@@ -14,7 +14,7 @@ BEAM: Final = 12
 """Candidates kept from stage to stage when encoding; beyond it errors hardly shrink."""
 _CHUNK: Final = 2048
 _KMEANS_ROUNDS: Final = 15
-_RIDGE: Final = 0.3
+_RIDGE: Final = 3.0
 """In samples: how strongly a codeword stays where it is when few vectors use it."""
 
 

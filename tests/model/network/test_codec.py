@@ -12,8 +12,9 @@ from safetensors.numpy import load_file, save_file
 
 from model.driving.trajectory import STEP_S, present_speed
 from model.network import quantiser
-from model.network.codec import CODEC_FILE, CodecError, TrajectoryCodec
+from model.network.codec import CODEC_FILE, HEADING_WEIGHT_M, CodecError, TrajectoryCodec
 from model.network.splines import clamped_basis
+from tests.comma2k19 import windows
 from tests.model.network.motions import made_up_motions
 
 SMALL = TrajectoryCodec.fit(*made_up_motions(1500), size=32, seed=1)
@@ -91,7 +92,7 @@ def test_code_vectors_are_metres() -> None:
     history = np.zeros((1, 16, 4), np.float32)
     # Two codes of the first stage differ by what their vectors say, in root mean square metres.
     one, other = (SMALL.decode(history, [[code, 0, 0, 0, 0, 0]])[0] for code in (0, 1))
-    squares = ((one - other)[:, :2] ** 2).sum(axis=1) + (2.255 * (one - other)[:, 3]) ** 2
+    squares = ((one - other)[:, :2] ** 2).sum(axis=1) + (HEADING_WEIGHT_M * (one - other)[:, 3]) ** 2
     expected = np.linalg.norm(vectors[0, 0] - vectors[0, 1])
     assert np.sqrt(squares.mean()) == pytest.approx(float(expected), rel=1e-3)
 
@@ -150,3 +151,13 @@ def test_splines_begin_as_they_must() -> None:
     np.testing.assert_allclose(basis[0, 1:], 0, atol=1e-12)
     np.testing.assert_allclose(slopes[2:], 0, atol=1e-5)
     assert basis[3, -1] == pytest.approx(1)
+
+
+def test_a_real_minute_of_driving() -> None:
+    """What was learned from made-up motions writes real ones."""
+    histories, futures = windows(every=10)
+    codec = TrajectoryCodec.fit(*made_up_motions(3000, seed=6), size=64)
+    error = codec.reconstruction_error(histories, futures)
+    assert error["ade_m"] < 0.25
+    assert error["fde_m"] < 0.5
+    assert error["max_jump_m"] < 0.05
