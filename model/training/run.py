@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
@@ -14,6 +15,7 @@ from torch import nn
 from torch.utils.data import Dataset
 
 from model.driving.scene import LabelledScene
+from model.network.attention import MATMUL_ATTENTION
 from model.network.checkpoint import Loaded, create_nano, load, save
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus
@@ -35,6 +37,7 @@ class RunSettings:
     Attributes:
         cache: folder for scenes brought into arrays.
         validate_every, save_every: steps.
+        draws: per scene in validation.
         bf16: mixed precision.
         compiled: compile the decoder; pays after a few hundred steps.
         use_cpu: stay off accelerators.
@@ -43,6 +46,7 @@ class RunSettings:
     cache: Path
     validate_every: int = 500
     save_every: int = 250
+    draws: int = 6
     bf16: bool = True
     compiled: bool = False
     use_cpu: bool = True
@@ -85,11 +89,12 @@ def run(
     if vision_source is not None:
         loaded.model.model.visual.load_state_dict(load(vision_source).model.model.visual.state_dict())
     loaded.model.train()
+    loaded.model.set_attn_implementation(MATMUL_ATTENTION)
     torch.manual_seed(recipe.seed)
     examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
     validate: Validate | None = None
     if recipe.goal == "respond" and recipe.pictures and validation:
-        validate = partial(open_loop, loaded, validation, list(recipe.tasks))
+        validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
     learner, dataset, sampler, collator = _prepare(recipe, loaded, examples, settings.compiled)
     trainer = LearnerTrainer(
         learner,
@@ -104,7 +109,7 @@ def run(
         bf16=settings.bf16,
         use_cpu=settings.use_cpu,
     )
-    trainer.train(resume_from_checkpoint=any((target / "state").glob("checkpoint-*")))
+    trainer.train(resume_from_checkpoint=last_whole_state(target / "state"))
     loaded.model.train(False)
     save(
         target,
@@ -113,6 +118,20 @@ def run(
         loaded.codec,
         details=_details(recipe, loaded, examples),
     )
+
+
+def last_whole_state(folder: Path) -> str | None:
+    """The newest training state that was written to its end, or None.
+
+    ``trainer_state.json`` is written last: a folder without it, or with half of it, was cut off by a kill.
+    """
+    for state in sorted(folder.glob("checkpoint-*"), key=lambda path: -int(path.name.split("-")[1])):
+        try:
+            json.loads((state / "trainer_state.json").read_text())
+        except (OSError, json.JSONDecodeError):
+            continue
+        return str(state)
+    return None
 
 
 def _prepare(

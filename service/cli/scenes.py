@@ -67,3 +67,18 @@ def show(
         out.parent.mkdir(parents=True, exist_ok=True)
         contact_sheet(islice(read_scenes(path, dense=False), 0, limit * every, every), out)
         typer.echo(str(out))
+
+
+@app.command("pick")
+def pick(
+    path: Annotated[Path, typer.Argument(help="Scene file or folder.")],
+    out: Annotated[Path, typer.Argument(help="Scene file to write.")],
+    count: Annotated[int, typer.Option(help="How many scenes.", min=1)] = 12,
+) -> None:
+    """Pick a few scenes that show every tag, each from another episode, without their dense targets."""
+    with told():
+        from model.driving.scene_store import read_scenes, write_scenes
+        from model.driving.selection import pick_varied
+
+        chosen = pick_varied(read_scenes(path, dense=False), count)
+        typer.echo(f"{write_scenes(out, chosen)} scenes in {out}")

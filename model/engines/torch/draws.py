@@ -27,6 +27,7 @@ class Request:
 
     @property
     def controls(self) -> Controls:
+        """What the caller decided."""
         return self.plan_request.controls
 
     def late(self) -> bool:

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from model.network.checkpoint import Loaded, load
+from model.training.batches import Item, ResponseDataset, TaskSampler, collate
+from model.training.examples import Examples
+from model.training.learner import ResponseLearner
+from model.training.targets import PAPER_WEIGHTS
+from tests.model.training.scenes import training_scene
+
+
+@pytest.fixture(scope="module")
+def loaded(untrained_checkpoint: Path) -> Loaded:
+    return load(untrained_checkpoint)
+
+
+def dataset(loaded: Loaded, *, pictures: bool = True) -> ResponseDataset:
+    examples = Examples.from_scenes((training_scene(k) for k in range(8)), (FRONT_WIDE, FRONT_TELE))
+    return ResponseDataset(
+        examples, loaded.codec, loaded.inputs, loaded.vocabulary, PAPER_WEIGHTS, pictures=pictures
+    )
+
+
+def test_an_epoch_gives_every_example_at_most_once_with_its_share_of_tasks() -> None:
+    has_route = np.arange(4000) % 4 > 0
+    sampler = TaskSampler(has_route, 16, {"traj_only": 0.25, "cf_vla": 0.75}, 0.5, seed=0)
+    batches = list(sampler)
+    items = [item for batch in batches for item in batch]
+    assert len(batches) == len(sampler) == 250
+    assert max(Counter(item.index for item in items).values()) == 1
+    tasks = Counter(item.task for item in items)
+    assert tasks["cf_vla"] / len(items) == pytest.approx(0.75, abs=0.03)
+    assert sum(item.route for item in items) / len(items) == pytest.approx(0.375, abs=0.03)
+    assert not any(item.route and not has_route[item.index] for item in items)
+    mixed = [batch for batch in batches if len({(item.task, item.route) for item in batch}) > 1]
+    assert len(mixed) <= 4
+
+
+def test_epochs_differ_and_repeat_by_seed() -> None:
+    def epoch(number: int) -> list[list[Item]]:
+        sampler = TaskSampler(np.ones(64, np.bool_), 8, {"cf_vla": 1.0}, 0.5, seed=3)
+        sampler.set_epoch(number)
+        return list(sampler)
+
+    assert epoch(0) == epoch(0)
+    assert epoch(0) != epoch(1)
+
+
+def test_only_the_response_weighs(loaded: Loaded) -> None:
+    sample = dataset(loaded)[Item(1, "cf_vla", True)]
+    prompt = loaded.inputs.prompt("cf_vla", route=True).ids.tolist()
+    assert sample.ids[: len(prompt)] == prompt
+    assert set(sample.weights[: len(prompt)]) == {0.0}
+    assert min(sample.weights[len(prompt) :]) > 0
+
+
+def test_padding_changes_no_loss(loaded: Loaded) -> None:
+    """A batch's loss is that of its samples alone, weighed together: padding and neighbours do not matter."""
+    data = dataset(loaded)
+    learner = ResponseLearner(loaded.model, loaded.vocabulary.code_ids(0).start)
+    samples = [data[Item(1, "cf_vla", True)], data[Item(2, "traj_only", False)]]
+    # Equal weights, so that losses can be added up by numbers of tokens.
+    with torch.no_grad():
+        alone = [float(learner(**collate([sample]))["loss"]) for sample in samples]
+        batch = collate(samples)
+        together = float(learner(**batch)["loss"])
+    from model.training.loss import STAGE_WEIGHTS
+
+    mass = [sum(sample.weights) - 6 + sum(STAGE_WEIGHTS) for sample in samples]
+    expected = sum(loss * each for loss, each in zip(alone, mass, strict=True)) / sum(mass)
+    assert together == pytest.approx(expected, rel=1e-4)
+
+
+def test_learning_without_pictures_leaves_the_tower_alone(loaded: Loaded) -> None:
+    data = dataset(loaded, pictures=False)
+    learner = ResponseLearner(loaded.model, loaded.vocabulary.code_ids(0).start)
+    loss = learner(**collate([data[Item(1, "cf_vla", False)]]))["loss"]
+    loss.backward()
+    assert all(parameter.grad is None for parameter in loaded.model.model.visual.parameters())
+    assert loaded.model.lm_head.weight.grad is not None
+    loaded.model.zero_grad()

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import os
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from model.driving.images import decode_image
+from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from model.driving.scene_store import write_scenes
+from model.evaluation.open_loop import expert_plan
+from model.training.examples import Examples, load_examples
+from tests.model.training.scenes import training_scene
+
+CAMERAS = (FRONT_WIDE, FRONT_TELE)
+SCENES = [training_scene(index) for index in range(6)]
+
+
+def test_examples_hold_what_the_scenes_hold() -> None:
+    examples = Examples.from_scenes(SCENES, CAMERAS)
+    assert len(examples) == 6
+    for index, labelled in enumerate(SCENES):
+        assert examples.picture(index, 1, 3) == labelled.scene.clip(FRONT_TELE).images[3]
+        assert decode_image(examples.picture(index, 0, 0)).ndim == 3
+        assert examples.plan(index) == expert_plan(labelled)
+        assert np.array_equal(examples.future[index], labelled.future)
+        assert np.isnan(examples.route[index]).all() == (labelled.scene.route is None)
+        assert np.array_equal(examples.dense_classes[index, 0], labelled.dense[0].classes)
+        metres = np.expm1(examples.dense_range_log[index, 1].astype(np.float32))
+        assert np.allclose(metres, labelled.dense[1].range_m, atol=0.2)
+
+
+def test_pictures_are_kept_once() -> None:
+    once = Examples.from_scenes(SCENES[:1], CAMERAS)
+    twice = Examples.from_scenes([SCENES[0], SCENES[0]], CAMERAS)
+    assert len(twice.pictures) == len(once.pictures)
+
+
+def test_joining_keeps_every_picture_in_its_place() -> None:
+    joined = Examples.concatenate(
+        [Examples.from_scenes(SCENES[:2], CAMERAS), Examples.from_scenes(SCENES[2:], CAMERAS)]
+    )
+    whole = Examples.from_scenes(SCENES, CAMERAS)
+    for index in range(6):
+        assert joined.picture(index, 0, 1) == whole.picture(index, 0, 1)
+
+
+def test_the_cache_gives_the_same_and_follows_its_file(tmp_path: Path) -> None:
+    write_scenes(tmp_path / "scenes" / "a.parquet", SCENES[:4])
+    write_scenes(tmp_path / "scenes" / "b.parquet", SCENES[4:])
+    first = load_examples(tmp_path / "scenes", tmp_path / "cache", CAMERAS)
+    again = load_examples(tmp_path / "scenes", tmp_path / "cache", CAMERAS)
+    for field in fields(Examples):
+        assert np.array_equal(getattr(first, field.name), getattr(again, field.name), equal_nan=True)
+    assert len(first) == 6
+    write_scenes(tmp_path / "scenes" / "b.parquet", SCENES[4:5])
+    newer = os.stat(tmp_path / "cache").st_mtime + 10
+    os.utime(tmp_path / "scenes" / "b.parquet", (newer, newer))
+    assert len(load_examples(tmp_path / "scenes", tmp_path / "cache", CAMERAS)) == 5

@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from model.training.loss import STAGE_WEIGHTS, response_loss
+
+VOCABULARY, FIRST_CODE, SIZE = 30, 10, 3
+
+
+def slow_loss(
+    logits: torch.Tensor, labels: list[int], weights: list[float], shares: list[list[list[float]]]
+) -> float:
+    total = weight_sum = 0.0
+    codes_seen = 0
+    for row, label, weight in zip(logits.tolist(), labels, weights, strict=True):
+        norm = math.log(sum(math.exp(value) for value in row))
+        if FIRST_CODE <= label < FIRST_CODE + 6 * SIZE:
+            stage = (label - FIRST_CODE) // SIZE
+            assert stage == codes_seen % 6
+            wanted = shares[codes_seen // 6][stage]
+            codes_seen += 1
+            loss = sum(
+                share * (norm - row[FIRST_CODE + stage * SIZE + code]) for code, share in enumerate(wanted)
+            )
+            weight *= STAGE_WEIGHTS[stage]
+        else:
+            loss = norm - row[label]
+        total += weight * loss
+        weight_sum += weight
+    return total / weight_sum
+
+
+def test_loss_equals_the_obvious_sum() -> None:
+    torch.manual_seed(0)
+    codes = [FIRST_CODE + stage * SIZE + stage % SIZE for stage in range(6)]
+    labels = [1, 2, *codes, 3, 4, *codes, 5]
+    weights = [float(1 + k % 4) for k in range(len(labels))]
+    logits = torch.randn(len(labels), VOCABULARY)
+    shares = torch.softmax(torch.randn(2, 6, SIZE), dim=-1)
+    loss = response_loss(logits, torch.tensor(labels), torch.tensor(weights), FIRST_CODE, shares)
+    assert float(loss) == pytest.approx(slow_loss(logits, labels, weights, shares.tolist()), rel=1e-5)
+
+
+def test_tokens_of_weight_zero_teach_nothing() -> None:
+    logits = torch.randn(2, VOCABULARY, requires_grad=True)
+    labels, weights = torch.tensor([1, 2]), torch.tensor([0.0, 1.0])
+    loss = response_loss(logits, labels, weights, FIRST_CODE, torch.zeros(0, 6, SIZE))
+    (gradient,) = torch.autograd.grad(loss, logits)
+    assert gradient[0].abs().max() == 0
+    assert gradient[1].abs().max() > 0
+
+
+def test_no_weight_at_all_is_a_loss_of_zero() -> None:
+    logits = torch.randn(1, VOCABULARY)
+    loss = response_loss(logits, torch.tensor([1]), torch.tensor([0.0]), FIRST_CODE, torch.zeros(0, 6, SIZE))
+    assert float(loss) == 0.0

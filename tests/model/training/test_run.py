@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from model.driving.scene_store import write_scenes
+from model.network.checkpoint import load
+from model.training.recipes import NANO, Recipe
+from model.training.run import RunSettings, last_whole_state, run
+from tests.model.training.scenes import training_scene
+
+SCENES = [training_scene(index) for index in range(16)]
+
+
+@pytest.fixture
+def scenes(tmp_path: Path) -> Path:
+    write_scenes(tmp_path / "scenes" / "a.parquet", SCENES)
+    return tmp_path / "scenes"
+
+
+def short(name: str, steps: int = 4) -> Recipe:
+    return replace(NANO[name], steps=steps, batch_size=4, warmup_steps=1)
+
+
+def test_the_stages_lead_to_a_checkpoint_that_tells_its_history(
+    untrained_checkpoint: Path, scenes: Path, tmp_path: Path
+) -> None:
+    settings = RunSettings(tmp_path / "cache", validate_every=2, save_every=2, draws=1, bf16=False)
+    before = load(untrained_checkpoint).model.state_dict()
+    run(short("ground"), scenes, untrained_checkpoint, tmp_path / "ground", settings)
+    grounded = load(tmp_path / "ground").model.state_dict()
+    moved = {name for name in before if not torch.equal(before[name], grounded[name])}
+    assert moved
+    assert all(name.startswith("model.visual.") for name in moved)
+
+    run(short("meta-act"), scenes, tmp_path / "ground", tmp_path / "plan", settings, SCENES[:1])
+    done = load(tmp_path / "plan")
+    assert [stage["name"] for stage in done.card.details["stages"]] == ["ground", "meta-act"]
+    assert done.card.revision != load(untrained_checkpoint).card.revision
+    rows = [json.loads(line) for line in (tmp_path / "plan" / "log.jsonl").read_text().splitlines()]
+    validated = [row for row in rows if "min_ade_m/cf_vla+route" in row]
+    assert [row["step"] for row in validated] == [2, 4]
+    assert all(0 < row["plan_iou/cf_vla"] < 1 for row in validated)
+
+
+def test_a_vision_tower_can_be_taken_from_elsewhere(
+    untrained_checkpoint: Path, scenes: Path, tmp_path: Path
+) -> None:
+    settings = RunSettings(tmp_path / "cache", bf16=False)
+    run(short("ground", 1), scenes, untrained_checkpoint, tmp_path / "ground", settings)
+    run(
+        short("language", 1),
+        scenes,
+        untrained_checkpoint,
+        tmp_path / "both",
+        settings,
+        vision_source=tmp_path / "ground",
+    )
+    name = "model.visual.merger.mlp.0.weight"
+    both, grounded = load(tmp_path / "both"), load(tmp_path / "ground")
+    assert torch.equal(both.model.state_dict()[name], grounded.model.state_dict()[name])
+
+
+def test_a_state_cut_off_by_a_kill_is_passed_over(tmp_path: Path) -> None:
+    assert last_whole_state(tmp_path) is None
+    for step, text in ((2, "{}"), (10, "{}"), (12, '{"half'), (14, None)):
+        folder = tmp_path / f"checkpoint-{step}"
+        folder.mkdir()
+        if text is not None:
+            (folder / "trainer_state.json").write_text(text)
+    assert last_whole_state(tmp_path) == str(tmp_path / "checkpoint-10")
+
+
+_SCRIPT = """
+import sys
+from pathlib import Path
+from dataclasses import replace
+from model.training.recipes import NANO
+from model.training.run import RunSettings, run
+scenes, source, target, cache = map(Path, sys.argv[1:])
+recipe = replace(NANO["language"], steps=12, batch_size=4, warmup_steps=1)
+run(recipe, scenes, source, target, RunSettings(cache, save_every=2, bf16=False))
+"""
+
+
+def test_a_killed_run_goes_on(untrained_checkpoint: Path, scenes: Path, tmp_path: Path) -> None:
+    target = tmp_path / "target"
+    command = [
+        sys.executable,
+        "-c",
+        _SCRIPT,
+        *map(str, (scenes, untrained_checkpoint, target, tmp_path / "c")),
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list((target / "state").glob("checkpoint-[4-9]")) and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (target / "config.json").exists()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    assert load(target).card.details["stages"][0]["steps"] == 12
+    last = json.loads((target / "log.jsonl").read_text().splitlines()[-1])
+    # The second run's own steps are fewer than all: it did not begin anew.
+    assert last["step"] == 12
+    assert last["train_samples_per_second"] > 0

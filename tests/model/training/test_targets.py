@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import pytest
+
+from model.driving.plan import parse_plan
+from model.formats.cf_vla import CF_VLA, TRAJ_ONLY
+from model.formats.cursor import CompiledFormat
+from model.formats.text import parse
+from model.training.targets import PAPER_WEIGHTS, Reflection, make_target
+from tests.model.formats.vocabulary import ByteVocabulary
+
+VOCABULARY = ByteVocabulary()
+CODES = (1, 2, 3, 4, 5, 6)
+PLAN = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
+WRONG = parse_plan("- longitudinal\n  - 0.0s-6.4s: Accelerate\n")
+
+
+def test_a_direct_target_says_plan_and_codes_with_the_papers_weights() -> None:
+    compiled = CompiledFormat(CF_VLA, VOCABULARY)
+    target = make_target(compiled, PLAN, CODES)
+    values = parse(CF_VLA, VOCABULARY.decode(target.ids))
+    assert values == {"plan": PLAN, "branch": "Action:", "trajectory": CODES}
+    tokens = compiled.render(values)
+    assert target.weights == tuple(1.0 if token.section == "trajectory" else 10.0 for token in tokens)
+
+
+def test_traj_only_has_no_plan() -> None:
+    target = make_target(CompiledFormat(TRAJ_ONLY, VOCABULARY), PLAN, CODES)
+    assert parse(TRAJ_ONLY, VOCABULARY.decode(target.ids)) == {"trajectory": CODES}
+
+
+def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
+    compiled = CompiledFormat(CF_VLA, VOCABULARY)
+    reflection = Reflection(WRONG, "The car ahead stands still.")
+    target = make_target(compiled, PLAN, CODES, PAPER_WEIGHTS, reflection)
+    values = parse(CF_VLA, VOCABULARY.decode(target.ids))
+    assert (values["plan"], values["revised_plan"]) == (WRONG, PLAN)
+    sections = [token.section for token in compiled.render(values)]
+    weights = {
+        name: {weight for weight, section in zip(target.weights, sections, strict=True) if section == name}
+        for name in set(sections)
+    }
+    assert weights == {
+        "plan": {0.0},
+        "branch": {10.0},
+        "thinking": {10.0},
+        "revised_plan": {10.0},
+        "trajectory": {1.0},
+    }
+
+
+def test_every_section_needs_a_weight() -> None:
+    with pytest.raises(KeyError):
+        make_target(CompiledFormat(CF_VLA, VOCABULARY), PLAN, CODES, {"plan": 1.0})
