@@ -171,7 +171,7 @@ def _run_blocks(
 
 
 def _work(out_dir: Path, seeds: range, config: GenerateConfig) -> None:
-    """A worker process: one block, then gone at once, for Panda3D's own tear-down crashes now and then."""
+    """A worker process: one block, then gone at once; the graphics library's tear-down is not waited for."""
     write_block(out_dir, seeds, config)
     os._exit(0)
 

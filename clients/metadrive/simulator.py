@@ -23,6 +23,7 @@ framebuffer-multisample 0
 multisamples 0
 textures-power-2 none
 max-texture-dimension 512
+model-cache-dir
 garbage-collect-states-rate 1.0
 """
 

@@ -55,6 +55,17 @@ def test_a_killed_worker_leaves_nothing_and_the_next_run_everything(folder: Path
     assert not list(folder.glob(".*.tmp"))
 
 
+def test_a_worker_ends_cleanly(tmp_path: Path) -> None:
+    """Panda3D once crashed at exit, after the file was written."""
+    config = GenerateConfig(stride_s=2.0, duration_s=9.0, block=1)
+    worker = multiprocessing.get_context("spawn").Process(
+        target=write_block, args=(tmp_path, range(5, 6), config)
+    )
+    worker.start()
+    worker.join()
+    assert worker.exitcode == 0
+
+
 def test_a_second_run_leaves_what_is_there_alone(folder: Path) -> None:
     file = block_file(folder, range(4, 5))
     before = file.stat().st_mtime_ns
@@ -107,8 +118,8 @@ def test_statistics_of_an_empty_file_are_zero(tmp_path: Path) -> None:
 
 
 def test_a_contact_sheet_shows_every_scene(filmed: Filmed, tmp_path: Path) -> None:
-    contact_sheet(filmed.scenes[:3], tmp_path / "sheet.png", columns=2)
-    one, both = Image.open(tmp_path / "sheet.png").size
-    contact_sheet(filmed.scenes[:2], tmp_path / "small.png", columns=2)
-    assert both == 2 * Image.open(tmp_path / "small.png").size[1]
-    assert one == Image.open(tmp_path / "small.png").size[0]
+    contact_sheet(filmed.scenes[:3], tmp_path / "three.png", columns=2)
+    contact_sheet(filmed.scenes[:2], tmp_path / "two.png", columns=2)
+    with Image.open(tmp_path / "three.png") as three, Image.open(tmp_path / "two.png") as two:
+        assert three.width == two.width
+        assert three.height == 2 * two.height

@@ -70,7 +70,8 @@ def test_pictures_have_the_asked_size(filmed: Filmed) -> None:
     for clip, spec in zip(filmed.scenes[0].scene.clips, FRONT_CAMERAS, strict=True):
         assert clip.camera == spec.name
         for jpeg in clip.images:
-            assert Image.open(io.BytesIO(jpeg)).size == (spec.width, spec.height)
+            with Image.open(io.BytesIO(jpeg)) as picture:
+                assert picture.size == (spec.width, spec.height)
 
 
 def test_lane_trace_says_where_the_ego_is(filmed: Filmed) -> None:
@@ -106,8 +107,9 @@ def test_left_in_the_world_is_left_in_the_picture(filmed: Filmed) -> None:
                     continue
                 column, row, _ = spec.project(np.array([[x, y, agent.height_m / 2]]))[0]
                 if 4 < column < spec.width - 4 and 4 < row < spec.height - 4:
-                    vehicle = SEMANTIC_CLASSES.index("vehicle")
-                    assert target.classes[int(row) // 4, int(column) // 4] == vehicle
+                    down, across = int(row) // 4, int(column) // 4
+                    around = target.classes[down - 1 : down + 2, across - 1 : across + 2]
+                    assert (around == SEMANTIC_CLASSES.index("vehicle")).any()
                     assert (column < spec.width / 2) == (y > 0)
                     checked += 1
     assert checked
