@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from clients.metadrive.episode import ActorLog, EpisodeLog
+from clients.metadrive.episode_log import ActorLog, EpisodeLog
 from clients.metadrive.rig import CameraSpec
 from clients.metadrive.roads import Array, Rail
 from model.driving.scene import SEMANTIC_CLASSES, DenseTarget, Tag

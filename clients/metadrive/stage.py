@@ -10,8 +10,9 @@ import numpy as np
 
 from clients.metadrive import scenery, simulator
 from clients.metadrive.actors import BODY_SIZES
-from clients.metadrive.episode import BRAKE_LIGHT, LEFT_LIGHT, RIGHT_LIGHT, ActorLog, EpisodeLog
-from clients.metadrive.meshes import GAIT_CYCLE_M, GAIT_POSES, box, model_meshes
+from clients.metadrive.episode_log import BRAKE_LIGHT, LEFT_LIGHT, RIGHT_LIGHT, ActorLog, EpisodeLog
+from clients.metadrive.meshes import box
+from clients.metadrive.models import GAIT_CYCLE_M, GAIT_POSES, model_meshes
 from clients.metadrive.rig import Picture, Rig
 
 _BLINK_STEPS: Final = 4

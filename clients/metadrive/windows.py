@@ -10,7 +10,7 @@ import shapely
 import shapely.affinity
 
 from clients.metadrive.annotate import Tagger, dense_target, route_ahead, to_ego
-from clients.metadrive.episode import EpisodeLog
+from clients.metadrive.episode_log import EpisodeLog
 from clients.metadrive.rig import Picture, Rig
 from clients.metadrive.stage import Stage
 from model.driving.metrics import collides, leaves_road

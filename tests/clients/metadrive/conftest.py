@@ -13,7 +13,8 @@ from clients.metadrive import simulator
 if not simulator.is_installed():
     pytest.skip("MetaDrive is not installed (make sim)", allow_module_level=True)
 
-from clients.metadrive.episode import EpisodeLog, run_episode
+from clients.metadrive.episode import run_episode
+from clients.metadrive.episode_log import EpisodeLog
 from clients.metadrive.rig import Rig
 from clients.metadrive.windows import labelled_scenes
 from model.driving.scene import LabelledScene
