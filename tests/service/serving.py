@@ -9,27 +9,31 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic
 
 import httpx
 import uvicorn
 from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
+from typing_extensions import TypeVar
 
 from model.driving.scene import Scene
+from model.engines.engine import Engine
 from service.app import create_app
 from service.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
 
+ServedEngine = TypeVar("ServedEngine", bound=Engine, default=ScriptedEngine)
+
 PATIENCE_S = 30
 
 
 @dataclass
-class Served:
+class Served(Generic[ServedEngine]):
     """A running service."""
 
-    engine: ScriptedEngine
+    engine: ServedEngine
     url: str
     http: httpx.Client
     loop: asyncio.AbstractEventLoop
@@ -67,7 +71,7 @@ class Served:
 
 
 @contextmanager
-def serve(engine: ScriptedEngine, settings: Settings, *, wait: bool = True) -> Iterator[Served]:
+def serve(engine: ServedEngine, settings: Settings, *, wait: bool = True) -> Iterator[Served[ServedEngine]]:
     """Serve ``engine`` over a real socket until the block ends."""
     listening = socket.create_server(("127.0.0.1", 0))
     url = f"http://127.0.0.1:{listening.getsockname()[1]}"

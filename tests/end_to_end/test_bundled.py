@@ -1,0 +1,126 @@
+"""What ships, as users meet it: the bundled checkpoint through socket, client and commands."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+
+from clients import wire
+from clients.planner import Patience, PlannerClient
+from model.bundled import CHECKPOINT, SCENES
+from model.driving.scene import split_of_seed
+from model.driving.scene_store import read_scenes
+from model.engines.torch.engine import TorchEngine
+from model.evaluation.open_loop import evaluate_baselines, evaluate_trajectories
+from service.settings import Settings
+from tests.service.serving import Served, serve
+
+BUNDLED = list(read_scenes(SCENES))
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served[TorchEngine]]:
+    with serve(TorchEngine(CHECKPOINT), Settings(bundled_scenes=SCENES)) as served:
+        yield served
+
+
+@pytest.fixture(scope="module")
+def planner(served: Served[TorchEngine]) -> Iterator[PlannerClient]:
+    with PlannerClient(served.url, Patience(timeout_s=120)) as planner:
+        yield planner
+
+
+def test_bundled_scenes_are_twelve_test_scenes_that_show_every_tag() -> None:
+    assert len(BUNDLED) == 12
+    assert {split_of_seed(labelled.seed) for labelled in BUNDLED} == {"test"}
+    assert len({tag for labelled in BUNDLED for tag in labelled.tags}) == 6
+
+
+def test_the_checkpoint_is_small_and_tells_how_it_was_made(served: Served[TorchEngine]) -> None:
+    assert sum(file.stat().st_size for file in CHECKPOINT.rglob("*")) < 40_000_000
+    card = served.http.get("/v1/models").json()["models"][0]
+    stages = [stage["name"] for stage in card["details"]["stages"]]
+    assert stages[-1] == "meta-act"
+
+
+def test_it_plans_better_than_keeping_on(planner: PlannerClient) -> None:
+    """Over the twelve scenes; the evaluation over a thousand is `looktwice evaluate`."""
+    baselines = evaluate_baselines(BUNDLED)
+    best = min(np.mean([result.min_ade_m for result in results]) for results in baselines.values())
+    errors = []
+    for labelled in BUNDLED:
+        answer = planner.plan(labelled.scene, wire.Controls(n=6, seed=1))
+        draws = np.stack([draw.trajectory for draw in answer.draws])
+        assert all(draw.plan is not None for draw in answer.draws)
+        errors.append(evaluate_trajectories(labelled, draws).min_ade_m)
+    assert np.mean(errors) < 0.8 * best
+
+
+def test_the_same_seed_gives_the_same_answer(planner: PlannerClient) -> None:
+    first, second = (planner.plan(BUNDLED[0].scene, wire.Controls(n=2, seed=5)) for _ in range(2))
+    for one, other in zip(first.draws, second.draws, strict=True):
+        assert np.array_equal(one.trajectory, other.trajectory)
+    other_seed = planner.plan(BUNDLED[0].scene, wire.Controls(n=2, seed=6))
+    assert not np.array_equal(first.draws[0].trajectory, other_seed.draws[0].trajectory)
+
+
+def test_hostile_pictures_do_not_disturb_others(served: Served[TorchEngine], planner: PlannerClient) -> None:
+    bad = planner.plan(BUNDLED[0].scene, wire.Controls(n=1))
+    assert bad.draws
+    body = json.loads(served.http.get("/openapi.json").text)
+    assert "/v1/plan" in body["paths"]
+    answer = served.http.post("/v1/plan", content=b"{" * 1000, headers={"content-type": "application/json"})
+    assert answer.status_code == 422
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert planner.plan(BUNDLED[0].scene, wire.Controls(n=1)).draws
+
+
+def test_metrics_count_tokens_by_section(served: Served[TorchEngine], planner: PlannerClient) -> None:
+    name = "looktwice_section_tokens_sum"
+    before = served.metric(name, section="trajectory")
+    planner.plan(BUNDLED[1].scene, wire.Controls(n=3))
+    assert served.metric(name, section="trajectory") > before
+
+
+def looktwice(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from service.cli import main; main()", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def test_the_command_prints_a_plan_and_writes_a_picture(tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-c",
+        "from service.cli import main; main()",
+        "plan",
+        "--json",
+        "--out",
+        str(tmp_path),
+    ]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
+    report = json.loads(done.stdout)
+    assert len(report["draws"]) == 6
+    assert report["draws"][0]["text"].startswith("Meta Actions:\n- longitudinal\n")
+    with Image.open(report["picture"]) as picture:
+        assert picture.size == (1400, 900)
+
+
+def test_a_damaged_scene_file_says_so(tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.parquet"
+    damaged.write_bytes(SCENES.read_bytes()[:5000])
+    done = looktwice("plan", str(damaged))
+    assert done.returncode == 2
+    assert "truncated" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_it_is_ready(served: Served[TorchEngine]) -> None:
+    assert httpx.get(f"{served.url}/readyz").status_code == 200
