@@ -13,11 +13,12 @@ import numpy as np
 from clients.metadrive.generate import MANIFEST
 from model.driving.labeller import label_plan
 from model.driving.metrics import collides, leaves_road
-from model.driving.plan import TICKS, Plan
+from model.driving.plan import GROUPS, TICKS, WORDS, Plan
 from model.driving.scene import TAGS, LabelledScene
-from model.driving.scene_store import read_scenes
+from model.driving.scene_store import SceneFileError, read_scenes
 from model.driving.trajectory import HORIZON_S, STEP_S
 
+_ALL_WORDS: Final = tuple(word for group in GROUPS for word in WORDS[group])
 _LEAD_OFFSET_M: Final = 1.6
 _LEAD_NEAR_M: Final = 20.0
 _TURNS: Final = ("Left Turn", "Right Turn")
@@ -27,7 +28,8 @@ _ENDED_BADLY: Final = ("collision", "off_road")
 def scene_stats(path: Path, limit: int | None = None) -> dict[str, Any]:
     """Count what the scenes of a file or folder hold; ``limit`` looks at the first ones only.
 
-    Shares are of scenes; ``share_of_time`` is of the seconds that plans cover.
+    ``tags`` and ``meta_actions`` count scenes, shares are of scenes, ``meta_action_time`` is the share of the
+    seconds that plans cover.
     """
     tags: Counter[str] = Counter()
     words_in: Counter[str] = Counter()
@@ -55,31 +57,18 @@ def scene_stats(path: Path, limit: int | None = None) -> dict[str, Any]:
         accelerations.append(acceleration)
         jerks.append(np.abs(np.diff(np.convolve(acceleration, np.full(3, 1 / 3), "valid"))) / STEP_S)
     if not scenes:
-        return {
-            "scenes": 0,
-            "episodes": 0,
-            "tags": {},
-            "meta_actions": {},
-            "expert_collisions": 0,
-            "expert_off_road": 0,
-        }
+        raise SceneFileError(f"{path} holds no scenes")
     acceleration, jerk = np.concatenate(accelerations), np.concatenate(jerks)
     return {
         "scenes": scenes,
         "episodes": len(episodes),
-        "tags": {tag: {"scenes": tags[tag], "share": tags[tag] / scenes} for tag in TAGS},
-        "meta_actions": {
-            word: {
-                "scenes": words_in[word],
-                "share": words_in[word] / scenes,
-                "share_of_time": word_ticks[word] / (TICKS * scenes),
-            }
-            for word in sorted(words_in)
-        },
+        "tags": {tag: tags[tag] for tag in TAGS},
+        "meta_actions": {word: words_in[word] for word in _ALL_WORDS},
+        "meta_action_time": {word: word_ticks[word] / (TICKS * scenes) for word in _ALL_WORDS},
         "expert_collisions": collisions,
         "expert_off_road": off_road,
         "turning_share": turning / scenes,
-        "mean_speed": float(np.mean(speeds)),
+        "mean_speed_ms": float(np.mean(speeds)),
         "stationary_share_of_time": stationary / (len(speeds) * 64),
         "lead_within_20_m_share": near / scenes,
         "acceleration_p01": float(np.percentile(acceleration, 1)),

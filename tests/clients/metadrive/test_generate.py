@@ -23,8 +23,9 @@ from clients.metadrive.generate import (
 )
 from clients.metadrive.sheet import contact_sheet
 from clients.metadrive.stats import scene_stats
-from model.driving.scene import TAGS, SceneError
-from model.driving.scene_store import read_scenes, write_scenes
+from model.driving.labeller import label_plan
+from model.driving.scene import TAGS, LabelledScene, SceneError
+from model.driving.scene_store import SceneFileError, read_scenes, write_scenes
 from tests.clients.metadrive.conftest import Filmed
 
 CONFIG = GenerateConfig(stride_s=2.0, duration_s=10.0, block=1)
@@ -105,16 +106,22 @@ def test_statistics_count_scenes_tags_and_words(folder: Path) -> None:
     assert set(stats["tags"]) == set(TAGS)
     assert stats["expert_collisions"] == 0
     assert stats["expert_off_road"] == 0
+    words = [labelled_words(labelled) for labelled in read_scenes(folder)]
+    assert stats["meta_actions"] == {word: sum(word in of for of in words) for word in stats["meta_actions"]}
+    assert set().union(*words) <= set(stats["meta_actions"])
     lane_words = ("Keep Lane", "Left Lane Change", "Right Lane Change")
-    in_time = sum(
-        stats["meta_actions"].get(word, {"share_of_time": 0})["share_of_time"] for word in lane_words
-    )
-    assert in_time == pytest.approx(1.0)
+    assert sum(stats["meta_action_time"][word] for word in lane_words) == pytest.approx(1.0)
 
 
-def test_statistics_of_an_empty_file_are_zero(tmp_path: Path) -> None:
+def labelled_words(labelled: LabelledScene) -> set[str]:
+    plan = label_plan(labelled.future, labelled.scene.history, labelled.lane_trace)
+    return {action.word for _, track in plan.tracks() for action in track}
+
+
+def test_statistics_need_scenes(tmp_path: Path) -> None:
     write_scenes(tmp_path / "none.parquet", [])
-    assert scene_stats(tmp_path)["scenes"] == 0
+    with pytest.raises(SceneFileError, match="no scenes"):
+        scene_stats(tmp_path)
 
 
 def test_a_contact_sheet_shows_every_scene(filmed: Filmed, tmp_path: Path) -> None:
