@@ -6,14 +6,14 @@ No torch here; a vocabulary is anything that satisfies `Vocabulary`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.plan import Plan, format_tick
+from model.driving.plan import Plan
+from model.formats.given import with_given
 from model.formats.pieces import (
     Choice,
     Codes,
@@ -26,9 +26,9 @@ from model.formats.pieces import (
     Section,
     Sequence,
     Track,
-    Value,
     Values,
 )
+from model.formats.trie import Node, build_trie
 
 
 class Vocabulary(Protocol):
@@ -54,24 +54,6 @@ class Token(NamedTuple):
     section: str
 
 
-class _Node:
-    """A node of a trie over tokenised options."""
-
-    __slots__ = ("children", "ids", "option")
-
-    def __init__(self) -> None:
-        self.children: dict[int, _Node] = {}
-        self.option: int | None = None
-        self.ids: npt.NDArray[np.int64] = np.empty(0, np.int64)
-
-    def options(self) -> Iterator[int]:
-        """Positions of the options reachable from here."""
-        if self.option is not None:
-            yield self.option
-        for child in self.children.values():
-            yield from child.options()
-
-
 class _Run(NamedTuple):
     ids: tuple[int, ...]
     position: int
@@ -79,7 +61,7 @@ class _Run(NamedTuple):
 
 class _AtChoice(NamedTuple):
     choice: Choice
-    node: _Node
+    node: Node
 
 
 class _InText(NamedTuple):
@@ -119,7 +101,7 @@ class CompiledFormat:
         self.format = format
         self._vocabulary = vocabulary
         self._literals: dict[str, tuple[int, ...]] = {}
-        self._tries: dict[tuple[str, ...], _Node] = {}
+        self._tries: dict[tuple[str, ...], Node] = {}
         self._expanded: dict[Track | PlanTracks, Sequence] = {}
         self._codes = tuple(np.arange(ids.start, ids.stop) for ids in map(vocabulary.code_ids, range(6)))
         self._free_ids: dict[tuple[str, bool], npt.NDArray[np.int64]] = {}
@@ -134,7 +116,7 @@ class CompiledFormat:
         for name in given or {}:
             if name not in known:
                 raise FormatError(f"format {self.format.name} has no section {name!r}")
-        body = _with_given(self.format.body, given or {}, None)
+        body = with_given(self.format.body, given or {})
         return self._enter((body, "", None))
 
     def render(self, values: Values) -> list[Token]:
@@ -177,30 +159,12 @@ class CompiledFormat:
         """Ids of one stage's codes."""
         return self._codes[stage]
 
-    def trie(self, choice: Choice) -> _Node:
+    def trie(self, choice: Choice) -> Node:
         """The trie over a choice's tokenised options."""
         texts = tuple(option.text for option in choice.options)
         if texts not in self._tries:
-            self._tries[texts] = self._build_trie(texts)
+            self._tries[texts] = build_trie(texts, self.literal)
         return self._tries[texts]
-
-    def _build_trie(self, texts: tuple[str, ...]) -> _Node:
-        root = _Node()
-        for position, text in enumerate(texts):
-            node = root
-            for token in self.literal(text):
-                if node.option is not None:
-                    raise FormatError(f"option {texts[node.option]!r} is a beginning of {text!r} in tokens")
-                node = node.children.setdefault(token, _Node())
-            if node.children or node.option is not None:
-                raise FormatError(f"option {text!r} is a beginning of another option in tokens")
-            node.option = position
-        stack = [root]
-        while stack:
-            node = stack.pop()
-            node.ids = np.array(sorted(node.children), np.int64)
-            stack += node.children.values()
-        return root
 
     def _enter(self, rest: _Rest) -> Cursor:
         """The cursor at the first token of ``rest``."""
@@ -351,56 +315,3 @@ class Cursor:
 def _holds(ids: npt.NDArray[np.int64], token: int) -> bool:
     position = int(np.searchsorted(ids, token))
     return position < len(ids) and int(ids[position]) == token
-
-
-def _with_given(piece: Piece, given: Mapping[str, Value], section: str | None) -> Piece:
-    """``piece`` with the plans of given sections written out as literals, piece by piece."""
-    match piece:
-        case Section(name, body):
-            return Section(name, _with_given(body, given, name))
-        case Sequence(parts):
-            return Sequence(tuple(_with_given(part, given, section) for part in parts))
-        case Choice(options, name):
-            return Choice(
-                tuple(
-                    type(option)(option.text, _with_given(option.then, given, section)) for option in options
-                ),
-                name,
-            )
-        case PlanTracks() if section is not None and section in given:
-            plan = given[section]
-            if not isinstance(plan, Plan):
-                raise FormatError(f"section {section!r} needs a plan")
-            return _written_plan(plan, section)
-        case _:
-            return piece
-
-
-def _written_plan(plan: Plan, section: str) -> Sequence:
-    """The pieces that a plan's text is made of, each as a literal: tokenised as decoding would."""
-    parts: list[Piece] = []
-    for group, track in plan.tracks():
-        rest: Piece = PlanTracks((group,))
-        answers = iter([text for action in track for text in (format_tick(action.end), f" {action.word}")])
-        stack: list[Piece] = [rest]
-        while stack:
-            piece = stack.pop()
-            match piece:
-                case Literal():
-                    parts.append(piece)
-                case Sequence(pieces):
-                    stack += reversed(pieces)
-                case PlanTracks() | Track():
-                    stack.append(piece.expand())
-                case Choice(options):
-                    text = next(answers)
-                    chosen = [option for option in options if option.text == text]
-                    if not chosen:
-                        raise FormatError(
-                            f"section {section!r}: track {group} has more meta-actions than the format allows"
-                        )
-                    parts.append(Literal(text))
-                    stack.append(chosen[0].then)
-                case _:
-                    raise FormatError(f"a plan holds no {type(piece).__name__}")
-    return Sequence(tuple(parts))

@@ -18,10 +18,10 @@ from model.driving.plan import (
     PlanError,
     Track,
     parse_plan,
-    parse_plan_leniently,
     plan_from_bins,
     plan_iou,
 )
+from model.driving.plan_mending import parse_plan_leniently
 
 PAPERS_EXAMPLE = """\
 - longitudinal
