@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -61,11 +63,31 @@ def test_torch_stays_in_the_engine_room(name: str, path: Path) -> None:
 @pytest.mark.parametrize(("name", "path"), list(modules()))
 def test_the_planner_client_stays_light(name: str, path: Path) -> None:
     if within(name, LIGHT):
-        import sys
-
         foreign = [
             imported
             for imported in imports(path)
             if imported.split(".")[0] not in sys.stdlib_module_names and not within(imported, LIGHT_IMPORTS)
         ]
         assert foreign == []
+
+
+def test_the_planner_client_needs_none_of_the_heavy_packages() -> None:
+    heavy = (
+        "torch",
+        "transformers",
+        "pyarrow",
+        "fastapi",
+        "pydantic_settings",
+        "matplotlib",
+        "shapely",
+        "typer",
+    )
+    blocked = f"import sys; sys.modules.update(dict.fromkeys({heavy!r})); import clients.planner"
+    subprocess.run([sys.executable, "-c", blocked], check=True, cwd=ROOT)
+
+
+def test_the_command_says_what_to_install_where_only_the_client_is() -> None:
+    script = "import sys; sys.modules['typer'] = None; from service.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 1
+    assert "pip install 'looktwice[serve]'" in done.stderr
