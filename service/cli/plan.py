@@ -56,10 +56,9 @@ async def _plan(
 ) -> None:
     from dataclasses import replace
 
-    from model.evaluation.pictures import plan_picture
-
     from model.engines.engine import Controls, DrawFinished, PlanRequest
     from model.engines.torch.engine import TorchEngine
+    from model.evaluation.pictures import plan_picture
 
     engine = TorchEngine(checkpoint)
     await engine.start()
