@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import multiprocessing.connection
-import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
@@ -148,7 +147,7 @@ def _run_blocks(
         while waiting or running:
             while waiting and len(running) < workers:
                 block, attempt = waiting.pop(0)
-                process = context.Process(target=_work, args=(out_dir, block, config), daemon=True)
+                process = context.Process(target=write_block, args=(out_dir, block, config), daemon=True)
                 process.start()
                 running[process] = (block, attempt)
             multiprocessing.connection.wait([process.sentinel for process in running])
@@ -168,12 +167,6 @@ def _run_blocks(
         for process in running:
             process.kill()
             process.join()
-
-
-def _work(out_dir: Path, seeds: range, config: GenerateConfig) -> None:
-    """A worker process: one block, then gone at once; the graphics library's tear-down is not waited for."""
-    write_block(out_dir, seeds, config)
-    os._exit(0)
 
 
 def write_block(out_dir: Path, seeds: range, config: GenerateConfig) -> None:
