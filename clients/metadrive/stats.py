@@ -12,6 +12,7 @@ import numpy as np
 
 from clients.metadrive.generate import MANIFEST
 from model.driving.labeller import label_plan
+from model.driving.lead import LEAD_WITHIN_M, lead_within
 from model.driving.metrics import collides, leaves_road
 from model.driving.plan import GROUPS, TICKS, WORDS, Plan
 from model.driving.scene import TAGS, LabelledScene
@@ -19,8 +20,6 @@ from model.driving.scene_store import SceneFileError, read_scenes
 from model.driving.trajectory import HORIZON_S, STEP_S
 
 _ALL_WORDS: Final = tuple(word for group in GROUPS for word in WORDS[group])
-_LEAD_OFFSET_M: Final = 1.6
-_LEAD_NEAR_M: Final = 20.0
 _TURNS: Final = ("Left Turn", "Right Turn")
 _ENDED_BADLY: Final = ("collision", "off_road")
 
@@ -49,7 +48,7 @@ def scene_stats(path: Path, limit: int | None = None) -> dict[str, Any]:
         future = labelled.future[None]
         collisions += bool(collides(future, labelled.agents, HORIZON_S)[0])
         off_road += bool(leaves_road(future, labelled.drivable)[0])
-        near += _lead_near(labelled)
+        near += lead_within(labelled)
         speed = _speeds(labelled)
         speeds.append(speed.mean())
         stationary += int((np.abs(speed) < 0.2).sum())
@@ -70,7 +69,7 @@ def scene_stats(path: Path, limit: int | None = None) -> dict[str, Any]:
         "turning_share": turning / scenes,
         "mean_speed_ms": float(np.mean(speeds)),
         "stationary_share_of_time": stationary / (len(speeds) * 64),
-        "lead_within_20_m_share": near / scenes,
+        f"lead_within_{LEAD_WITHIN_M:.0f}_m_share": near / scenes,
         "acceleration_p01": float(np.percentile(acceleration, 1)),
         "acceleration_p99": float(np.percentile(acceleration, 99)),
         "jerk_p99": float(np.percentile(jerk, 99)),
@@ -91,14 +90,6 @@ def _speeds(labelled: LabelledScene) -> Any:
     step = np.diff(poses[:, :2], axis=0)
     heading = 0.5 * (poses[1:, 3] + poses[:-1, 3])
     return (step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading)) / STEP_S
-
-
-def _lead_near(labelled: LabelledScene) -> bool:
-    for agent in labelled.agents:
-        x, y, _ = agent.present
-        if agent.kind == "vehicle" and 0 < x < _LEAD_NEAR_M and abs(y) < _LEAD_OFFSET_M:
-            return True
-    return False
 
 
 def _outcomes(path: Path) -> dict[str, Any]:

@@ -12,9 +12,10 @@ from typing import Final
 import numpy as np
 
 from model.driving.labeller import label_plan
+from model.driving.lead import lead_within
 from model.driving.metrics import collides, displacement_errors, leaves_road
 from model.driving.plan import Plan, plan_iou
-from model.driving.scene import EGO_LENGTH_M, LabelledScene, Tag
+from model.driving.scene import LabelledScene, Tag
 from model.driving.trajectory import FloatArray, constant_turn_rate, constant_velocity
 from model.engines.engine import Draw
 
@@ -34,10 +35,6 @@ MEASURES: Final = (
 )
 """Fields of `SceneResult` that are averaged over scenes, in the table's order."""
 
-LEAD_WITHIN_M: Final = 20.0
-LANE_HALF_WIDTH_M: Final = 1.75
-"""Half of MetaDrive's 3.5 m lanes: what is closer than this to the ego's path is in its way."""
-
 BASELINES: Final[Mapping[str, Callable[[FloatArray], FloatArray]]] = {
     "constant velocity": constant_velocity,
     "constant turn rate": constant_turn_rate,
@@ -50,7 +47,7 @@ class SceneResult:
 
     Attributes:
         scene_id, episode_id, tags: the scene's own.
-        lead_close: a vehicle is in the ego's way within `LEAD_WITHIN_M`.
+        lead_close: a vehicle is in the ego's way close by, see `lead_within`.
         min_ade_m, avg_ade_m, min_fde_m, avg_fde_m, corner_distance_m: see `DisplacementErrors`.
         collision_rate: share of draws that meet another agent or obstacle within 5 s.
         off_road_rate: share of draws that leave the road; None where no drivable area is known.
@@ -136,40 +133,6 @@ def evaluate_baselines(scenes: Iterable[LabelledScene]) -> dict[str, list[SceneR
             trajectory = baseline(labelled.scene.history)
             results[name].append(evaluate_trajectories(labelled, trajectory[None]))
     return results
-
-
-def lead_within(labelled: LabelledScene, metres: float = LEAD_WITHIN_M) -> bool:
-    """Whether a vehicle's centre is now in the ego's way, up to ``metres`` ahead of the front bumper.
-
-    In the way is what is closer than half a lane to the line straight ahead or to the expert's path, which
-    is prolonged along its last heading, for an expert that stops behind the vehicle.
-    """
-    future = labelled.future.astype(np.float64)
-    reach_m = EGO_LENGTH_M / 2 + metres
-    beyond = np.linspace(1.0, reach_m, 64)[:, None]
-    last = future[-1]
-    path = np.concatenate(
-        [
-            np.zeros((1, 2)),
-            future[:, :2],
-            last[:2] + beyond * np.array([np.cos(last[3]), np.sin(last[3])]),
-        ]
-    )
-    for agent in labelled.agents:
-        x, y = (float(value) for value in agent.present[:2])
-        if agent.kind != "vehicle" or not EGO_LENGTH_M / 2 < x <= reach_m:  # False where absent (NaN)
-            continue
-        if min(abs(y), _distance_to_line(np.array([x, y]), path)) < LANE_HALF_WIDTH_M:
-            return True
-    return False
-
-
-def _distance_to_line(point: FloatArray, line: FloatArray) -> float:
-    """Distance of a point [2] to a polyline [k, 2]."""
-    start, step = line[:-1], np.diff(line, axis=0)
-    length_sq = np.maximum((step**2).sum(axis=1), 1e-12)
-    along = np.clip(((point - start) * step).sum(axis=1) / length_sq, 0, 1)
-    return float(np.linalg.norm(start + along[:, None] * step - point, axis=1).min())
 
 
 def iou_with_expert(plan: Plan, expert: Plan) -> float:

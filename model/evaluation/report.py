@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from model.driving.lead import LEAD_WITHIN_M
 from model.driving.scene import LabelledScene
 from model.engines.engine import Engine
 from model.evaluation.bootstrap import Comparison, compare
-from model.evaluation.open_loop import LEAD_WITHIN_M, SceneResult, evaluate_baselines
+from model.evaluation.open_loop import SceneResult, evaluate_baselines
 from model.evaluation.table import Row, format_table, to_json
 from model.evaluation.variants import Variant, evaluate_engine
 

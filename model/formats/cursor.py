@@ -26,6 +26,7 @@ from model.formats.pieces import (
     Section,
     Sequence,
     Track,
+    TrackWord,
     Values,
 )
 from model.formats.trie import Node, build_trie
@@ -102,12 +103,12 @@ class CompiledFormat:
         self._vocabulary = vocabulary
         self._literals: dict[str, tuple[int, ...]] = {}
         self._tries: dict[tuple[str, ...], Node] = {}
-        self._expanded: dict[Track | PlanTracks, Sequence] = {}
+        self._expanded: dict[PlanTracks | Track | TrackWord, Sequence] = {}
         self._codes = tuple(np.arange(ids.start, ids.stop) for ids in map(vocabulary.code_ids, range(6)))
         self._free_ids: dict[tuple[str, bool], npt.NDArray[np.int64]] = {}
 
     def start(self, given: Values | None = None) -> Cursor:
-        """A cursor at the beginning; plans of the sections in ``given`` are forced as they are.
+        """A cursor at the beginning; plans of the sections in ``given`` are forced, equal neighbours joined.
 
         Raises:
             FormatError: ``given`` names a section without a plan, or a plan beyond the format.
@@ -181,7 +182,7 @@ class CompiledFormat:
                     rest = after
                 case Section(name, body):
                     rest = (body, name, after)
-                case PlanTracks() | Track():
+                case PlanTracks() | Track() | TrackWord():
                     if piece not in self._expanded:
                         self._expanded[piece] = piece.expand()
                     rest = (self._expanded[piece], section, after)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from model.driving.plan import Plan, format_tick
+from model.driving.plan import Plan, format_tick, plan_from_bins
 from model.formats.pieces import (
     Choice,
     FormatError,
@@ -13,6 +13,7 @@ from model.formats.pieces import (
     Section,
     Sequence,
     Track,
+    TrackWord,
     Values,
 )
 
@@ -20,7 +21,8 @@ from model.formats.pieces import (
 def with_given(piece: Piece, given: Values, section: str | None = None) -> Piece:
     """``piece`` with the plans of given sections written out as literals, piece by piece.
 
-    So a given plan is tokenised exactly as if the model had written it.
+    So a given plan is tokenised exactly as if the model had written it; equal neighbours are joined first,
+    as no model writes them.
 
     Raises:
         FormatError: a given value is no plan, or has more meta-actions than the format allows.
@@ -47,7 +49,7 @@ def with_given(piece: Piece, given: Values, section: str | None = None) -> Piece
 def _written_plan(plan: Plan, section: str) -> Sequence:
     """The pieces that a plan's text is made of, each as a literal: tokenised as decoding would."""
     parts: list[Piece] = []
-    for group, track in plan.tracks():
+    for group, track in plan_from_bins(plan.bins()).tracks():
         rest: Piece = PlanTracks((group,))
         answers = iter([text for action in track for text in (format_tick(action.end), f" {action.word}")])
         stack: list[Piece] = [rest]
@@ -58,7 +60,7 @@ def _written_plan(plan: Plan, section: str) -> Sequence:
                     parts.append(piece)
                 case Sequence(pieces):
                     stack += reversed(pieces)
-                case PlanTracks() | Track():
+                case PlanTracks() | Track() | TrackWord():
                     stack.append(piece.expand())
                 case Choice(options):
                     text = next(answers)

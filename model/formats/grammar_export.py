@@ -2,7 +2,8 @@
 
 The grammar is right-linear within a plan: one rule per group and start time, so only partitions of the
 horizon can be written. It works on text and on the vocabulary's special tokens; unlike our own cursor it
-does not count a track's meta-actions and does not fix how text is split into tokens.
+does not count a track's meta-actions, lets a word follow itself and does not fix how text is split into
+tokens.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from model.formats.pieces import (
     Section,
     Sequence,
     Track,
+    TrackWord,
 )
 
 _SPECIAL = re.compile(r"(<\|[a-z_]+\|>)")
@@ -61,7 +63,7 @@ def _rule(piece: Piece, vocabulary: Vocabulary, rules: dict[str, str]) -> str:
         case Codes(count):
             ranges = [vocabulary.code_ids(stage) for stage in range(count)]
             return " ".join(f"<[{ids.start}-{ids.stop - 1}]>" for ids in ranges)
-        case Track():
+        case Track() | TrackWord():
             raise TypeError("a track is exported as part of its plan")
 
 

@@ -115,26 +115,46 @@ class PlanTracks:
 
 @dataclass(frozen=True)
 class Track:
-    """The rest of one track from the tick ``start`` on, in at most ``segments_left`` meta-actions."""
+    """The rest of one track from the tick ``start`` on, in at most ``segments_left`` meta-actions.
+
+    No word follows itself: ``previous`` is the word before ``start``.
+    """
 
     group: Group
     start: int
     segments_left: int
+    previous: str | None = None
 
     def expand(self) -> Sequence:
-        """One meta-action in simpler pieces, and the rest of the track behind each end time."""
+        """One meta-action's times in simpler pieces, and its word behind each end time."""
         first = TICKS if self.segments_left == 1 else self.start + 1
-        words = tuple(Option(f" {word}", Literal("\n")) for word in WORDS[self.group])
-        ends = []
-        for end in range(first, TICKS + 1):
-            parts: tuple[Piece, ...] = (Literal("s:"), Choice(words))
-            if end < TICKS:
-                parts += (Track(self.group, end, self.segments_left - 1),)
-            ends.append(Option(format_tick(end), Sequence(parts)))
-        return Sequence((Literal(f"  - {format_tick(self.start)}s-"), Choice(tuple(ends))))
+        ends = tuple(
+            Option(format_tick(end), TrackWord(self.group, end, self.segments_left - 1, self.previous))
+            for end in range(first, TICKS + 1)
+        )
+        return Sequence((Literal(f"  - {format_tick(self.start)}s-"), Choice(ends)))
 
 
-Piece = Literal | Choice | Sequence | Section | FreeText | Codes | PlanTracks | Track
+@dataclass(frozen=True)
+class TrackWord:
+    """The word of the meta-action that ends at the tick ``end``, and the rest of its track."""
+
+    group: Group
+    end: int
+    segments_left: int
+    previous: str | None
+
+    def expand(self) -> Sequence:
+        """The words in simpler pieces; behind each the rest of the track, if there is one."""
+        words = []
+        for word in WORDS[self.group]:
+            if word != self.previous:
+                rest = (Track(self.group, self.end, self.segments_left, word),) if self.end < TICKS else ()
+                words.append(Option(f" {word}", Sequence((Literal("\n"), *rest))))
+        return Sequence((Literal("s:"), Choice(tuple(words))))
+
+
+Piece = Literal | Choice | Sequence | Section | FreeText | Codes | PlanTracks | Track | TrackWord
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from model.formats.pieces import (
     Section,
     Sequence,
     Track,
+    TrackWord,
     Value,
     Values,
 )
@@ -70,7 +71,7 @@ class _Reader:
                 self.position = end + len(stop)
             case Codes(count):
                 self._codes(count, section)
-            case Track():
+            case Track() | TrackWord():
                 raise TypeError("a track is read as part of its plan")
 
     def error(self, message: str) -> FormatError:

@@ -51,12 +51,16 @@ def prompt_text(format: str, cameras: Sequence[str], clip_tokens: int, *, route:
     if format not in TASKS:
         raise PromptError(f"no prompt is known for format {format!r}; known are {', '.join(TASKS)}")
     clips = "".join(f"{camera}:{VISION_START}{VIDEO_PAD * clip_tokens}{VISION_END}\n" for camera in cameras)
-    way = f"route:{ROUTE_START}{ROUTE}{ROUTE_END}\n" if route else ""
     return (
         f"{IM_START}system\n{_SYSTEM}{IM_END}\n"
         f"{IM_START}user\n{TASKS[format]}\n"
         f"{clips}"
-        f"history:{HISTORY_START}{HISTORY}{HISTORY_END}\n"
-        f"{way}"
+        f"{motion_text(route=route)}"
         f"{IM_END}\n{IM_START}assistant\n"
     )
+
+
+def motion_text(*, route: bool) -> str:
+    """The prompt's lines about the ego's own motion: all that training without pictures gives."""
+    way = f"route:{ROUTE_START}{ROUTE}{ROUTE_END}\n" if route else ""
+    return f"history:{HISTORY_START}{HISTORY}{HISTORY_END}\n{way}"

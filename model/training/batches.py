@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import cast
+from typing import Final, cast
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
-from torch.utils.data import BatchSampler, Dataset
+from torch.utils.data import BatchSampler, Dataset, Sampler
 
 from model.driving.images import decode_image
 from model.formats.cf_vla import FORMATS
@@ -18,13 +18,17 @@ from model.formats.cursor import CompiledFormat
 from model.network.codec import TrajectoryCodec
 from model.network.inputs import InputBuilder
 from model.network.patches import patchify, resize
-from model.network.prompts import prompt_text
+from model.network.prompts import motion_text
 from model.network.vocabulary import Vocabulary
 from model.training.examples import Examples
 from model.training.soft_codes import SoftCodes
 from model.training.targets import SectionWeights, Task, make_target
 
 Batch = dict[str, Tensor]
+
+WIDTH_STEP: Final = 16
+"""Batches are padded to multiples of this: few shapes, so kernels made for a shape are made few times and
+kept in little memory (on CPUs every new shape costs megabytes)."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +95,8 @@ class ResponseDataset(Dataset[Sample]):
     def _prompt(self, item: Item) -> list[int]:
         if self._pictures:
             return cast("list[int]", self._inputs.prompt(item.task, route=item.route).ids.tolist())
-        # Learning the language first, without pictures, is ten times faster: the same prompt less its clips.
-        return list(self._vocabulary.encode(prompt_text(item.task, (), 0, route=item.route)))
+        # Without pictures nothing but speed counts, and a trajectory's whole example has thirty tokens.
+        return list(self._vocabulary.encode(motion_text(route=item.route)))
 
     def frames(self, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
         """The pictures of an example, uint8 [cameras x 4, h, w, 3]."""
@@ -127,6 +131,9 @@ class TaskSampler(BatchSampler):
     ) -> None:
         self._has_route, self.batch_size, self._tasks = has_route, batch_size, tasks
         self._route_share, self._seed, self._epoch = route_share, seed, 0
+        # accelerate, sharding batches over processes, reads these two and sets the epoch of `sampler`.
+        self.drop_last = True
+        self.sampler = cast("Sampler[int]", self)
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch's order."""
@@ -159,8 +166,8 @@ class TaskSampler(BatchSampler):
 
 
 def collate(samples: list[Sample]) -> Batch:
-    """Stack samples, padded on the right with token 0 and weight 0."""
-    width = max(len(sample.ids) for sample in samples)
+    """Stack samples, padded on the right with token 0 and weight 0 to a multiple of `WIDTH_STEP`."""
+    width = -(-max(len(sample.ids) for sample in samples) // WIDTH_STEP) * WIDTH_STEP
     ids = np.zeros((len(samples), width), np.int64)
     weights = np.zeros((len(samples), width), np.float32)
     mask = np.zeros((len(samples), width), np.int64)

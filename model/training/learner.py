@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model.network.vla import LookTwiceVla
 from model.training.loss import response_loss
 
+_PLACES_STEP: Final = 256
+"""Predicted places are filled up to multiples of this, for the reason that `WIDTH_STEP` gives."""
+
 
 class ResponseLearner(nn.Module):
-    """Predicts the tokens of responses; its only output is the weighted token loss.
+    """Predicts the tokens of responses; outputs the weighted token loss and its parts.
 
     The loss is worked out inside ``forward``, so wrappers (FSDP, DDP) see every use of the weights.
     """
@@ -35,7 +39,7 @@ class ResponseLearner(nn.Module):
         code_shares: Tensor,
         patches: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """The loss of a batch from `collate`; weights and ids are shifted against each other here."""
+        """The `ResponseLoss` of a batch from `collate`, as a dictionary."""
         vla = self.vla
         vision_tokens = None
         if patches is not None:
@@ -50,8 +54,10 @@ class ResponseLearner(nn.Module):
             position_ids=vla.position_ids(input_ids, attention_mask),
             use_cache=False,
         ).last_hidden_state
+        labels, weights = input_ids[:, 1:].flatten(), loss_weights[:, 1:].flatten()
         # Logits only where a token is predicted that counts: a third of the positions.
-        counts = loss_weights[:, 1:] > 0
-        logits = vla.lm_head(hidden[:, :-1][counts])
-        labels, weights = input_ids[:, 1:][counts], loss_weights[:, 1:][counts]
-        return {"loss": response_loss(logits, labels, weights, self._first_code_id, code_shares)}
+        places = weights.nonzero()[:, 0]
+        filling = -len(places) % _PLACES_STEP
+        logits = vla.lm_head(hidden[:, :-1].flatten(0, 1)[F.pad(places, (0, filling))])
+        labels, weights = F.pad(labels[places], (0, filling)), F.pad(weights[places], (0, filling))
+        return response_loss(logits, labels, weights, self._first_code_id, code_shares)._asdict()

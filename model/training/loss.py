@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -11,11 +11,31 @@ from torch import Tensor
 STAGE_WEIGHTS: Final = (2.0, 1.5, 1.0, 0.7, 0.5, 0.3)
 """Of the codes in the order they are written: the first ones decide metres, the last ones centimetres."""
 
+LOSS_UNIT: Final = 60.0
+"""What six tokens of the paper's heaviest weight, 10, weigh together."""
+
+
+class ResponseLoss(NamedTuple):
+    """What is minimised, and two means without weights and gradients to follow the learning by.
+
+    Attributes:
+        loss: scalar.
+        code_loss: nats per trajectory code; a uniform guess has log(codebook size).
+        word_loss: nats per other token, forced ones included.
+    """
+
+    loss: Tensor
+    code_loss: Tensor
+    word_loss: Tensor
+
 
 def response_loss(
     logits: Tensor, labels: Tensor, weights: Tensor, first_code_id: int, code_shares: Tensor
-) -> Tensor:
-    """Cross-entropy, each token with its weight, divided by the sum of weights.
+) -> ResponseLoss:
+    """Cross-entropy, each token with its weight, summed over a response and averaged over responses.
+
+    Not averaged over tokens: most of a plan's tokens are forced and soon known by heart, and a code would
+    teach tens of times less behind a plan than without one. Divided by `LOSS_UNIT`, so losses are around 1.
 
     A code is not compared with one winner but with a distribution over its stage's codebook.
 
@@ -25,10 +45,10 @@ def response_loss(
         labels: int64 [tokens].
         weights: float [tokens]; 0 leaves a token out.
         first_code_id: the id of stage 0's code 0; codes of all stages lie behind it, stage by stage.
-        code_shares: float [responses, stages, size], each response's distributions, in order.
+        code_shares: float [responses >= 1, stages, size], each response's distributions, in order.
 
-    Returns:
-        A scalar; 0 when all weights are 0.
+    Raises:
+        RuntimeError: other numbers of codes among ``labels`` and in ``code_shares``.
     """
     log_shares = F.log_softmax(logits.float(), dim=-1)
     losses = -log_shares.gather(1, labels[:, None])[:, 0]
@@ -39,6 +59,9 @@ def response_loss(
     ids = (first_code_id + stage * size)[:, None] + torch.arange(size, device=labels.device)
     soft = -(code_shares.flatten(0, 1) * log_shares[is_code].gather(1, ids)).sum(dim=1)
     losses = losses.masked_scatter(is_code, soft)
+    parts = losses.detach()
+    is_word = ~is_code & (weights > 0)
+    code_loss, word_loss = (parts[which].sum() / which.sum().clamp_min(1) for which in (is_code, is_word))
     by_stage = torch.tensor(STAGE_WEIGHTS, device=labels.device)[stage]
     weights = weights.float().masked_scatter(is_code, weights[is_code].float() * by_stage)
-    return (losses * weights).sum() / weights.sum().clamp_min(torch.finfo(losses.dtype).tiny)
+    return ResponseLoss((losses * weights).sum() / (LOSS_UNIT * len(code_shares)), code_loss, word_loss)

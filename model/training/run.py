@@ -110,6 +110,8 @@ def run(
         use_cpu=settings.use_cpu,
     )
     trainer.train(resume_from_checkpoint=last_whole_state(target / "state"))
+    if not trainer.is_world_process_zero():
+        return
     loaded.model.train(False)
     save(
         target,
@@ -152,6 +154,7 @@ def _prepare(
     )
     has_route = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
     sampler = TaskSampler(has_route, recipe.batch_size, recipe.tasks, recipe.route_share, recipe.seed)
+    loaded.model.model.visual.requires_grad_(recipe.vision_rate > 0)
     first_code_id = loaded.vocabulary.code_ids(0).start
     return ResponseLearner(loaded.model, first_code_id, compiled=compiled), dataset, sampler, collate
 

@@ -71,6 +71,7 @@ class LearnerTrainer(Trainer):
             callbacks=[_Log(folder / LOG_FILE, validate, validate_every)],
         )
         self._recipe, self._sampler, self._dataset, self._learner = recipe, sampler, dataset, learner
+        self._parts: dict[str, list[torch.Tensor]] = {}
 
     def get_train_dataloader(self) -> Any:
         """Batches of equal tasks where there is a sampler for them."""
@@ -78,6 +79,21 @@ class LearnerTrainer(Trainer):
             return super().get_train_dataloader()
         loader = DataLoader(self._dataset, batch_sampler=self._sampler, collate_fn=self.data_collator)
         return self.accelerator.prepare(loader)
+
+    def compute_loss(self, model: nn.Module, inputs: Any, *args: Any, **kwargs: Any) -> Any:
+        """The learner's loss; the parts that it gives beside it are kept for the log."""
+        outputs = model(**inputs)
+        for name, value in outputs.items():
+            if name != "loss":
+                self._parts.setdefault(name, []).append(value.detach())
+        return outputs["loss"]
+
+    def log(self, logs: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        """Logs the parts' means since the last time along with the loss."""
+        if "loss" in logs:
+            logs |= {name: float(torch.stack(values).mean()) for name, values in self._parts.items()}
+            self._parts.clear()
+        super().log(logs, *args, **kwargs)
 
     def create_optimizer(self, *args: Any, **kwargs: Any) -> Any:
         """AdamW with the vision tower's own learning rate."""
@@ -121,10 +137,12 @@ class _Log(TrainerCallback):
     def on_log(
         self, args: Any, state: Any, control: Any, logs: dict[str, Any] | None = None, **_: Any
     ) -> None:
-        self._write({"step": state.global_step, **(logs or {})})
+        if state.is_world_process_zero:
+            self._write({"step": state.global_step, **(logs or {})})
 
     def on_step_end(self, args: Any, state: Any, control: Any, **_: Any) -> None:
-        if self._validate and (state.global_step % self._every == 0 or state.global_step == state.max_steps):
+        due = state.global_step % self._every == 0 or state.global_step == state.max_steps
+        if due and self._validate and state.is_world_process_zero:
             self._write({"step": state.global_step, **self._validate()})
 
     def _write(self, row: Mapping[str, Any]) -> None:

@@ -7,13 +7,13 @@ from itertools import pairwise
 
 from hypothesis import strategies as st
 
-from model.driving.plan import GROUPS, TICKS, WORDS, MetaAction, Plan
+from model.driving.plan import GROUPS, TICKS, WORDS, MetaAction, Plan, plan_from_bins
 from model.formats.pieces import CODES, MAX_SEGMENTS, Value, Values
 
 
 @st.composite
 def plans(draw: st.DrawFn) -> Plan:
-    """Plans with all three groups."""
+    """Plans with all three groups, equal neighbours joined."""
     tracks = {}
     for group in GROUPS:
         cuts = draw(st.sets(st.integers(1, TICKS - 1), max_size=MAX_SEGMENTS - 1))
@@ -21,7 +21,7 @@ def plans(draw: st.DrawFn) -> Plan:
         tracks[group] = tuple(
             MetaAction(start, end, draw(st.sampled_from(WORDS[group]))) for start, end in pairwise(edges)
         )
-    return Plan(**tracks)
+    return plan_from_bins(Plan(**tracks).bins())
 
 
 @st.composite

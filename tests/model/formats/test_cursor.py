@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -66,6 +68,22 @@ def test_a_given_plan_is_forced_and_tokenised_as_the_model_writes_it(plan: Plan,
     assert forced == [token for token in COMPILED.render(values) if token.section == "plan"]
     written = walk(COMPILED.start({"plan": plan}), seed)
     assert parse(CF_VLA, VOCABULARY.decode([token.id for token in written]))["plan"] == plan
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_no_word_follows_itself(seed: int) -> None:
+    written = [token.id for token in walk(COMPILED.start(), seed)]
+    plan = parse(CF_VLA, VOCABULARY.decode(written))["plan"]
+    assert isinstance(plan, Plan)
+    assert all(one.word != two.word for _, track in plan.tracks() for one, two in pairwise(track))
+
+
+def test_equal_neighbours_of_a_given_plan_are_joined() -> None:
+    split = parse_plan(
+        str(PLAN).replace("  - 0.0s-6.4s: Wait\n", "  - 0.0s-2.0s: Wait\n  - 2.0s-6.4s: Wait\n")
+    )
+    assert split != PLAN
+    assert COMPILED.start({"plan": split}).forced()[0] == COMPILED.start({"plan": PLAN}).forced()[0]
 
 
 def test_a_given_plan_may_lack_a_group() -> None:

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from model.training.loss import STAGE_WEIGHTS, response_loss
+from model.training.loss import LOSS_UNIT, STAGE_WEIGHTS, response_loss
 
 VOCABULARY, FIRST_CODE, SIZE = 30, 10, 3
 
@@ -13,7 +13,7 @@ VOCABULARY, FIRST_CODE, SIZE = 30, 10, 3
 def slow_loss(
     logits: torch.Tensor, labels: list[int], weights: list[float], shares: list[list[list[float]]]
 ) -> float:
-    total = weight_sum = 0.0
+    total = 0.0
     codes_seen = 0
     for row, label, weight in zip(logits.tolist(), labels, weights, strict=True):
         norm = math.log(sum(math.exp(value) for value in row))
@@ -29,8 +29,7 @@ def slow_loss(
         else:
             loss = norm - row[label]
         total += weight * loss
-        weight_sum += weight
-    return total / weight_sum
+    return total / LOSS_UNIT / len(shares)
 
 
 def test_loss_equals_the_obvious_sum() -> None:
@@ -40,14 +39,14 @@ def test_loss_equals_the_obvious_sum() -> None:
     weights = [float(1 + k % 4) for k in range(len(labels))]
     logits = torch.randn(len(labels), VOCABULARY)
     shares = torch.softmax(torch.randn(2, 6, SIZE), dim=-1)
-    loss = response_loss(logits, torch.tensor(labels), torch.tensor(weights), FIRST_CODE, shares)
+    loss = response_loss(logits, torch.tensor(labels), torch.tensor(weights), FIRST_CODE, shares).loss
     assert float(loss) == pytest.approx(slow_loss(logits, labels, weights, shares.tolist()), rel=1e-5)
 
 
 def test_tokens_of_weight_zero_teach_nothing() -> None:
     logits = torch.randn(2, VOCABULARY, requires_grad=True)
     labels, weights = torch.tensor([1, 2]), torch.tensor([0.0, 1.0])
-    loss = response_loss(logits, labels, weights, FIRST_CODE, torch.zeros(0, 6, SIZE))
+    loss = response_loss(logits, labels, weights, FIRST_CODE, torch.zeros(1, 0, SIZE)).loss
     (gradient,) = torch.autograd.grad(loss, logits)
     assert gradient[0].abs().max() == 0
     assert gradient[1].abs().max() > 0
@@ -55,5 +54,22 @@ def test_tokens_of_weight_zero_teach_nothing() -> None:
 
 def test_no_weight_at_all_is_a_loss_of_zero() -> None:
     logits = torch.randn(1, VOCABULARY)
-    loss = response_loss(logits, torch.tensor([1]), torch.tensor([0.0]), FIRST_CODE, torch.zeros(0, 6, SIZE))
+    loss = response_loss(
+        logits, torch.tensor([1]), torch.tensor([0.0]), FIRST_CODE, torch.zeros(1, 0, SIZE)
+    ).loss
     assert float(loss) == 0.0
+
+
+def test_forced_text_before_a_code_does_not_dilute_it() -> None:
+    """A code teaches the same with and without a plan's known-by-heart tokens before it."""
+    shares = torch.full((1, 6, SIZE), 1.0 / SIZE)
+    code_logits = torch.randn(1, VOCABULARY)
+    known = torch.full((50, VOCABULARY), -50.0)
+    known[:, 1] = 50.0
+    gradients = []
+    for before in (known[:0], known):
+        logits = torch.cat([before, code_logits]).requires_grad_()
+        labels = torch.tensor([1] * len(before) + [FIRST_CODE])
+        loss = response_loss(logits, labels, torch.full((len(labels),), 10.0), FIRST_CODE, shares[:, :1]).loss
+        gradients.append(torch.autograd.grad(loss, logits)[0][-1])
+    torch.testing.assert_close(gradients[0], gradients[1])

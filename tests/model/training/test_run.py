@@ -113,3 +113,19 @@ def test_a_killed_run_goes_on(untrained_checkpoint: Path, scenes: Path, tmp_path
     # The second run's own steps are fewer than all: it did not begin anew.
     assert last["step"] == 12
     assert last["train_samples_per_second"] > 0
+
+
+def test_two_processes_share_the_work(untrained_checkpoint: Path, scenes: Path, tmp_path: Path) -> None:
+    """Batches are dealt out, gradients joined, and one process alone writes log and checkpoint."""
+    script = tmp_path / "train.py"
+    script.write_text(_SCRIPT.replace('"language"], steps=12', '"meta-act"], steps=6'))
+    target = tmp_path / "target"
+    subprocess.run(
+        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+        + [str(path) for path in (scenes, untrained_checkpoint, target, tmp_path / "c")],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    rows = [json.loads(line) for line in (target / "log.jsonl").read_text().splitlines()]
+    assert sum("train_runtime" in row for row in rows) == 1
+    assert load(target).card.details["stages"][0]["steps"] == 6
