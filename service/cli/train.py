@@ -26,6 +26,9 @@ def train(
     steps: Annotated[int | None, typer.Option(help="Instead of the recipe's.", min=1)] = None,
     batch_size: Annotated[int | None, typer.Option(help="Instead of the recipe's.", min=1)] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Instead of the recipe's.")] = None,
+    vision_rate: Annotated[
+        float | None, typer.Option(help="The vision tower's, relative; 0 leaves it as it is.", min=0)
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of order and initialisation.")] = 0,
     threads: Annotated[int | None, typer.Option(help="CPU threads.", min=1)] = None,
     bf16: Annotated[bool, typer.Option(help="Mixed precision.")] = True,
@@ -61,6 +64,7 @@ def train(
             steps=steps or chosen.steps,
             batch_size=batch_size or chosen.batch_size,
             learning_rate=learning_rate or chosen.learning_rate,
+            vision_rate=chosen.vision_rate if vision_rate is None else vision_rate,
             seed=seed,
         )
         held_out = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import subprocess
 import sys
@@ -18,8 +19,11 @@ from clients.planner import Patience, PlannerClient
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.scene import split_of_seed
 from model.driving.scene_store import read_scenes
+from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
 from model.engines.torch.engine import TorchEngine
 from model.evaluation.open_loop import evaluate_baselines, evaluate_trajectories
+from model.formats.cf_vla import CF_VLA
+from model.formats.text import parse
 from service.settings import Settings
 from tests.service.serving import Served, serve
 
@@ -62,6 +66,39 @@ def test_it_plans_better_than_keeping_on(planner: PlannerClient) -> None:
         assert all(draw.plan is not None for draw in answer.draws)
         errors.append(evaluate_trajectories(labelled, draws).min_ade_m)
     assert np.mean(errors) < 0.8 * best
+
+
+def test_a_thousand_hot_draws_all_parse() -> None:
+    """Read back strictly, from text alone, at a temperature that makes a model of this size babble."""
+    hot = [Controls(n=40, temperature=1.5, seed=seed) for seed in (1, 2)]
+    hot.append(Controls(n=4, temperature=1.5, thinking="always"))
+    requests = [
+        PlanRequest(f"{labelled.scene.scene_id} {index}", labelled.scene, controls=controls)
+        for labelled in BUNDLED
+        for index, controls in enumerate(hot)
+    ]
+
+    async def write() -> list[Draw]:
+        engine = TorchEngine(CHECKPOINT)
+        await engine.start()
+        try:
+            events = [event for request in requests async for event in engine.submit(request)]
+        finally:
+            await engine.stop()
+        return [event.draw for event in events if isinstance(event, DrawFinished)]
+
+    draws = asyncio.run(write())
+    assert len(draws) == 12 * 84
+    for draw in draws:
+        values = parse(CF_VLA, draw.text)
+        assert (values["plan"], values["branch"], values["trajectory"]) == (
+            draw.plan,
+            draw.branch,
+            draw.codes,
+        )
+        assert values.get("revised_plan") == draw.revised_plan
+        assert np.isfinite(draw.trajectory).all()
+    assert {draw.branch for draw in draws} == {"Action:", "Thinking:"}
 
 
 def test_the_same_seed_gives_the_same_answer(planner: PlannerClient) -> None:
