@@ -119,6 +119,7 @@ class TaskSampler(BatchSampler):
         tasks: share of the examples for each task.
         route_share: share of the examples, among those that have one, that are given their route.
         seed: of the order; every epoch has another one.
+        processes: so many batches in a row are alike, as those who share the work wait for the slowest.
     """
 
     def __init__(
@@ -128,7 +129,9 @@ class TaskSampler(BatchSampler):
         tasks: Mapping[Task, float],
         route_share: float,
         seed: int,
+        processes: int = 1,
     ) -> None:
+        self._processes = processes
         self._has_route, self.batch_size, self._tasks = has_route, batch_size, tasks
         self._route_share, self._seed, self._epoch = route_share, seed, 0
         # accelerate, sharding batches over processes, reads these two and sets the epoch of `sampler`.
@@ -155,14 +158,14 @@ class TaskSampler(BatchSampler):
             key = (int(drawn[index]), bool(given[index]))
             bucket = buckets.setdefault(key, [])
             bucket.append(Item(int(index), names[key[0]], key[1]))
-            if len(bucket) == self.batch_size:
-                batches.append(buckets.pop(key))
+            if len(bucket) == self.batch_size * self._processes:
+                batches += self._split(buckets.pop(key))
         for bucket in buckets.values():
             leftover += bucket
-        batches += [
-            leftover[start : start + self.batch_size] for start in range(0, len(leftover), self.batch_size)
-        ]
-        yield from batches[: len(self)]
+        yield from (batches + self._split(leftover))[: len(self)]
+
+    def _split(self, items: list[Item]) -> list[list[Item]]:
+        return [items[start : start + self.batch_size] for start in range(0, len(items), self.batch_size)]
 
 
 def collate(samples: list[Sample]) -> Batch:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
@@ -153,7 +154,14 @@ def _prepare(
         seed=recipe.seed,
     )
     has_route = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
-    sampler = TaskSampler(has_route, recipe.batch_size, recipe.tasks, recipe.route_share, recipe.seed)
+    sampler = TaskSampler(
+        has_route,
+        recipe.batch_size,
+        recipe.tasks,
+        recipe.route_share,
+        recipe.seed,
+        processes=int(os.environ.get("WORLD_SIZE", 1)),
+    )
     loaded.model.model.visual.requires_grad_(recipe.vision_rate > 0)
     first_code_id = loaded.vocabulary.code_ids(0).start
     return ResponseLearner(loaded.model, first_code_id, compiled=compiled), dataset, sampler, collate

@@ -12,7 +12,7 @@ from model.network.checkpoint import Loaded, load
 from model.training.batches import Item, ResponseDataset, TaskSampler, collate
 from model.training.examples import Examples
 from model.training.learner import ResponseLearner
-from model.training.targets import PAPER_WEIGHTS
+from model.training.targets import PAPER_WEIGHTS, Task
 from tests.model.training.scenes import training_scene
 
 
@@ -51,6 +51,15 @@ def test_epochs_differ_and_repeat_by_seed() -> None:
 
     assert epoch(0) == epoch(0)
     assert epoch(0) != epoch(1)
+
+
+def test_processes_get_batches_of_one_kind_at_a_time() -> None:
+    tasks: dict[Task, float] = {"traj_only": 0.5, "cf_vla": 0.5}
+    batches = list(TaskSampler(np.ones(4000, np.bool_), 16, tasks, 0.5, seed=0, processes=2))
+    kinds = [{(item.task, item.route) for item in batch} for batch in batches]
+    alike = [one == two for one, two in zip(kinds[::2], kinds[1::2], strict=True)]
+    assert len(batches) == 250
+    assert alike.count(False) <= 4
 
 
 def test_only_the_response_weighs(loaded: Loaded) -> None:
