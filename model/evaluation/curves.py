@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 
 def training_curves(log: Path, picture: Path) -> None:
-    """Plot a log of JSON rows ``{"step": …, "loss": …}`` or ``{"step": …, "…min_ade_m": …}`` as a PNG.
+    """Plot the last stage of a log of JSON rows ``{"stage": …, "step": …, "loss": …}`` as a PNG.
 
     Numbers whose name contains ``loss`` share the upper axes, those with ``ade`` the lower ones; everything
     else is left out.
@@ -21,6 +21,7 @@ def training_curves(log: Path, picture: Path) -> None:
         ValueError: a line that is no JSON object, or a log without any such number.
     """
     rows = [_row(line, number) for number, line in enumerate(log.read_text().splitlines(), 1) if line.strip()]
+    rows = [row for row in rows if row.get("stage") == rows[-1].get("stage")]
     names = sorted({name for row in rows for name, value in row.items() if isinstance(value, (int, float))})
     panels = [
         (title, [name for name in names if part in name.lower()])

@@ -72,9 +72,10 @@ def run(
     validation: Sequence[LabelledScene] = (),
     vision_source: Path | None = None,
 ) -> None:
-    """Train ``source`` by a recipe and write the outcome to ``target``.
+    """Train ``source`` by a recipe and write the outcome to ``target``, weights in bfloat16.
 
     State is kept in ``target/state`` while the run lasts: started again after a kill, it goes on from there.
+    The log begins with those of the checkpoints it came from, so it tells the whole history.
 
     Args:
         recipe: what to do.
@@ -87,8 +88,11 @@ def run(
             while another process trains the language.
     """
     loaded = load(source)
+    stages = list(loaded.card.details.get("stages", []))
     if vision_source is not None:
-        loaded.model.model.visual.load_state_dict(load(vision_source).model.model.visual.state_dict())
+        vision = load(vision_source)
+        loaded.model.model.visual.load_state_dict(vision.model.model.visual.state_dict())
+        stages += [stage for stage in vision.card.details.get("stages", []) if stage not in stages]
     loaded.model.train()
     loaded.model.set_attn_implementation(MATMUL_ATTENTION)
     torch.manual_seed(recipe.seed)
@@ -100,6 +104,7 @@ def run(
     trainer = LearnerTrainer(
         learner,
         recipe,
+        f"{len(stages) + 1} {recipe.name}",
         dataset,
         collator,
         target,
@@ -110,6 +115,8 @@ def run(
         bf16=settings.bf16,
         use_cpu=settings.use_cpu,
     )
+    if trainer.is_world_process_zero():
+        _inherit_log(target / LOG_FILE, [source, *([vision_source] if vision_source else [])])
     trainer.train(resume_from_checkpoint=last_whole_state(target / "state"))
     if not trainer.is_world_process_zero():
         return
@@ -119,7 +126,8 @@ def run(
         loaded.model,
         loaded.vocabulary,
         loaded.codec,
-        details=_details(recipe, loaded, examples),
+        dtype=torch.bfloat16,
+        details={"stages": [*stages, _about(recipe, examples)]},
     )
 
 
@@ -167,9 +175,18 @@ def _prepare(
     return ResponseLearner(loaded.model, first_code_id, compiled=compiled), dataset, sampler, collate
 
 
-def _details(recipe: Recipe, loaded: Loaded, examples: Examples) -> Mapping[str, Any]:
-    stages = list(loaded.card.details.get("stages", []))
+def _inherit_log(log: Path, sources: Sequence[Path]) -> None:
+    """Begin a log that is not there yet with the rows of its sources, each row once."""
+    if log.exists():
+        return
+    rows: dict[str, None] = {}
+    for source in sources:
+        if (source / LOG_FILE).exists():
+            rows |= dict.fromkeys((source / LOG_FILE).read_text().splitlines(keepends=True))
+    log.write_text("".join(rows))
+
+
+def _about(recipe: Recipe, examples: Examples) -> Mapping[str, Any]:
     about = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     about |= {"tasks": dict(recipe.tasks), "weights": dict(recipe.weights)}
-    about |= {"examples": len(examples), "episodes": len(np.unique(examples.episode)), "log": LOG_FILE}
-    return {"stages": [*stages, about]}
+    return about | {"examples": len(examples), "episodes": len(np.unique(examples.episode))}

@@ -28,6 +28,7 @@ class LearnerTrainer(Trainer):
         self,
         learner: nn.Module,
         recipe: Recipe,
+        stage: str,
         dataset: Dataset[Any],
         collate: Callable[[list[Any]], dict[str, torch.Tensor]],
         folder: Path,
@@ -68,7 +69,7 @@ class LearnerTrainer(Trainer):
             args=arguments,
             train_dataset=dataset,
             data_collator=collate,
-            callbacks=[_Log(folder / LOG_FILE, validate, validate_every)],
+            callbacks=[_Log(folder / LOG_FILE, stage, validate, validate_every)],
         )
         self._recipe, self._sampler, self._dataset, self._learner = recipe, sampler, dataset, learner
         self._parts: dict[str, list[torch.Tensor]] = {}
@@ -131,8 +132,8 @@ class LearnerTrainer(Trainer):
 class _Log(TrainerCallback):
     """Appends what the trainer logs, and validation figures, to a file of JSON lines."""
 
-    def __init__(self, path: Path, validate: Validate | None, every: int) -> None:
-        self._path, self._validate, self._every = path, validate, every
+    def __init__(self, path: Path, stage: str, validate: Validate | None, every: int) -> None:
+        self._path, self._stage, self._validate, self._every = path, stage, validate, every
 
     def on_log(
         self, args: Any, state: Any, control: Any, logs: dict[str, Any] | None = None, **_: Any
@@ -147,4 +148,4 @@ class _Log(TrainerCallback):
 
     def _write(self, row: Mapping[str, Any]) -> None:
         with self._path.open("a") as file:
-            file.write(json.dumps(row) + "\n")
+            file.write(json.dumps({"stage": self._stage, **row}) + "\n")

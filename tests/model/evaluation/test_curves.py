@@ -28,6 +28,14 @@ def test_losses_and_errors_share_a_picture(tmp_path: Path) -> None:
     assert height(tmp_path / "both.png") == 2 * height(tmp_path / "one.png")
 
 
+def test_only_the_last_stage_is_drawn(tmp_path: Path) -> None:
+    last = [{"stage": "2 b", "step": step, "loss": 1 / step} for step in (1, 2)]
+    before = [{"stage": "1 a", "step": step, "min_ade_m": 3.0} for step in (1, 2)]
+    training_curves(log_of(tmp_path / "all.jsonl", [*before, *last]), tmp_path / "all.png")
+    training_curves(log_of(tmp_path / "last.jsonl", [*last]), tmp_path / "last.png")
+    assert (tmp_path / "all.png").read_bytes() == (tmp_path / "last.png").read_bytes()
+
+
 def test_a_log_without_figures_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="neither a loss nor a displacement error"):
         training_curves(log_of(tmp_path / "log.jsonl", [{"step": 1, "note": "x"}]), tmp_path / "x.png")

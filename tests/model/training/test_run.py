@@ -34,9 +34,9 @@ def test_the_stages_lead_to_a_checkpoint_that_tells_its_history(
     untrained_checkpoint: Path, scenes: Path, tmp_path: Path
 ) -> None:
     settings = RunSettings(tmp_path / "cache", validate_every=2, save_every=2, draws=1, bf16=False)
-    before = load(untrained_checkpoint).model.state_dict()
+    before = load(untrained_checkpoint).model.bfloat16().state_dict()
     run(short("ground"), scenes, untrained_checkpoint, tmp_path / "ground", settings)
-    grounded = load(tmp_path / "ground").model.state_dict()
+    grounded = load(tmp_path / "ground", dtype=torch.bfloat16).model.state_dict()
     moved = {name for name in before if not torch.equal(before[name], grounded[name])}
     assert moved
     assert all(name.startswith("model.visual.") for name in moved)
@@ -46,6 +46,7 @@ def test_the_stages_lead_to_a_checkpoint_that_tells_its_history(
     assert [stage["name"] for stage in done.card.details["stages"]] == ["ground", "meta-act"]
     assert done.card.revision != load(untrained_checkpoint).card.revision
     rows = [json.loads(line) for line in (tmp_path / "plan" / "log.jsonl").read_text().splitlines()]
+    assert {row["stage"] for row in rows} == {"1 ground", "2 meta-act"}
     validated = [row for row in rows if "min_ade_m/cf_vla+route" in row]
     assert [row["step"] for row in validated] == [2, 4]
     assert all(0 < row["plan_iou/cf_vla"] < 1 for row in validated)
