@@ -118,6 +118,13 @@ def test_broken_json_is_a_problem_and_disturbs_nobody(
     assert planner.plan(BUNDLED[0].scene, wire.Controls(n=1)).draws
 
 
+def test_the_readmes_request_is_answered(served: Served[TorchEngine]) -> None:
+    body = (Path(__file__).parents[2] / "docs" / "examples" / "plan-request.json").read_bytes()
+    answer = served.http.post("/v1/plan", content=body, headers={"content-type": "application/json"})
+    assert answer.status_code == 200
+    assert len(answer.json()["draws"]) == 6
+
+
 def test_metrics_count_tokens_by_section(served: Served[TorchEngine], planner: PlannerClient) -> None:
     name = "looktwice_section_tokens_sum"
     before = served.metric(name, section="trajectory")
