@@ -47,15 +47,17 @@ def draw_of(
 class FakeEngine:
     """Draws constant-velocity trajectories, each a metre farther to the left; answers out of order.
 
-    It notes requests and how many were under way at once, and fails for scenes named in ``broken``.
+    It notes requests and how many were under way at once, and fails for scenes named in ``broken``. The
+    first answer comes when ``company`` requests are under way.
     """
 
-    def __init__(self, broken: frozenset[str] = frozenset(), missing: int = 0) -> None:
+    def __init__(self, broken: frozenset[str] = frozenset(), missing: int = 0, company: int = 1) -> None:
         self.requests: list[PlanRequest] = []
         self.under_way = 0
         self.most_under_way = 0
         self._broken = broken
         self._missing = missing
+        self._company = company
 
     @property
     def card(self) -> ModelCard:
@@ -75,6 +77,9 @@ class FakeEngine:
         self.under_way += 1
         self.most_under_way = max(self.most_under_way, self.under_way)
         try:
+            async with asyncio.timeout(30):
+                while self.most_under_way < self._company:
+                    await asyncio.sleep(0.001)
             await asyncio.sleep(0.002 if len(self.requests) % 2 else 0)
             if request.scene.scene_id in self._broken:
                 raise EngineError("out of memory")

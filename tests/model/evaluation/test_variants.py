@@ -40,7 +40,7 @@ def test_results_come_in_the_scenes_order_and_progress_as_they_finish() -> None:
 
 
 def test_scenes_are_read_no_faster_than_they_are_planned_for() -> None:
-    engine = FakeEngine()
+    engine = FakeEngine(company=3)
     ahead: list[int] = []
 
     def reading() -> Iterator[LabelledScene]:
