@@ -35,7 +35,8 @@ def response_loss(
     """Cross-entropy, each token with its weight, summed over a response and averaged over responses.
 
     Not averaged over tokens: most of a plan's tokens are forced and soon known by heart, and a code would
-    teach tens of times less behind a plan than without one. Divided by `LOSS_UNIT`, so losses are around 1.
+    teach tens of times less behind a plan than without one. Divided by `LOSS_UNIT`: a trajectory of weight 10
+    adds the mean of its codes' losses, weighted by stage.
 
     A code is not compared with one winner but with a distribution over its stage's codebook.
 

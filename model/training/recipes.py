@@ -51,8 +51,8 @@ class Recipe:
 NANO_WEIGHTS: Final[SectionWeights] = MappingProxyType(
     {"plan": 3.0, "branch": 3.0, "thinking": 3.0, "revised_plan": 3.0, "trajectory": 10.0}
 )
-"""A model from scratch learns trajectories too, which the paper's brings along. Half of a plan's loss is the
-tenths of its times, which nobody can know: with the paper's weights their noise drowns what codes teach."""
+"""A model from scratch learns trajectories too, which the paper's brings along. The tenths of a plan's times
+are next to unknowable: with the paper's weights their noise drowns what codes teach."""
 
 NANO: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe
