@@ -50,6 +50,8 @@ class Sample:
     history: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
     route: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
     code_shares: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+    facts: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+    future: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
 
 class ResponseDataset(Dataset[Sample]):
@@ -69,6 +71,7 @@ class ResponseDataset(Dataset[Sample]):
         self._examples, self._inputs = examples, inputs
         self._vectors = codec.vectors(examples.history, examples.future)
         self._soft = SoftCodes(codec, self._vectors)
+        self._size = np.float32(np.sqrt((self._vectors**2).sum(axis=1).mean()))
         self._random = np.random.default_rng(seed)
         self._weights, self._pictures, self._vocabulary = weights, pictures, vocabulary
         self._formats = {name: CompiledFormat(FORMATS[name], vocabulary) for name in ("cf_vla", "traj_only")}
@@ -90,6 +93,8 @@ class ResponseDataset(Dataset[Sample]):
             history=examples.history[index],
             route=np.nan_to_num(examples.route[index]),
             code_shares=soft.shares,
+            facts=examples.facts[index],
+            future=self._vectors[index] / self._size,
         )
 
     def _prompt(self, item: Item) -> list[int]:
@@ -185,6 +190,8 @@ def collate(samples: list[Sample]) -> Batch:
         "history": torch.from_numpy(np.stack([sample.history for sample in samples])),
         "route": torch.from_numpy(np.stack([sample.route for sample in samples])),
         "code_shares": torch.from_numpy(np.stack([sample.code_shares for sample in samples])),
+        "facts": torch.from_numpy(np.stack([sample.facts for sample in samples])),
+        "futures": torch.from_numpy(np.stack([sample.future for sample in samples])),
     }
     if samples[0].patches is not None:
         batch["patches"] = torch.from_numpy(np.concatenate([sample.patches for sample in samples]))

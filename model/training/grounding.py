@@ -23,12 +23,12 @@ from model.network.patches import patchify, resize
 from model.network.vla import LookTwiceVla
 from model.training.examples import Examples
 from model.training.facts import FACTS
+from model.training.probe import fact_loss
 
 _CLASSES: Final = len(SEMANTIC_CLASSES)
 _CLASS_WEIGHTS: Final = (0.3, 0.5, 0.5, 3.0, 6.0, 4.0)
 """Sky and road fill most pictures; what matters is small."""
 _OBJECT_RANGE_WEIGHT: Final = 5.0
-_PRESENT: Final = tuple(index for index, name in enumerate(FACTS) if name.endswith("present"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,27 +117,14 @@ class GroundingLearner(nn.Module):
         weight = torch.where(labels >= 3, _OBJECT_RANGE_WEIGHT, 1.0)[shown]
         error = (dense[..., _CLASSES] - range_log).abs()[shown]
         range_loss = (error * weight).sum() / weight.sum().clamp_min(1)
-        fact_loss = self._fact_loss(self.squeeze(tokens).reshape(batch, -1), facts)
+        of_facts = fact_loss(self.fact_head(self.squeeze(tokens).reshape(batch, -1)), facts)
         with torch.no_grad():
             objects = labels >= 3
             hit = (dense[..., :_CLASSES].argmax(-1) == labels)[objects].float().mean()
         return {
-            "loss": class_loss + range_loss + fact_loss,
+            "loss": class_loss + range_loss + of_facts,
             "class_loss": class_loss.detach(),
             "range_error_log": error.mean().detach(),
-            "fact_loss": fact_loss.detach(),
+            "fact_loss": of_facts.detach(),
             "object_recall": hit.nan_to_num(0.0),
         }
-
-    def _fact_loss(self, features: Tensor, facts: Tensor) -> Tensor:
-        predicted = self.fact_head(features).float()
-        known = torch.isfinite(facts)
-        targets = torch.where(known, facts, 0.0)
-        present = torch.zeros_like(known)
-        present[:, _PRESENT] = True
-        losses = torch.where(
-            present,
-            F.binary_cross_entropy_with_logits(predicted, targets.clamp(0, 1), reduction="none"),
-            F.smooth_l1_loss(predicted, targets, reduction="none", beta=0.1),
-        )
-        return (losses * known).sum() / known.sum().clamp_min(1) * 4

@@ -31,6 +31,7 @@ class Recipe:
         steps, batch_size: how long.
         learning_rate, warmup_steps: cosine decay to zero behind a linear warm-up.
         vision_rate: the tower's learning rate, relative to the rest; 0 leaves the tower as it is.
+        probe: whether a `SceneProbe` is trained along.
         seed: of order and initialisation.
     """
 
@@ -45,6 +46,7 @@ class Recipe:
     route_share: float = 0.5
     weights: SectionWeights = field(default_factory=lambda: PAPER_WEIGHTS)
     vision_rate: float = 1.0
+    probe: bool = False
     seed: int = 0
 
 
@@ -78,6 +80,7 @@ NANO: Final[Mapping[str, Recipe]] = {
             warmup_steps=200,
             tasks={"traj_only": 1.0},
             weights=NANO_WEIGHTS,
+            probe=True,
         ),
         Recipe(
             "meta-act",
@@ -88,6 +91,7 @@ NANO: Final[Mapping[str, Recipe]] = {
             warmup_steps=200,
             tasks={"traj_only": 0.25, "cf_vla": 0.75},
             weights=NANO_WEIGHTS,
+            probe=True,
         ),
     )
 }

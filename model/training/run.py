@@ -26,6 +26,7 @@ from model.training.batches import ResponseDataset, TaskSampler, collate
 from model.training.examples import Examples, load_examples
 from model.training.grounding import GroundingDataset, GroundingLearner, collate_grounding
 from model.training.learner import ResponseLearner
+from model.training.probe import SceneProbe
 from model.training.recipes import Recipe
 from model.training.trainer import LOG_FILE, LearnerTrainer, Validate
 from model.training.validation import open_loop
@@ -150,8 +151,8 @@ def _prepare(
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
     if recipe.goal == "ground":
         shape = examples.dense_classes.shape[2:4]
-        learner = GroundingLearner(loaded.model, (shape[0], shape[1]))
-        return learner, GroundingDataset(examples, loaded.inputs), None, collate_grounding
+        grounding = GroundingLearner(loaded.model, (shape[0], shape[1]))
+        return grounding, GroundingDataset(examples, loaded.inputs), None, collate_grounding
     dataset = ResponseDataset(
         examples,
         loaded.codec,
@@ -171,8 +172,11 @@ def _prepare(
         processes=int(os.environ.get("WORLD_SIZE", 1)),
     )
     loaded.model.model.visual.requires_grad_(recipe.vision_rate > 0)
+    text: Any = loaded.model.config.text_config
+    probe = SceneProbe(text.hidden_size, loaded.codec.books.shape[2]) if recipe.probe else None
     first_code_id = loaded.vocabulary.code_ids(0).start
-    return ResponseLearner(loaded.model, first_code_id, compiled=compiled), dataset, sampler, collate
+    learner = ResponseLearner(loaded.model, first_code_id, probe=probe, compiled=compiled)
+    return learner, dataset, sampler, collate
 
 
 def _inherit_log(log: Path, sources: Sequence[Path]) -> None:
