@@ -42,6 +42,8 @@ class Controls:
         seed: random numbers depend on (seed, draw, position) only, so a draw is the same alone and in
             a batch.
         deadline_ms: milliseconds from submission by which the answer must be there; None for no deadline.
+            Thinking that would not fit is not begun, or cut; while it lasts, a direct trajectory is made
+            ready beside it and is the answer if the reflection does not end in time.
     """
 
     thinking: Thinking = "adaptive"
@@ -122,7 +124,17 @@ class DrawFinished:
     draw: Draw
 
 
-Event = SectionFinished | DrawFinished
+@dataclass(frozen=True)
+class DraftFinished:
+    """Under a deadline: a direct trajectory, kept in case the reflection of its draw does not end in time.
+
+    A `DrawFinished` follows for the same index, with the reflection or, at the deadline, with this draft.
+    """
+
+    draw: Draw
+
+
+Event = SectionFinished | DraftFinished | DrawFinished
 
 
 @dataclass(frozen=True)

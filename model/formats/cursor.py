@@ -12,9 +12,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.plan import Plan
+from model.driving.plan import TICKS, WORDS, Group, Plan, format_tick
 from model.formats.given import with_given
 from model.formats.pieces import (
+    MAX_SEGMENTS,
     Choice,
     Codes,
     Format,
@@ -106,6 +107,7 @@ class CompiledFormat:
         self._expanded: dict[PlanTracks | Track | TrackWord, Sequence] = {}
         self._codes = tuple(np.arange(ids.start, ids.stop) for ids in map(vocabulary.code_ids, range(6)))
         self._free_ids: dict[tuple[str, bool], npt.NDArray[np.int64]] = {}
+        self._sentence_ends: frozenset[int] | None = None
 
     def start(self, given: Values | None = None) -> Cursor:
         """A cursor at the beginning; plans of the sections in ``given`` are forced, equal neighbours joined.
@@ -137,6 +139,39 @@ class CompiledFormat:
                 tokens.append(Token(token, cursor.section))
                 cursor = cursor.advance(token)
 
+    def longest(self) -> int:
+        """A number of tokens that no response exceeds."""
+        return self._longest(self.format.body)
+
+    def _longest(self, piece: Piece) -> int:
+        match piece:
+            case Literal(text):
+                return len(self.literal(text))
+            case Sequence(parts):
+                return sum(map(self._longest, parts))
+            case Section(_, body):
+                return self._longest(body)
+            case Choice(options):
+                return max(len(self.literal(option.text)) + self._longest(option.then) for option in options)
+            case FreeText(stop, max_tokens):
+                return max_tokens + len(self.literal(stop))
+            case Codes(count):
+                return count
+            case PlanTracks(groups):
+                return sum(
+                    len(self.literal(f"- {group}\n")) + MAX_SEGMENTS * self._longest_line(group)
+                    for group in groups
+                )
+            case Track() | TrackWord():
+                raise TypeError("a track is measured as part of its plan")
+
+    def _longest_line(self, group: Group) -> int:
+        """Tokens of the longest meta-action of a group, all its pieces as `Track` writes them."""
+        starts = max(len(self.literal(f"  - {format_tick(tick)}s-")) for tick in range(TICKS))
+        ends = max(len(self.literal(format_tick(tick))) for tick in range(1, TICKS + 1))
+        words = max(len(self.literal(f" {word}")) for word in WORDS[group])
+        return starts + ends + len(self.literal("s:")) + words + len(self.literal("\n"))
+
     def literal(self, text: str) -> tuple[int, ...]:
         """Token ids of a literal."""
         if text not in self._literals:
@@ -155,6 +190,12 @@ class CompiledFormat:
             mask[self.literal(stop)[0]] = may_stop
             self._free_ids[key] = np.flatnonzero(mask)
         return self._free_ids[key]
+
+    def sentence_ends(self) -> frozenset[int]:
+        """Ids of the tokens that end a sentence."""
+        if self._sentence_ends is None:
+            self._sentence_ends = frozenset(id for mark in ".!?" for id in self.literal(mark)[-1:])
+        return self._sentence_ends
 
     def codes(self, stage: int) -> npt.NDArray[np.int64]:
         """Ids of one stage's codes."""

@@ -82,21 +82,29 @@ class InputBuilder:
         route = scene.route if self.settings.with_route else None
         return ModelInputs(
             prompt=self.prompt(format, route=route is not None),
-            patches=patchify(self.frames(scene), self.settings),
+            patches=np.concatenate([self.patches(pictures) for pictures in self.slices(scene)]),
             video_grid_thw=self.video_grid_thw,
             history=scene.history,
             route=route,
         )
 
-    def frames(self, scene: Scene) -> npt.NDArray[np.uint8]:
-        """The pictures of the checkpoint's cameras, uint8 [cameras x 4, h, w, 3], camera by camera."""
-        return np.stack(
-            [
-                resize(decode_image(image), self.settings)
-                for camera in self.settings.cameras
-                for image in scene.clip(camera).images
-            ]
-        )
+    def slices(self, scene: Scene) -> list[tuple[bytes, ...]]:
+        """The encoded pictures of each time slice, camera by camera; the tower sees slices one by one.
+
+        Raises:
+            SceneError: a camera is missing.
+        """
+        depth = self.settings.temporal_patch_size
+        return [
+            images[start : start + depth]
+            for images in (scene.clip(camera).images for camera in self.settings.cameras)
+            for start in range(0, len(images), depth)
+        ]
+
+    def patches(self, pictures: tuple[bytes, ...]) -> npt.NDArray[np.uint8]:
+        """The patches of one slice, uint8 [p, 1176]; raises `ImageError` for what cannot be decoded."""
+        frames = np.stack([resize(decode_image(picture), self.settings) for picture in pictures])
+        return patchify(frames, self.settings)
 
     def prompt(self, format: str, *, route: bool) -> Prompt:
         """The prompt of a format; raises `PromptError` for an unknown one."""

@@ -117,15 +117,12 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
                 embeddings = torch.where(here, encoder(values)[:, None].to(embeddings.dtype), embeddings)
         return embeddings
 
-    def encode_prompt_embeddings(
-        self, inputs: ModelInputs, vision_tokens: Tensor | None = None
-    ) -> PromptEmbeddings:
-        """One scene's prompt, ready to be prefilled; ``vision_tokens`` from a cache save the tower."""
+    def encode_prompt_embeddings(self, inputs: ModelInputs) -> PromptEmbeddings:
+        """One scene's prompt, ready to be prefilled."""
         device = self.device
-        if vision_tokens is None:
-            vision_tokens = self.vision(
-                torch.from_numpy(inputs.patches).to(device), torch.from_numpy(inputs.video_grid_thw)
-            )
+        vision_tokens = self.vision(
+            torch.from_numpy(inputs.patches).to(device), torch.from_numpy(inputs.video_grid_thw)
+        )
         embeddings = self.embed(
             torch.from_numpy(inputs.prompt.ids).to(device)[None],
             vision_tokens,

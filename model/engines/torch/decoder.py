@@ -1,17 +1,32 @@
-"""The decoding loop without threads: admit, run one pass over all rows, apply what was sampled."""
+"""The decoding loop without threads: schedule, run one pass, apply what was chosen."""
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 
-from model.engines.engine import DrawFinished, Event, PlanRequest, RequestError
-from model.engines.torch.draws import Request, RunningDraw
-from model.engines.torch.runner import Runner
+import numpy as np
+import numpy.typing as npt
+
+from model.engines.engine import (
+    DraftFinished,
+    Draw,
+    DrawFinished,
+    EngineError,
+    Event,
+    PlanRequest,
+    RequestError,
+)
+from model.engines.torch.pace import Pace
+from model.engines.torch.rows import Request, Row
+from model.engines.torch.runner import Feed, Prompt, Runner
+from model.engines.torch.schedule import Schedule, urgency
 from model.formats.cf_vla import FORMATS
-from model.formats.cursor import CompiledFormat
-from model.formats.pieces import FormatError, Values
+from model.formats.pieces import ACTION, BRANCH, THINKING, FormatError, Values
 from model.formats.text import parse
+
+Logits = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -25,123 +40,376 @@ StepEvent = tuple[str, Event | Failed]
 """A request id and what happened to it."""
 
 
-class Decoder:
-    """Continuous batching over a runner's rows; every draw of every request is one row.
+@dataclass(frozen=True)
+class Shortcuts:
+    """What makes decoding fast and changes no response. All can be switched off, to be compared with.
 
-    Args:
-        runner: network and KV rows.
-        jump: feed forced runs in one pass; off, every token takes a pass of its own (the plain decoder
-            that everything faster is compared with).
+    Attributes:
+        jump: a forced run goes through the network in one pass with the token before it.
+        shared_rows: draws that have written the same tokens are one row.
+        shared_prompts: a scene's prompt is worked out and held once for all its draws.
+        speculate: a revised plan is fed as far as it may repeat the first one, and checked.
     """
 
-    def __init__(self, runner: Runner, *, jump: bool = True) -> None:
-        self._runner = runner
-        self._jump = jump
-        self._waiting: deque[Request] = deque()
-        self._running: list[RunningDraw] = []
-        vocabulary = runner.loaded.vocabulary
-        self._formats = {
-            name: CompiledFormat(FORMATS[name], vocabulary) for name in runner.loaded.card.formats
-        }
+    jump: bool = True
+    shared_rows: bool = True
+    shared_prompts: bool = True
+    speculate: bool = True
+
+    @classmethod
+    def none(cls) -> Shortcuts:
+        """All switched off."""
+        return cls(**{option.name: False for option in fields(cls)})
+
+
+@dataclass(eq=False)
+class _Beginning:
+    """Rows that wait for their prompt; it is begun when its turn comes."""
+
+    request: Request
+    rows: list[Row]
+    prompt: Prompt | None = None
+
+
+@dataclass
+class Counts:
+    """What the decoder has done so far.
+
+    Attributes:
+        passes: through the network, for draws.
+        row_passes: rows fed, over all passes.
+        fan_out_row_passes: the same if every draw had a row of its own.
+        tokens: fed, over all rows.
+    """
+
+    passes: int = 0
+    row_passes: int = 0
+    fan_out_row_passes: int = 0
+    tokens: int = 0
+
+
+class Decoder:
+    """Continuous batching: requests, and rows of a request, join and leave at every step.
+
+    Args:
+        runner: network and memory; the decoder's alone.
+        shortcuts: see there.
+        prompt_chunk: tokens of a new prompt that go through the network in one step while draws run.
+        clock: seconds, ever growing; deadlines count from a request's arrival on it.
+        pace: what is known of how long things take.
+    """
+
+    def __init__(
+        self,
+        runner: Runner,
+        shortcuts: Shortcuts = Shortcuts(),
+        *,
+        prompt_chunk: int = 256,
+        clock: Callable[[], float] = time.monotonic,
+        pace: Pace | None = None,
+    ) -> None:
+        self._clock, self._pace = clock, pace or Pace()
+        self._drafts: dict[tuple[str, int], Draw] = {}
+        self._paused: dict[str, list[Row]] = {}
+        self._runner, self._shortcuts, self._chunk = runner, shortcuts, prompt_chunk
+        self._schedule = Schedule(runner.rows, runner.prompts, prompts_per_draw=not shortcuts.shared_prompts)
+        self._beginnings: list[_Beginning] = []
+        self._prompts: list[Prompt] = []
+        self._rows: list[Row] = []
+        self.counts = Counts()
 
     @property
     def idle(self) -> bool:
         """Whether there is nothing to do."""
-        return not self._waiting and not self._running
+        return self._schedule.idle
 
     def add(self, plan_request: PlanRequest) -> None:
         """Queue a request.
 
         Raises:
             RequestError: it can never be served: unknown format, too many draws, a missing camera, a
-                prefill the format cannot write.
+                prefill the format cannot write; or its id is in use.
         """
         loaded, controls = self._runner.loaded, plan_request.controls
-        if plan_request.format not in self._formats:
-            known = ", ".join(self._formats)
+        if plan_request.request_id in self._schedule:
+            raise RequestError(f"request id {plan_request.request_id} is in use")
+        if plan_request.format not in self._runner.formats:
+            known = ", ".join(self._runner.formats)
             raise RequestError(f"unknown format {plan_request.format!r}; this checkpoint writes {known}")
-        if controls.n > self._runner.rows:
+        request = Request(plan_request, self._clock())
+        if not self._schedule.fits(request):
             raise RequestError(
                 f"n is {controls.n}; this engine runs at most {self._runner.rows} draws at once"
+                + (", half of them under a deadline" if request.drafts else "")
             )
         cameras = {clip.camera for clip in plan_request.scene.clips}
         if missing := [camera for camera in loaded.card.cameras if camera not in cameras]:
             raise RequestError(f"the scene lacks camera {', '.join(missing)}, which this checkpoint needs")
         try:
-            self._formats[plan_request.format].start(_given(plan_request))
+            self._runner.formats[plan_request.format].start(_given(plan_request))
         except FormatError as error:
             raise RequestError(f"prefill: {error}") from error
-        self._waiting.append(Request(plan_request))
+        self._schedule.add(request)
 
     def cancel(self, request_id: str) -> None:
-        """Drop a request, whether it waits or runs; its rows are free at once."""
-        self._waiting = deque(
-            request for request in self._waiting if request.plan_request.request_id != request_id
-        )
-        for row in reversed(range(len(self._running))):
-            if self._running[row].request.plan_request.request_id == request_id:
-                self._free(row)
+        """Drop a request, whether it waits or runs; its memory is free at once."""
+        self._schedule.release(request_id)
+        self._paused.pop(request_id, None)
+        self._drop_rows(request_id)
+        self._drafts = {key: draw for key, draw in self._drafts.items() if key[0] != request_id}
+
+    def _drop_rows(self, request_id: str) -> None:
+        for beginning in [each for each in self._beginnings if each.request.id == request_id]:
+            self._beginnings.remove(beginning)
+            if beginning.prompt is not None:
+                self._free_prompt(beginning.prompt)
+        for row in [row for row in self._rows if row.request.id == request_id]:
+            self._free_row(row)
+
+    def _pause(self, request: Request) -> None:
+        """Give up a request's memory and keep what its draws have written."""
+        rows = [row for row in self._rows if row.request is request]
+        rows += [row for each in self._beginnings if each.request is request for row in each.rows]
+        self._drop_rows(request.id)
+        self._paused[request.id] = rows
 
     def step(self) -> list[StepEvent]:
-        """Admit what fits, run one pass, and return what happened."""
-        events = self._admit()
-        if not self._running:
+        """Admit what fits, bring a prompt on, feed all rows once, and return what happened."""
+        began_s = self._clock()
+        for request in self._schedule.make_room():
+            self._pause(request)
+        for request in self._schedule.admit():
+            rows = self._paused.pop(request.id, None) or self._first_rows(request)
+            groups = [rows] if self._shortcuts.shared_prompts else [[row] for row in rows]
+            self._beginnings += [_Beginning(request, group) for group in groups]
+        events = self._bring_prompt_on()
+        if not self._rows:
             return events
-        fed = [draw.pending if self._jump else draw.pending[:1] for draw in self._running]
-        logits = self._runner.decode(
-            fed, [draw.held for draw in self._running], [draw.position_offset for draw in self._running]
-        )
-        for draw, tokens in zip(self._running, fed, strict=True):
-            draw.held += len(tokens)
-            del draw.pending[: len(tokens)]
-        vocabulary = self._runner.loaded.vocabulary
-        for row in reversed(range(len(self._running))):
-            draw = self._running[row]
-            if not draw.pending and not draw.cursor.done:
-                sections = draw.take(logits[row], vocabulary)
-                events += [(draw.request.plan_request.request_id, event) for event in sections]
-            if draw.cursor.done:
-                self._free(row)
-                events.append((draw.request.plan_request.request_id, self._finish(draw)))
-        return events
-
-    def _admit(self) -> list[StepEvent]:
-        events: list[StepEvent] = []
-        while self._waiting and len(self._running) + self._waiting[0].controls.n <= self._runner.rows:
-            request = self._waiting.popleft()
-            plan_request = request.plan_request
-            try:
-                prompt = self._runner.prefill(plan_request.scene, plan_request.format, len(self._running))
-            except ValueError as error:
-                events.append((plan_request.request_id, Failed(RequestError(str(error)))))
-                continue
-            start = self._formats[plan_request.format].start(_given(plan_request))
-            for index in range(request.controls.n):
-                if index:
-                    self._runner.copy_row(len(self._running) - index, len(self._running), prompt.held)
-                draw = RunningDraw(
-                    request, index, start, [prompt.last_token], prompt.held, prompt.position_offset
+        rows = list(self._rows)
+        feeds = [self._feed_of(row) for row in rows]
+        for row, feed, logits in zip(rows, feeds, self._runner.feed(feeds), strict=True):
+            if row not in self._rows:
+                continue  # its request failed with another of its rows
+            if all(np.isfinite(values).all() for values in logits):
+                events += self._apply(row, feed, logits)
+            else:
+                events.append(
+                    self._fail(row.request, EngineError("the network gave logits that are no numbers"))
                 )
-                sections = draw.write_forced(self._runner.loaded.vocabulary)
-                events += [(plan_request.request_id, event) for event in sections]
-                self._running.append(draw)
+        self._count(rows, feeds)
+        events += self._end_the_done()
+        self._pace.saw_step(self._clock() - began_s)
+        return events + self._settle_for_drafts()
+
+    def check_integrity(self) -> None:
+        """Raise `AssertionError` when the books do not agree with each other."""
+        assert [prompt.row for prompt in self._prompts] == list(range(len(self._prompts)))
+        held = {id(prompt) for prompt in self._prompts}
+        begun = [each.prompt for each in self._beginnings if each.prompt is not None]
+        used = {id(row.prompt) for row in self._rows} | {id(prompt) for prompt in begun}
+        assert held == used, "a prompt is held for nobody, or missing"
+        draws = [(row.request.id, draw, row.draft) for row in self._rows for draw in row.draws]
+        draws += [
+            (each.request.id, draw, row.draft)
+            for each in self._beginnings
+            for row in each.rows
+            for draw in row.draws
+        ]
+        assert len(draws) == len(set(draws)), "a draw runs twice"
+        assert len(self._rows) <= self._runner.rows
+        if not self._rows and not self._beginnings and self.idle:
+            assert self._schedule.free_rows == self._runner.rows
+            assert self._schedule.free_prompts == self._runner.prompts
+        for row in self._rows:
+            assert row.draws
+            assert row.pending or row.cursor.done, "a row has nothing to feed"
+
+    def _bring_prompt_on(self) -> list[StepEvent]:
+        """A chunk of the most urgent prompt; all of it while no draw waits for the pass."""
+        if not self._beginnings:
+            return []
+        beginning = min(self._beginnings, key=lambda each: urgency(each.request))
+        request = beginning.request
+        plan_request = request.plan_request
+        if beginning.prompt is None:
+            try:
+                beginning.prompt = self._runner.begin_prompt(
+                    plan_request.scene, plan_request.format, len(self._prompts)
+                )
+            except ValueError as error:
+                return [self._fail(request, RequestError(str(error)))]
+            except Exception as error:  # one scene that cannot be encoded must not end the others
+                failure = EngineError(f"the scene could not be encoded: {error}")
+                failure.__cause__ = error
+                return [self._fail(request, failure)]
+            self._prompts.append(beginning.prompt)
+        prompt = beginning.prompt
+        self._runner.feed_prompt(prompt, self._chunk if self._rows else len(prompt.embeddings))
+        if not prompt.ready:
+            return []
+        self._beginnings.remove(beginning)
+        events: list[StepEvent] = []
+        for row in beginning.rows:
+            row.begin(prompt, prompt.last_token)
+            self._rows.append(row)
+            if not row.tokens:
+                events += [(request.id, event) for event in row.write((), self._runner.loaded.vocabulary)]
         return events
 
-    def _free(self, row: int) -> None:
-        """Give up a row; the last live row moves into its place."""
-        last = self._running.pop()
-        if row < len(self._running):
-            self._runner.copy_row(len(self._running), row, last.held)
-            self._running[row] = last
+    def _first_rows(self, request: Request) -> list[Row]:
+        """The rows that a request begins with."""
+        start = self._runner.formats[request.plan_request.format].start(_given(request.plan_request))
+        every = tuple(range(request.controls.n))
+        shared = self._shortcuts.shared_rows and self._shortcuts.shared_prompts
+        return [Row(request, draws, start) for draws in ([every] if shared else [(draw,) for draw in every])]
 
-    def _finish(self, draw: RunningDraw) -> Event:
-        loaded, request = self._runner.loaded, draw.request.plan_request
-        text = loaded.vocabulary.decode([token.id for token in draw.tokens])
+    def _feed_of(self, row: Row) -> Feed:
+        """A row's pending tokens and what is proposed behind them, with the decisions among both."""
+        assert row.prompt is not None
+        if not self._shortcuts.jump and len(row.pending) > 1:
+            return Feed(row.prompt, row.held, row.pending[:1], ())
+        proposal = row.proposal() if self._shortcuts.speculate else []
+        wanted, cursor = [], row.cursor
+        for place in range(len(row.pending) - 1, len(row.pending) + len(proposal)):
+            if cursor.done:
+                break
+            if len(ids := cursor.allowed().ids) > 1:
+                wanted.append((place, ids))
+            if place + 1 < len(row.pending) + len(proposal):
+                cursor = cursor.advance(proposal[place + 1 - len(row.pending)])
+        return Feed(row.prompt, row.held, [*row.pending, *proposal], wanted)
+
+    def _apply(self, row: Row, feed: Feed, found: list[Logits]) -> list[StepEvent]:
+        """Choose at the decisions of a feed, one after the other, while what was fed is what is chosen."""
+        events: list[StepEvent] = []
+        row.passes += 1
+        ahead = feed.tokens[len(row.pending) :]
+        row.saw(min(len(row.pending), len(feed.tokens)))
+        for logits in found:
+            events += self._choose(row, logits, ahead[0] if ahead else None)
+            agreed = 0
+            while agreed < min(len(row.pending), len(ahead)) and row.pending[agreed] == ahead[agreed]:
+                agreed += 1
+            row.saw(agreed)
+            ahead = ahead[agreed:]
+            if row.pending:
+                break
+        return events
+
+    def _choose(self, row: Row, logits: Logits, proposed: int | None) -> list[StepEvent]:
+        """Write what the row's draws choose; those that choose otherwise get rows of their own.
+
+        The row goes on with those that choose ``proposed``, if any do.
+        """
+        time_for = self._pace.thinking(row.request.deadline_s, self._clock())
+        chosen = sorted(row.choices(logits, time_for), key=lambda choice: choice[0] != proposed)
+        parts = [(row.part(draws, draft=row.draft), token) for token, draws in chosen[1:]]
+        if row.request.drafts and row.cursor.allowed().choice == BRANCH:
+            direct = next(int(id) for id in row.cursor.allowed().ids if row.branch_of(int(id)) == ACTION)
+            thinking = [draws for token, draws in chosen if row.branch_of(token) == THINKING]
+            parts += [(row.part(draws, draft=True), direct) for draws in thinking]
+        token, row.draws = chosen[0]
+        vocabulary = self._runner.loaded.vocabulary
+        events = row.write((token,), vocabulary)
+        for part, token in parts:
+            self._runner.copy_row(self._rows.index(row), len(self._rows), row.held)
+            self._rows.append(part)
+            events += part.write((token,), vocabulary)
+        return [(row.request.id, event) for event in events]
+
+    def _count(self, rows: list[Row], feeds: list[Feed]) -> None:
+        counts = self.counts
+        counts.passes += 1
+        counts.row_passes += len(rows)
+        counts.fan_out_row_passes += sum(len(row.draws) for row in rows)
+        counts.tokens += sum(len(feed.tokens) for feed in feeds)
+
+    def _end_the_done(self) -> list[StepEvent]:
+        """Take finished rows out, and read their responses."""
+        events: list[StepEvent] = []
+        for row in [row for row in self._rows if row.cursor.done]:
+            if row not in self._rows:
+                continue  # its request failed with another of its rows
+            try:
+                draws = self._read(row)
+            except Exception as error:  # a response that cannot be read back must not end the others
+                failure = EngineError(f"a response could not be read back: {error}")
+                failure.__cause__ = error
+                events.append(self._fail(row.request, failure))
+                continue
+            if row.draft:
+                events += [(row.request.id, DraftFinished(draw)) for draw in draws]
+                self._drafts.update({(row.request.id, draw.index): draw for draw in draws})
+                self._free_row(row)
+                continue
+            if row.passes_before_ending:
+                self._pace.saw_ending(row.passes - row.passes_before_ending)
+            self._free_row(row)
+            events += self._answer(row.request, draws)
+        return events
+
+    def _settle_for_drafts(self) -> list[StepEvent]:
+        """Answer with drafts where the reflection will not end in time."""
+        events: list[StepEvent] = []
+        now_s = self._clock()
+        for row in list(self._rows):
+            if row.draft or not self._pace.last_step(row.request.deadline_s, now_s):
+                continue
+            ready = [draw for draw in row.draws if (row.request.id, draw) in self._drafts]
+            if not ready:
+                continue
+            row.draws = tuple(draw for draw in row.draws if draw not in ready)
+            if not row.draws:
+                self._free_row(row)
+            events += self._answer(row.request, [self._drafts[row.request.id, draw] for draw in ready])
+        return events
+
+    def _answer(self, request: Request, draws: list[Draw]) -> list[StepEvent]:
+        """Finished draws; what was kept for them is forgotten, and the request with its last draw."""
+        answered = {draw.index for draw in draws}
+        for index in answered:
+            self._drafts.pop((request.id, index), None)
+        for row in [row for row in self._rows if row.request is request and row.draft]:
+            row.draws = tuple(draw for draw in row.draws if draw not in answered)
+            if not row.draws:
+                self._free_row(row)
+        if not self._at_work(request):
+            self._schedule.release(request.id)
+        return [(request.id, DrawFinished(draw)) for draw in draws]
+
+    def _fail(self, request: Request, error: Exception) -> StepEvent:
+        self.cancel(request.id)
+        return request.id, Failed(error)
+
+    def _at_work(self, request: Request) -> bool:
+        return any(row.request is request for row in self._rows) or any(
+            beginning.request is request for beginning in self._beginnings
+        )
+
+    def _free_row(self, row: Row) -> None:
+        """Give up a row, and its prompt if it was the last to use it; the last row moves into its place."""
+        index, last = self._rows.index(row), self._rows.pop()
+        if last is not row:
+            self._runner.copy_row(len(self._rows), index, last.held)
+            self._rows[index] = last
+        assert row.prompt is not None
+        if all(other.prompt is not row.prompt for other in self._rows):
+            self._free_prompt(row.prompt)
+
+    def _free_prompt(self, prompt: Prompt) -> None:
+        last = self._prompts.pop()
+        if last is not prompt:
+            self._prompts[prompt.row] = last
+            self._runner.move_prompt(last, prompt.row)
+
+    def _read(self, row: Row) -> list[Draw]:
+        loaded, request = self._runner.loaded, row.request.plan_request
+        text = loaded.vocabulary.decode([token.id for token in row.tokens])
         values = parse(FORMATS[request.format], text)
         codes = values["trajectory"]
         assert isinstance(codes, tuple)
         trajectory = loaded.codec.decode(request.scene.history[None], [codes])[0]
-        return DrawFinished(draw.finished(text, values, trajectory))
+        return row.finished(text, values, trajectory)
 
 
 def _given(request: PlanRequest) -> Values:

@@ -6,8 +6,9 @@ import asyncio
 import queue
 import threading
 from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,9 +25,16 @@ from model.engines.engine import (
     PlanRequest,
     RequestError,
 )
-from model.engines.torch.decoder import Decoder, Failed
+from model.engines.torch.decoder import Decoder, Failed, Shortcuts
 from model.engines.torch.runner import Runner
 from model.network.checkpoint import load
+
+
+def fast_products() -> torch.dtype | None:
+    """bfloat16 where the CPU multiplies matrices of it many times as fast as of float32, else None."""
+    # Known from torch 2.12 on; before, nothing is known.
+    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    return torch.bfloat16 if capabilities.get("amx_bf16") or capabilities.get("avx512_bf16") else None
 
 
 @dataclass(frozen=True)
@@ -35,17 +43,22 @@ class TorchSettings:
 
     Attributes:
         rows: draws decoded at once; more wait.
-        length: tokens a row can hold, prompt and response together.
-        dtype: of weights and KV.
+        prompts: scenes decoded at once.
+        clip_bytes: of vision tokens kept for pictures that come again.
+        dtype: of weights, keys and values.
+        products: what matrix products are worked out in; by default bfloat16 on CPUs that have units for
+            it (AMX, AVX-512 BF16) and the weights' own type elsewhere.
         device: ``cpu`` or ``cuda``.
-        jump: forced runs go through the network in one pass.
+        shortcuts: what makes decoding fast and changes no response.
     """
 
-    rows: int = 64
-    length: int = 1536
+    rows: int = 96
+    prompts: int = 16
+    clip_bytes: int = 256 << 20
     dtype: torch.dtype = torch.float32
+    products: torch.dtype | None = field(default_factory=fast_products)
     device: str = "cpu"
-    jump: bool = True
+    shortcuts: Shortcuts = field(default_factory=Shortcuts)
 
 
 def grey_scene(card: ModelCard) -> Scene:
@@ -128,7 +141,14 @@ class TorchEngine:
 
     def _run(self) -> None:
         settings = self._settings
-        decoder = Decoder(Runner(self._loaded, settings.rows, settings.length), jump=settings.jump)
+        runner = Runner(
+            self._loaded,
+            settings.rows,
+            settings.prompts,
+            clip_bytes=settings.clip_bytes,
+            products=settings.products,
+        )
+        decoder = Decoder(runner, settings.shortcuts)
         reason: Exception = EngineError("the engine was stopped")
         try:
             with torch.inference_mode():

@@ -1,8 +1,9 @@
-"""Network passes over KV rows: prefill a scene's prompt, feed rows their next tokens."""
+"""Network passes: a scene's prompt in chunks, running draws their next tokens. Owns network and memory."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,102 +12,207 @@ import torch
 from torch import Tensor
 
 from model.driving.scene import Scene
-from model.engines.engine import EngineError
-from model.engines.torch.kv_rows import KvRows, KvStep
+from model.engines.torch.attention import DrawPass, Fed, PromptPass
+from model.engines.torch.clips import ClipCache, Pictures
+from model.engines.torch.head import AllowedHead, Ids
+from model.engines.torch.kv import KvRows
+from model.engines.torch.packed import PackedDecoder, Rotation
+from model.formats.cf_vla import FORMATS
+from model.formats.cursor import CompiledFormat
 from model.network.checkpoint import Loaded
 
 
-class Prefilled(NamedTuple):
-    """A prompt whose tokens but the last lie in a row.
+@dataclass(eq=False)
+class Prompt:
+    """A prompt on its way into its row, all but its last token, which draws begin with.
 
     Attributes:
-        held: tokens in the row.
-        last_token: the prompt's last token, still to be fed.
+        row: of the prompts' memory.
+        embeddings: [t, hidden] of the tokens to hold.
+        rotation: theirs.
+        held: how many of them are in the row.
+        last_token: still to be fed.
         position_offset: see `model.network.inputs.Prompt`.
     """
 
+    row: int
+    embeddings: Tensor
+    rotation: Rotation
     held: int
     last_token: int
     position_offset: int
 
+    @property
+    def ready(self) -> bool:
+        """Whether draws can begin."""
+        return self.held == len(self.embeddings)
+
+
+class Feed(NamedTuple):
+    """What a draw's row feeds in a pass.
+
+    Attributes:
+        prompt: of the row.
+        held: tokens that the row holds.
+        tokens: at least one.
+        wanted: places among the tokens, ascending, and the ids whose logits behind them are asked for.
+    """
+
+    prompt: Prompt
+    held: int
+    tokens: Sequence[int]
+    wanted: Sequence[tuple[int, Ids]]
+
 
 class Runner:
-    """Owns the network and the KV rows. Call under `torch.inference_mode`."""
+    """Owns the network, keys and values. Call under `torch.inference_mode`.
 
-    def __init__(self, loaded: Loaded, rows: int, length: int) -> None:
+    Args:
+        loaded: its weights must not change while the runner is used.
+        rows: draws that can run at once.
+        prompts: prompts that can be held at once.
+        clip_bytes: of vision tokens kept for pictures that come again.
+        products: what matrix products are worked out in; None for the weights' own type.
+    """
+
+    def __init__(
+        self,
+        loaded: Loaded,
+        rows: int,
+        prompts: int,
+        *,
+        clip_bytes: int = 0,
+        products: torch.dtype | None = None,
+    ) -> None:
         self.loaded = loaded
-        self.rows = rows
-        text: Any = loaded.model.config.text_config
-        self._kv = KvRows(
-            layers=text.num_hidden_layers,
-            heads=text.num_key_value_heads,
-            head_dim=text.hidden_size // text.num_attention_heads,
-            rows=rows,
-            length=length,
-            dtype=loaded.model.dtype,
-            device=loaded.model.device,
-        )
+        self.rows, self.prompts = rows, prompts
+        self.formats = {
+            name: CompiledFormat(FORMATS[name], loaded.vocabulary) for name in loaded.card.formats
+        }
+        # A draw's row holds the prompt's last token too.
+        length = 1 + max(format.longest() for format in self.formats.values())
+        model: Any = loaded.model
+        text = model.config.text_config
+        self._products = products
+        self._decoder = PackedDecoder(model.model.language_model, products)
+        self._head = AllowedHead(model.lm_head.weight)
+        self._clips = ClipCache(clip_bytes)
+        kept = [
+            len(loaded.inputs.prompt(format, route=route).ids) - 1
+            for format in loaded.card.formats
+            for route in {False, loaded.settings.with_route}
+        ]
+        sizes = {
+            "layers": text.num_hidden_layers,
+            "heads": text.num_key_value_heads,
+            "head_dim": text.hidden_size // text.num_attention_heads,
+            "dtype": loaded.model.dtype,
+            "device": loaded.model.device,
+        }
+        self._prompts = KvRows(rows=prompts, length=max(kept), **sizes)
+        self._draws = KvRows(rows=rows, length=length, **sizes)
+        every_place = torch.arange(max(kept) + 1 + length, device=loaded.model.device)
+        self._rotation = self._decoder.rotation(every_place.expand(3, -1))
+        self._heads: dict[str, tuple[Tensor, Tensor]] = {}
 
-    def prefill(self, scene: Scene, format: str, row: int) -> Prefilled:
-        """Run a scene's prompt, without its last token, into a row.
+    def begin_prompt(self, scene: Scene, format: str, row: int) -> Prompt:
+        """A scene's prompt, its pictures encoded, nothing of it in its row but what all scenes share.
 
         Raises:
             ValueError: the scene cannot be made into inputs (missing camera, damaged picture).
         """
-        inputs = self.loaded.inputs.build(scene, format)
-        prompt = self.loaded.model.encode_prompt_embeddings(inputs)
-        held = len(prompt.embeddings) - 1
-        places = torch.arange(held, device=prompt.embeddings.device)[None]
-        step = self._step(row, torch.tensor([held]), places)
-        self._pass(prompt.embeddings[None, :held], prompt.position_ids[:, None, :held], step)
-        return Prefilled(held, int(inputs.prompt.ids[-1]), prompt.position_offset)
+        loaded, device = self.loaded, self.loaded.model.device
+        route = scene.route if loaded.settings.with_route else None
+        prompt = loaded.inputs.prompt(format, route=route is not None)
+        vision_tokens = self._clips.tokens(loaded.inputs.slices(scene), self._encode)
+        embeddings = loaded.model.embed(
+            torch.from_numpy(prompt.ids).to(device)[None],
+            torch.cat(vision_tokens),
+            torch.tensor(scene.history, device=device)[None],
+            None if route is None else torch.tensor(route, device=device)[None],
+        )[0]
+        rotation = self._decoder.rotation(torch.from_numpy(prompt.position_ids).to(device))
+        kept = len(prompt.ids) - 1
+        begun = Prompt(
+            row,
+            embeddings[:kept],
+            Rotation(*(part[:kept] for part in rotation)),
+            0,
+            int(prompt.ids[-1]),
+            prompt.position_offset,
+        )
+        is_video = prompt.ids == loaded.model.config.video_token_id
+        self._begin_with_head(begun, format, int(is_video.argmax()))
+        return begun
+
+    def feed_prompt(self, prompt: Prompt, count: int) -> None:
+        """Run up to ``count`` more of a prompt's tokens into its row."""
+        end = min(prompt.held + count, len(prompt.embeddings))
+        part = slice(prompt.held, end)
+        attention = PromptPass(self._prompts, prompt.row, prompt.held, end - prompt.held)
+        rotation = Rotation(*(values[part] for values in prompt.rotation))
+        self._decoder(prompt.embeddings[part], rotation, attention)
+        prompt.held = end
 
     def copy_row(self, source: int, target: int, length: int) -> None:
-        """Make a row hold what another holds in its first ``length`` places."""
-        self._kv.copy(source, target, length)
+        """Make a draw's row hold what another holds in its first ``length`` places."""
+        self._draws.copy(source, target, length)
 
-    def decode(
-        self, tokens: Sequence[Sequence[int]], held: Sequence[int], position_offsets: Sequence[int]
-    ) -> npt.NDArray[np.float64]:
-        """Feed the first ``len(tokens)`` rows their next tokens in one pass.
+    def move_prompt(self, prompt: Prompt, row: int) -> None:
+        """Put a prompt into another row."""
+        self._prompts.copy(prompt.row, row, prompt.held)
+        prompt.row = row
 
-        Args:
-            tokens: of each row, at least one.
-            held: how many tokens each row holds already.
-            position_offsets: of each row.
-
-        Returns:
-            Logits float64 [rows, vocabulary] behind each row's last token.
-        """
+    def feed(self, feeds: Sequence[Feed]) -> list[list[npt.NDArray[np.float64]]]:
+        """Feed the first rows their next tokens in one pass; for each the logits wanted, float64 [k]."""
         device = self.loaded.model.device
-        width = max(map(len, tokens))
-        ids = np.zeros((len(tokens), width), np.int64)
-        places = np.full((len(tokens), width), -1, np.int64)
-        for row, fed in enumerate(tokens):
-            ids[row, : len(fed)] = fed
-            places[row, : len(fed)] = held[row] + np.arange(len(fed))
-        positions = np.maximum(places, 0) + np.array(position_offsets)[:, None]
-        lengths = np.array(held) + np.array([len(fed) for fed in tokens])
-        embeddings = self.loaded.model.get_input_embeddings()(torch.from_numpy(ids).to(device))
-        step = self._step(0, torch.from_numpy(lengths), torch.from_numpy(places).to(device))
-        rotary = torch.from_numpy(positions).to(device).expand(3, -1, -1)
-        hidden = self._pass(embeddings, rotary, step)
-        last = torch.tensor([len(fed) - 1 for fed in tokens], device=device)
-        logits: Tensor = self.loaded.model.lm_head(hidden[torch.arange(len(tokens), device=device), last])
-        return logits.double().cpu().numpy()
-
-    def _step(self, first_row: int, lengths: Tensor, places: Tensor) -> KvStep:
-        if int(lengths.max()) > self._kv.length:
-            raise EngineError(f"a response outgrew its row of {self._kv.length} tokens")
-        return self._kv.step(first_row, lengths, places)
-
-    def _pass(self, embeddings: Tensor, position_ids: Tensor, step: KvStep) -> Tensor:
-        output = self.loaded.model.model.language_model(
-            inputs_embeds=embeddings,
-            position_ids=position_ids,
-            attention_mask={"full_attention": step.mask},
-            past_key_values=step,
-            use_cache=False,
+        counts = [len(feed.tokens) for feed in feeds]
+        ids = np.concatenate([feed.tokens for feed in feeds]).astype(np.int64)
+        places = np.concatenate(
+            [
+                np.arange(feed.held, feed.held + count)
+                + (len(feed.prompt.embeddings) + feed.prompt.position_offset)
+                for feed, count in zip(feeds, counts, strict=True)
+            ]
         )
-        hidden: Tensor = output.last_hidden_state
-        return hidden
+        lengths = [0] * self.prompts
+        for feed in feeds:
+            lengths[feed.prompt.row] = feed.prompt.held
+        fed = [Fed(feed.prompt.row, feed.held, count) for feed, count in zip(feeds, counts, strict=True)]
+        attention = DrawPass(self._prompts, self._draws, fed, lengths)
+        embeddings = self.loaded.model.get_input_embeddings()(torch.from_numpy(ids).to(device))
+        hidden = self._decoder(embeddings, self._rotation.at(torch.from_numpy(places).to(device)), attention)
+        starts = np.cumsum(counts) - counts
+        asked = [
+            (row, int(starts[row]) + place, ids)
+            for row, feed in enumerate(feeds)
+            for place, ids in feed.wanted
+        ]
+        found: list[list[npt.NDArray[np.float64]]] = [[] for _ in feeds]
+        if asked:
+            at = torch.tensor([place for _, place, _ in asked], device=device)
+            logits = self._head.logits(hidden.index_select(0, at), [ids for _, _, ids in asked])
+            for (row, _, _), values in zip(asked, logits, strict=True):
+                found[row].append(values)
+        return found
+
+    def _encode(self, slices: list[Pictures]) -> Sequence[Tensor]:
+        """Vision tokens of slices, each [k, hidden]."""
+        loaded = self.loaded
+        patches = np.concatenate([loaded.inputs.patches(pictures) for pictures in slices])
+        grid = torch.tensor([[1, *loaded.settings.grid[1:]]] * len(slices))
+        device = loaded.model.device
+        with torch.autocast(device.type, self._products, enabled=self._products is not None):
+            tokens = loaded.model.vision(torch.from_numpy(patches).to(device), grid)
+        return tokens.view(len(slices), -1, tokens.shape[-1]).unbind()
+
+    def _begin_with_head(self, prompt: Prompt, format: str, count: int) -> None:
+        memory = (self._prompts.keys, self._prompts.values)
+        if format not in self._heads:
+            self.feed_prompt(prompt, count)
+            keys, values = (part[:, prompt.row, :, :count].clone() for part in memory)
+            self._heads[format] = (keys, values)
+            return
+        for part, kept in zip(memory, self._heads[format], strict=True):
+            part[:, prompt.row, :, :count] = kept
+        prompt.held = count

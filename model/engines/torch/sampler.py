@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -23,6 +24,11 @@ def uniform(seed: int, draw: int, position: int) -> float:
     return (state >> 11) * 2.0**-53
 
 
+def uniforms(seed: int, draws: Sequence[int], position: int) -> Array:
+    """`uniform` of several draws at one position."""
+    return np.array([uniform(seed, draw, position) for draw in draws])
+
+
 def _mix(value: int) -> int:
     value &= _MASK
     value = ((value ^ (value >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
@@ -38,20 +44,21 @@ def probabilities(logits: Array, temperature: float = 1.0) -> Array:
     return shares
 
 
-def choose(logits: Array, temperature: float, top_p: float, number: float) -> int:
-    """The position in logits [k] that ``number`` in [0, 1) selects.
+def choose(logits: Array, temperature: float, top_p: float, numbers: Array) -> npt.NDArray[np.int64]:
+    """The positions in logits [k] that ``numbers`` [n] in [0, 1) select, each by itself.
 
     Temperature 0 takes the largest logit (the first of equals). Otherwise the inverse of the cumulative
     distribution in the order given; ``top_p`` keeps the likeliest positions up to that mass.
     """
     if temperature == 0.0:
-        return int(np.argmax(logits))
+        return np.full(len(numbers), np.argmax(logits))
     mass = probabilities(logits, temperature)
     if top_p < 1.0:
         order = np.argsort(-mass, kind="stable")
         before = np.cumsum(mass[order]) - mass[order]
         mass[order[before >= top_p]] = 0.0
     cumulative = np.cumsum(mass)
-    position = int(np.searchsorted(cumulative, number * cumulative[-1], side="right"))
+    positions = np.searchsorted(cumulative, numbers * cumulative[-1], side="right")
     # Rounding may leave the last sum a hair below the number: the last position with mass takes it.
-    return min(position, int(np.flatnonzero(mass)[-1]))
+    chosen: npt.NDArray[np.int64] = np.minimum(positions, np.flatnonzero(mass)[-1])
+    return chosen

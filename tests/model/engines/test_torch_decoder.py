@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,17 @@ import pytest
 import torch
 
 from model.driving.plan import parse_plan
-from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, RequestError, SectionFinished
-from model.engines.torch.decoder import Decoder, Failed
+from model.engines.engine import (
+    Controls,
+    DraftFinished,
+    Draw,
+    DrawFinished,
+    PlanRequest,
+    RequestError,
+    SectionFinished,
+)
+from model.engines.torch.decoder import Counts, Decoder, Failed, Shortcuts
+from model.engines.torch.pace import Pace
 from model.engines.torch.runner import Runner
 from model.formats.cf_vla import CF_VLA
 from model.formats.cursor import CompiledFormat
@@ -18,6 +28,7 @@ from model.formats.pieces import BRANCH
 from model.formats.text import parse
 from model.network.checkpoint import Loaded, load
 from tests.checkpoints import noisy_scene
+from tests.model.engines.reference import exactly, reference_draws
 
 PLAN = parse_plan(
     "- longitudinal\n  - 0.0s-2.0s: Decelerate\n  - 2.0s-6.4s: Wait\n"
@@ -28,7 +39,7 @@ PLAN = parse_plan(
 @pytest.fixture(scope="module")
 def exact(untrained_checkpoint: Path) -> Loaded:
     """In float64, so that rounding cannot flip a draw."""
-    return load(untrained_checkpoint, dtype=torch.float64)
+    return exactly(load(untrained_checkpoint, dtype=torch.float64))
 
 
 @pytest.fixture(autouse=True)
@@ -50,31 +61,66 @@ def decode(decoder: Decoder, *requests: PlanRequest) -> dict[tuple[str, int], Dr
             assert not isinstance(event, Failed), event
             if isinstance(event, DrawFinished):
                 draws[name, event.draw.index] = event.draw
+        decoder.check_integrity()
     return draws
 
 
-def test_a_draw_is_the_same_alone_in_a_batch_and_token_by_token(exact: Loaded) -> None:
-    requests = [
-        request("a", 0, n=2, seed=1),
-        request("b", 1, n=3, seed=2, thinking="never"),
-        request("c", 2, "traj_only", n=2, seed=3, temperature=0.7, top_p=0.9),
-        request("d", 3, n=1, temperature=0.0, prefill=PLAN),
-    ]
-    together = decode(Decoder(Runner(exact, rows=8, length=1536)), *requests)
-    assert len(together) == 8
-    for jump in (True, False):
-        for each in requests:
-            alone = decode(Decoder(Runner(exact, rows=3, length=1536), jump=jump), each)
-            for key, draw in alone.items():
-                assert draw.text == together[key].text
-                assert draw.tokens == together[key].tokens
-                assert np.array_equal(draw.trajectory, together[key].trajectory)
+MIX = [
+    request("a", 0, n=2, seed=1),
+    request("b", 1, n=3, seed=2, thinking="never"),
+    request("c", 2, "traj_only", n=2, seed=3, temperature=0.7, top_p=0.9),
+    request("d", 3, n=1, temperature=0.0, prefill=PLAN),
+    request("e", 4, n=3, seed=5, thinking="always", temperature=0.4),
+    request("f", 5, n=2, seed=6, think_threshold=0.5),
+]
+SHORTCUTS = [field.name for field in fields(Shortcuts)]
+
+
+@pytest.fixture(scope="module")
+def plainly(exact: Loaded) -> dict[tuple[str, int], Draw]:
+    """What the reference decoder writes for `MIX`."""
+    with torch.inference_mode():
+        return {(each.request_id, draw.index): draw for each in MIX for draw in reference_draws(exact, each)}
+
+
+@pytest.mark.parametrize("off", [None, "all", *SHORTCUTS])
+def test_draws_are_those_of_the_plain_decoder(
+    exact: Loaded, plainly: dict[tuple[str, int], Draw], off: str | None
+) -> None:
+    shortcuts = Shortcuts.none() if off == "all" else replace(Shortcuts(), **({off: False} if off else {}))
+    decoder = Decoder(Runner(exact, 13, 13, clip_bytes=1 << 20), shortcuts, prompt_chunk=50)
+    draws = decode(decoder, *MIX)
+    assert draws.keys() == plainly.keys()
+    for key, draw in draws.items():
+        assert draw.text == plainly[key].text, key
+        assert draw.tokens == plainly[key].tokens
+        assert (draw.think_probability is None) == (plainly[key].think_probability is None)
+        assert draw.think_probability is None or draw.think_probability == pytest.approx(
+            plainly[key].think_probability, rel=1e-9
+        )
+        assert np.array_equal(draw.trajectory, plainly[key].trajectory)
+
+
+def test_shortcuts_save_what_they_are_for(exact: Loaded) -> None:
+    """Of the counts only: speed is measured elsewhere."""
+    one = request("a", 0, n=6, seed=1, temperature=0.3, thinking="always")
+
+    def counts(**off: bool) -> Counts:
+        decoder = Decoder(Runner(exact, 6, 6), replace(Shortcuts(), **off))
+        decode(decoder, one)
+        return decoder.counts
+
+    everything = counts()
+    assert counts(jump=False, speculate=False).passes > 2.5 * everything.passes
+    assert everything.row_passes < everything.fan_out_row_passes
+    unshared = counts(shared_rows=False)
+    assert unshared.row_passes == unshared.fan_out_row_passes > everything.row_passes
 
 
 def test_cached_steps_equal_a_full_pass(exact: Loaded) -> None:
     """The decoder's greedy choice at every decision is that of one pass over the whole sequence."""
     one = request("a", 1, n=1, temperature=0.0, thinking="never")
-    draw = decode(Decoder(Runner(exact, rows=1, length=1536)), one)["a", 0]
+    draw = decode(Decoder(Runner(exact, 1, 1)), one)["a", 0]
     inputs = exact.inputs.build(one.scene, "cf_vla")
     compiled = CompiledFormat(CF_VLA, exact.vocabulary)
     response = compiled.render(parse(CF_VLA, draw.text))
@@ -98,7 +144,7 @@ def test_cached_steps_equal_a_full_pass(exact: Loaded) -> None:
 
 @pytest.mark.parametrize("thinking", ["always", "never"])
 def test_the_caller_may_decide_the_branch(exact: Loaded, thinking: str) -> None:
-    draws = decode(Decoder(Runner(exact, rows=2, length=1536)), request("a", n=2, thinking=thinking))
+    draws = decode(Decoder(Runner(exact, 2, 2)), request("a", n=2, thinking=thinking))
     for draw in draws.values():
         assert draw.branch == ("Thinking:" if thinking == "always" else "Action:")
         assert (draw.revised_plan is not None) == (thinking == "always")
@@ -107,7 +153,7 @@ def test_the_caller_may_decide_the_branch(exact: Loaded, thinking: str) -> None:
 
 
 def test_the_threshold_decides_by_think_probability(exact: Loaded) -> None:
-    decoder = Decoder(Runner(exact, rows=4, length=1536))
+    decoder = Decoder(Runner(exact, 4, 4))
     draws = decode(decoder, request("a", n=1), request("b", n=1, think_threshold=0.0))
     assert draws["b", 0].branch == "Thinking:"
     probability = draws["a", 0].think_probability
@@ -117,21 +163,118 @@ def test_the_threshold_decides_by_think_probability(exact: Loaded) -> None:
 
 
 def test_a_prefilled_plan_stands(exact: Loaded) -> None:
-    draws = decode(Decoder(Runner(exact, rows=4, length=1536)), request("a", n=3, prefill=PLAN))
+    draws = decode(Decoder(Runner(exact, 4, 4)), request("a", n=3, prefill=PLAN))
     assert all(draw.plan == PLAN for draw in draws.values())
 
 
+class Clock:
+    """Stands still unless it is moved."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
 def test_a_passed_deadline_leaves_thinking_out(exact: Loaded) -> None:
-    draws = decode(
-        Decoder(Runner(exact, rows=2, length=1536)), request("a", n=2, thinking="always", deadline_ms=0)
-    )
+    draws = decode(Decoder(Runner(exact, 4, 2)), request("a", n=2, thinking="always", deadline_ms=0))
     assert all(draw.branch == "Action:" for draw in draws.values())
+
+
+def test_in_time_a_reflection_replaces_its_draft(exact: Loaded) -> None:
+    decoder = Decoder(Runner(exact, 4, 1), clock=Clock())
+    decoder.add(request("a", n=2, seed=4, thinking="always", deadline_ms=100_000))
+    drafts, draws, order = {}, {}, []
+    while not decoder.idle:
+        for _, event in decoder.step():
+            if isinstance(event, DraftFinished):
+                drafts[event.draw.index] = event.draw
+                order.append(("draft", event.draw.index))
+            elif isinstance(event, DrawFinished):
+                draws[event.draw.index] = event.draw
+                order.append(("draw", event.draw.index))
+        decoder.check_integrity()
+    unhurried = decode(Decoder(Runner(exact, 4, 1)), request("a", n=2, seed=4, thinking="always"))
+    direct = decode(Decoder(Runner(exact, 4, 1)), request("a", n=2, seed=4, thinking="never"))
+    for index in range(2):
+        assert order.index(("draft", index)) < order.index(("draw", index))
+        assert draws[index].text == unhurried["a", index].text
+        assert drafts[index].text == direct["a", index].text
+
+
+def test_at_the_deadline_the_draft_is_the_answer(exact: Loaded) -> None:
+    clock = Clock()
+    decoder = Decoder(Runner(exact, 4, 1), clock=clock)
+    decoder.add(request("a", n=2, seed=4, thinking="always", deadline_ms=100_000))
+    drafts, draws = {}, {}
+    while not decoder.idle:
+        for _, event in decoder.step():
+            if isinstance(event, DraftFinished):
+                drafts[event.draw.index] = event.draw
+            elif isinstance(event, DrawFinished):
+                draws[event.draw.index] = event.draw
+        decoder.check_integrity()
+        if len(drafts) == 2:
+            clock.now_s = 101.0
+    assert draws == drafts
+    assert {draw.branch for draw in draws.values()} == {"Action:"}
+
+
+class Steady(Pace):
+    """Steps of 10 ms, 40 of them behind a text, whatever is seen."""
+
+    step_s, ending_passes = 0.01, 40.0
+
+    def __init__(self) -> None:
+        pass
+
+    def saw_step(self, seconds: float) -> None:
+        pass
+
+    def saw_ending(self, passes: int) -> None:
+        pass
+
+
+def test_who_has_less_time_goes_first_and_the_others_lose_nothing(exact: Loaded) -> None:
+    clock = Clock()
+    decoder = Decoder(Runner(exact, 4, 2), clock=clock)
+    patient = request("patient", 0, n=4, seed=1, thinking="never")
+    urgent = request("urgent", 1, "traj_only", n=2, seed=2, deadline_ms=1000)
+    decoder.add(patient)
+    for _ in range(12):
+        decoder.step()
+    decoder.add(urgent)
+    draws = decode(decoder)
+    assert [name for name, _ in draws] == ["urgent"] * 2 + ["patient"] * 4
+    for asked in (patient, urgent):
+        for draw in reference_draws(exact, asked):
+            assert draws[asked.request_id, draw.index].text == draw.text
+
+
+def test_thinking_is_cut_when_the_rest_would_not_fit(exact: Loaded) -> None:
+    asked = request("a", n=1, seed=4, thinking="always", deadline_ms=100_000)
+    unhurried = decode(Decoder(Runner(exact, 2, 1), clock=Clock()), asked)["a", 0]
+    clock = Clock()
+    decoder = Decoder(Runner(exact, 2, 1), clock=clock, pace=Steady())
+    decoder.add(asked)
+    draws = []
+    while not decoder.idle:
+        for _, event in decoder.step():
+            if isinstance(event, SectionFinished) and event.section == "branch":
+                clock.now_s = 99.7  # 30 steps are left
+            draws += [event.draw] if isinstance(event, DrawFinished) else []
+    (draw,) = draws
+    assert draw.branch == "Thinking:"
+    assert draw.revised_plan is not None
+    assert draw.tokens["thinking"] < unhurried.tokens["thinking"]
+    assert draw.plan == unhurried.plan
 
 
 def test_every_response_parses_at_high_temperature(untrained_checkpoint: Path) -> None:
     loaded = load(untrained_checkpoint)
     requests = [request(f"{k}", k, n=8, temperature=1.5, seed=k) for k in range(3)]
-    draws = decode(Decoder(Runner(loaded, rows=24, length=1536)), *requests)
+    draws = decode(Decoder(Runner(loaded, 24, 3)), *requests)
     compiled = CompiledFormat(CF_VLA, loaded.vocabulary)
     assert len(draws) == 24
     for draw in draws.values():
@@ -142,7 +285,7 @@ def test_every_response_parses_at_high_temperature(untrained_checkpoint: Path) -
 
 
 def test_events_name_sections_in_order(exact: Loaded) -> None:
-    decoder = Decoder(Runner(exact, rows=2, length=1536))
+    decoder = Decoder(Runner(exact, 2, 2))
     decoder.add(request("a", n=1, thinking="always"))
     sections = []
     while not decoder.idle:
@@ -151,14 +294,14 @@ def test_events_name_sections_in_order(exact: Loaded) -> None:
 
 
 def test_requests_beyond_the_rows_wait_and_are_served(exact: Loaded) -> None:
-    decoder = Decoder(Runner(exact, rows=2, length=1536))
+    decoder = Decoder(Runner(exact, 2, 2))
     draws = decode(decoder, *(request(f"{k}", k, "traj_only", n=2) for k in range(3)))
     assert len(draws) == 6
 
 
 def test_cancelling_frees_rows_and_spares_others(exact: Loaded) -> None:
-    expected = decode(Decoder(Runner(exact, rows=4, length=1536)), request("b", 1, "traj_only", n=2))
-    decoder = Decoder(Runner(exact, rows=4, length=1536))
+    expected = decode(Decoder(Runner(exact, 4, 4)), request("b", 1, "traj_only", n=2))
+    decoder = Decoder(Runner(exact, 4, 4))
     decoder.add(request("a", 0, n=2))
     decoder.add(request("b", 1, "traj_only", n=2))
     decoder.add(request("c", 2, n=2))
@@ -181,4 +324,4 @@ def test_cancelling_frees_rows_and_spares_others(exact: Loaded) -> None:
 )
 def test_impossible_requests_are_refused(exact: Loaded, change: dict[str, object], message: str) -> None:
     with pytest.raises(RequestError, match=message):
-        Decoder(Runner(exact, rows=8, length=1536)).add(request("a", **change))  # type: ignore[arg-type]
+        Decoder(Runner(exact, 8, 8)).add(request("a", **change))  # type: ignore[arg-type]

@@ -1,16 +1,16 @@
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import cycle, pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.plan import Plan, parse_plan
+from model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, parse_plan
 from model.formats.cf_vla import CF_VLA, FORMATS, MAX_THINKING_TOKENS, TRAJ_ONLY
 from model.formats.cursor import CompiledFormat, Cursor, Token
-from model.formats.pieces import Choice, Format, FormatError, Literal, Option, Values
+from model.formats.pieces import MAX_SEGMENTS, Choice, Format, FormatError, Literal, Option, Values
 from model.formats.text import parse
 from tests.model.formats.strategies import cf_vla_values, plans
 from tests.model.formats.vocabulary import ByteVocabulary
@@ -163,3 +163,26 @@ def test_options_must_not_begin_one_another() -> None:
     choice = Choice((Option("a", Literal("")), Option("ab", Literal(""))))
     with pytest.raises(FormatError, match="is a beginning of"):
         CompiledFormat(Format("bad", choice), VOCABULARY).start()
+
+
+@given(cf_vla_values())
+def test_no_response_is_longer_than_the_longest(values: Values) -> None:
+    assert len(COMPILED.render(values)) <= COMPILED.longest()
+
+
+def test_the_longest_is_no_wild_guess() -> None:
+    times = [format_tick(tick) for tick in (*range(0, 5 * MAX_SEGMENTS, 5), TICKS)]
+    text = ""
+    for group in GROUPS:
+        longest = cycle(sorted(WORDS[group], key=len, reverse=True)[:2])
+        text += f"- {group}\n"
+        text += "".join(f"  - {start}s-{end}s: {next(longest)}\n" for start, end in pairwise(times))
+    plan = parse_plan(text)
+    values: Values = {
+        "plan": plan,
+        "branch": "Thinking:",
+        "thinking": "x" * MAX_THINKING_TOKENS,
+        "revised_plan": plan,
+        "trajectory": (0,) * 6,
+    }
+    assert COMPILED.longest() < 1.1 * len(COMPILED.render(values))

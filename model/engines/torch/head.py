@@ -1,0 +1,65 @@
+"""Logits of the tokens that the format allows, and of no others.
+
+A format often leaves a handful of tokens to choose from. The product with the whole vocabulary, as large as
+a layer of a small network, would be thrown away but for those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+_WHOLE_SHARE: Final = 0.5
+"""Of the vocabulary: for more allowed tokens than this the whole product is as fast."""
+
+Ids = npt.NDArray[np.int64]
+
+
+class AllowedHead:
+    """The language model's head over sets of ids.
+
+    Args:
+        weight: [vocabulary, hidden]; not to be changed while the head is used.
+    """
+
+    def __init__(self, weight: Tensor) -> None:
+        self._weight = weight.detach()
+        # Sets of ids are told apart by identity (formats make each of them once); kept, so that none is
+        # freed and its identity given to another.
+        self._parts: dict[int, tuple[Ids, Tensor | None]] = {}
+
+    def logits(self, hidden: Tensor, wanted: Sequence[Ids]) -> list[npt.NDArray[np.float64]]:
+        """For each row of ``hidden`` [n, hidden] the logits of its wanted ids, float64 [k]."""
+        rows_of: dict[int, list[int]] = {}
+        for row, ids in enumerate(wanted):
+            rows_of.setdefault(id(ids), []).append(row)
+        found: list[npt.NDArray[np.float64]] = [np.empty(0)] * len(wanted)
+        for rows in rows_of.values():
+            ids = wanted[rows[0]]
+            part = self._part(ids)
+            chosen = hidden if len(rows) == len(hidden) else hidden[rows]
+            logits = functional.linear(chosen, self._weight if part is None else part).double().cpu().numpy()
+            if part is None:
+                logits = logits[:, ids]
+            for row, values in zip(rows, logits, strict=True):
+                found[row] = values
+        return found
+
+    def _part(self, ids: Ids) -> Tensor | None:
+        """The weights of some ids; None for the whole."""
+        if id(ids) not in self._parts:
+            part: Tensor | None
+            if int(ids[-1]) - int(ids[0]) + 1 == len(ids):
+                part = self._weight[int(ids[0]) : int(ids[-1]) + 1]
+            elif len(ids) > _WHOLE_SHARE * len(self._weight):
+                part = None
+            else:
+                part = self._weight[torch.from_numpy(ids).to(self._weight.device)]
+            self._parts[id(ids)] = (ids, part)
+        return self._parts[id(ids)][1]

@@ -1,0 +1,50 @@
+"""How long things take, as far as deadlines need to know. No torch."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final
+
+_MEMORY: Final = 0.1
+"""Weight of the latest observation in a running mean."""
+_FIRST_STEP_S: Final = 0.02
+_FIRST_ENDING: Final = 40.0
+"""Passes from the end of thinking to the end of the response, before any was seen."""
+_CALM: Final = 1.5
+"""With less than so many times the necessary time left, a text ends at the next sentence."""
+
+
+class Thinking(Enum):
+    """What time allows a text to do."""
+
+    GO_ON = "go on"
+    END_SENTENCE = "end with this sentence"
+    END_NOW = "end now"
+
+
+class Pace:
+    """Running means of the time of a step and of the passes that follow a text."""
+
+    def __init__(self) -> None:
+        self.step_s = _FIRST_STEP_S
+        self.ending_passes = _FIRST_ENDING
+
+    def saw_step(self, seconds: float) -> None:
+        """A step took so long."""
+        self.step_s += _MEMORY * (seconds - self.step_s)
+
+    def saw_ending(self, passes: int) -> None:
+        """A response took so many passes behind its text."""
+        self.ending_passes += _MEMORY * (passes - self.ending_passes)
+
+    def thinking(self, deadline_s: float, now_s: float) -> Thinking:
+        """What a text may do, so that what must follow it fits before the deadline."""
+        left_s = deadline_s - now_s
+        needed_s = self.step_s * self.ending_passes
+        if left_s > _CALM * needed_s:
+            return Thinking.GO_ON
+        return Thinking.END_SENTENCE if left_s > needed_s else Thinking.END_NOW
+
+    def last_step(self, deadline_s: float, now_s: float) -> bool:
+        """Whether another step would end behind the deadline."""
+        return now_s + self.step_s > deadline_s

@@ -1,0 +1,113 @@
+"""The language model's layers over packed tokens: no batch dimension, nothing padded, few operations.
+
+Same weights and results as `transformers`' Qwen2.5-VL text model, whose modules cost more in calls than in
+arithmetic when a step feeds a handful of tokens, and more in padding when it feeds many.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+class Attention(Protocol):
+    """Where a pass's keys and values go, and what its queries see."""
+
+    def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+        """[t, h x d] for scaled queries [t, h, d] and keys and values [t, g, d]."""
+        ...
+
+
+class Rotation(NamedTuple):
+    """Rotary embedding of tokens: cosines and signed sines, each [t, 1, d]."""
+
+    cosines: Tensor
+    sines: Tensor
+
+    def at(self, places: Tensor) -> Rotation:
+        """The rows ``places``."""
+        return Rotation(self.cosines.index_select(0, places), self.sines.index_select(0, places))
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """``x`` [t, heads, d] turned."""
+        turned = x.roll(x.shape[-1] // 2, dims=-1).mul_(self.sines)
+        return turned.addcmul_(x, self.cosines)
+
+
+class _Layer(NamedTuple):
+    norm_in: Tensor
+    qkv: Tensor
+    qkv_bias: Tensor
+    out: Tensor
+    norm_mlp: Tensor
+    gate_up: Tensor
+    down: Tensor
+
+
+class PackedDecoder:
+    """The decoder of a loaded network, for inference. Its projections are copies, joined into few products.
+
+    Args:
+        text_model: `Qwen2_5_VLTextModel` with full attention in all layers.
+        products: what matrix products are worked out in, where it is not the weights' type; everything
+            else, sums over layers and attention above all, stays as it is.
+    """
+
+    def __init__(self, text_model: Any, products: torch.dtype | None = None) -> None:
+        config = text_model.config
+        if set(config.layer_types) != {"full_attention"}:
+            raise ValueError("the torch engine runs decoders with full attention in every layer only")
+        self._rotary = text_model.rotary_emb
+        self._epsilon = config.rms_norm_eps
+        self._heads, self._groups = config.num_attention_heads, config.num_key_value_heads
+        self._head_dim = config.hidden_size // config.num_attention_heads
+        self._final_norm = text_model.norm.weight
+        self._products = products or self._final_norm.dtype
+        self._layers = [_joined(layer, self._head_dim**-0.5, self._products) for layer in text_model.layers]
+
+    def rotation(self, position_ids: Tensor) -> Rotation:
+        """The rotary embedding of positions int64 [3, t]."""
+        cosines, sines = (part[0, :, None] for part in self._rotary(self._final_norm, position_ids[:, None]))
+        half = self._head_dim // 2
+        return Rotation(cosines, torch.cat([-sines[..., :half], sines[..., half:]], dim=-1))
+
+    def __call__(self, embeddings: Tensor, rotation: Rotation, attention: Attention) -> Tensor:
+        """Final hidden states [t, hidden] of tokens [t, hidden]."""
+        x = embeddings
+        turned = self._heads + self._groups
+        for index, layer in enumerate(self._layers):
+            qkv = self._product(self._norm(x, layer.norm_in), layer.qkv, layer.qkv_bias)
+            qkv = qkv.view(len(x), -1, self._head_dim)
+            looking = rotation(qkv[:, :turned])
+            query, key, value = looking[:, : self._heads], looking[:, self._heads :], qkv[:, turned:]
+            x = x + self._product(attention.attend(index, query, key, value), layer.out)
+            normed = self._norm(x, layer.norm_mlp).to(self._products)
+            gate, up = functional.linear(normed, layer.gate_up).chunk(2, dim=-1)
+            x = x + self._product(functional.silu(gate).mul_(up), layer.down)
+        return self._norm(x, self._final_norm)
+
+    def _product(self, x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+        return functional.linear(x.to(self._products), weight, bias).to(self._final_norm.dtype)
+
+    def _norm(self, x: Tensor, weight: Tensor) -> Tensor:
+        return functional.rms_norm(x, (x.shape[-1],), weight, self._epsilon)
+
+
+def _joined(layer: Any, query_scale: float, products: torch.dtype) -> _Layer:
+    attention, mlp = layer.self_attn, layer.mlp
+    projections = (attention.q_proj, attention.k_proj, attention.v_proj)
+    scales = (query_scale, 1.0, 1.0)
+    weights = [part.weight.detach() * scale for part, scale in zip(projections, scales, strict=True)]
+    biases = [part.bias.detach() * scale for part, scale in zip(projections, scales, strict=True)]
+    return _Layer(
+        norm_in=layer.input_layernorm.weight.detach(),
+        qkv=torch.cat(weights).to(products),
+        qkv_bias=torch.cat(biases).to(products),
+        out=attention.o_proj.weight.detach().to(products),
+        norm_mlp=layer.post_attention_layernorm.weight.detach(),
+        gate_up=torch.cat([mlp.gate_proj.weight.detach(), mlp.up_proj.weight.detach()]).to(products),
+        down=mlp.down_proj.weight.detach().to(products),
+    )

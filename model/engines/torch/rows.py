@@ -1,0 +1,207 @@
+"""Rows of the batch: draws that have written the same tokens share one. No torch."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from model.driving.plan import Plan
+from model.driving.trajectory import FloatArray
+from model.engines.engine import Branch, Controls, Draw, Event, PlanRequest, SectionFinished
+from model.engines.torch.pace import Thinking
+from model.engines.torch.sampler import choose, probabilities, uniforms
+from model.formats.cursor import Allowed, Cursor, Token
+from model.formats.pieces import ACTION, BRANCH, THINKING, Values
+from model.network.vocabulary import Vocabulary
+
+if TYPE_CHECKING:
+    from model.engines.torch.runner import Prompt  # a runner needs torch, rows do not
+
+_arrivals = itertools.count()
+_FIRST, _REVISED = "plan", "revised_plan"
+
+
+@dataclass(eq=False)
+class Request:
+    """A request as the engine tracks it; times are those of the engine's clock."""
+
+    plan_request: PlanRequest
+    submitted_s: float
+    arrival: int = field(default_factory=lambda: next(_arrivals))
+
+    @property
+    def id(self) -> str:
+        """The caller's name for it."""
+        return self.plan_request.request_id
+
+    @property
+    def controls(self) -> Controls:
+        """What the caller decided."""
+        return self.plan_request.controls
+
+    @property
+    def deadline_s(self) -> float:
+        """When the answer must be there; infinite without a deadline."""
+        deadline_ms = self.controls.deadline_ms
+        return float("inf") if deadline_ms is None else self.submitted_s + deadline_ms / 1000
+
+    @property
+    def drafts(self) -> bool:
+        """Whether a direct trajectory is made beside every reflection."""
+        return self.controls.deadline_ms is not None and self.controls.thinking != "never"
+
+
+@dataclass(eq=False)
+class Row:
+    """One row of the batch.
+
+    Attributes:
+        request: whose.
+        draws: indices of the draws that have written ``tokens``, at least one.
+        cursor: where the response stands, behind everything in ``tokens``.
+        prompt: in whose memory its prompt lies; None while it has not begun or is paused.
+        pending: tokens (of the response, before it the prompt's last) that the network has not seen yet.
+        held: how many tokens its KV row holds.
+        tokens: the response so far.
+        think_probability: at the branch, once that is decided.
+        draft: whether it is a direct trajectory beside a reflection.
+        passes: how many it took part in.
+        passes_before_ending: how many up to the end of its text.
+    """
+
+    request: Request
+    draws: tuple[int, ...]
+    cursor: Cursor
+    prompt: Prompt | None = None
+    pending: list[int] = field(default_factory=list)
+    held: int = 0
+    tokens: list[Token] = field(default_factory=list)
+    think_probability: float | None = None
+    draft: bool = False
+    passes: int = 0
+    passes_before_ending: int = 0
+
+    def begin(self, prompt: Prompt, last_token: int) -> None:
+        """Begin, or go on after a pause, behind a prompt: all that was written is to be fed again."""
+        self.prompt, self.held = prompt, 0
+        self.pending = [last_token, *(token.id for token in self.tokens)]
+
+    def part(self, draws: tuple[int, ...], *, draft: bool = False) -> Row:
+        """A row of its own for some of the draws."""
+        return replace(self, draws=draws, pending=list(self.pending), tokens=list(self.tokens), draft=draft)
+
+    def branch_of(self, token: int) -> Branch:
+        """At the branch: where ``token`` leads."""
+        return THINKING if THINKING in self.cursor.option_texts(token) else ACTION
+
+    def proposal(self) -> list[int]:
+        """What may come behind ``pending``: a revised plan goes on as the first plan did, while it does."""
+        if self.cursor.section != _REVISED:
+            return []
+        first = [token.id for token in self.tokens if token.section == _FIRST]
+        revised = [token.id for token in self.tokens if token.section == _REVISED]
+        return first[len(revised) :] if first[: len(revised)] == revised else []
+
+    def saw(self, count: int) -> None:
+        """The first ``count`` pending tokens went through the network."""
+        self.held += count
+        self.pending = self.pending[count:]
+
+    def choices(
+        self, logits: npt.NDArray[np.float64], time_for: Thinking
+    ) -> list[tuple[int, tuple[int, ...]]]:
+        """What the draws choose at the cursor: each token with the draws that choose it, in order.
+
+        Args:
+            logits: float64 [k] of the ids that the cursor allows.
+            time_for: what a text may still do.
+        """
+        allowed = self.cursor.allowed()
+        left = self._controlled(allowed, logits, time_for)
+        ids, controls = allowed.ids[left], self.request.controls
+        numbers = uniforms(controls.seed, self.draws, len(self.tokens))
+        places = choose(logits[left], controls.temperature, controls.top_p, numbers)
+        chosen: dict[int, list[int]] = {}
+        for draw, place in zip(self.draws, places, strict=True):
+            chosen.setdefault(int(ids[place]), []).append(draw)
+        return [(token, tuple(draws)) for token, draws in chosen.items()]
+
+    def write(self, ids: Sequence[int], vocabulary: Vocabulary) -> list[Event]:
+        """Append tokens and the forced run behind them; returns the sections that they finish."""
+        events: list[Event] = []
+        was_text = self.cursor.stop_id is not None
+        for token in ids:
+            events += self._append(token, vocabulary)
+        if was_text and self.cursor.stop_id is None:
+            self.passes_before_ending = self.passes
+        run, _ = self.cursor.forced()
+        for token, _ in run:
+            events += self._append(token, vocabulary)
+        return events
+
+    def _append(self, token: int, vocabulary: Vocabulary) -> list[Event]:
+        section = self.cursor.section
+        self.tokens.append(Token(token, section))
+        self.pending.append(token)
+        self.cursor = self.cursor.advance(token)
+        if self.cursor.section == section or self.draft:
+            return []
+        text = vocabulary.decode([token.id for token in self.tokens if token.section == section])
+        return [SectionFinished(index, section, text) for index in self.draws]
+
+    def _controlled(
+        self, allowed: Allowed, logits: npt.NDArray[np.float64], time_for: Thinking
+    ) -> npt.NDArray[np.bool_]:
+        """Which of the allowed ids the request's controls and its deadline leave."""
+        controls = self.request.controls
+        everything = np.ones(len(allowed.ids), np.bool_)
+        if allowed.choice != BRANCH:
+            if self.cursor.stop_id in allowed.ids and self._ends(time_for):
+                stops: npt.NDArray[np.bool_] = allowed.ids == self.cursor.stop_id
+                return stops
+            return everything
+        leads = np.array([THINKING in self.cursor.option_texts(int(token)) for token in allowed.ids])
+        self.think_probability = float(probabilities(logits)[leads].sum())
+        wanted: Branch | None = None
+        if time_for is Thinking.END_NOW or controls.thinking == "never":
+            wanted = ACTION
+        elif controls.thinking == "always":
+            wanted = THINKING
+        elif controls.think_threshold is not None:
+            wanted = THINKING if self.think_probability > controls.think_threshold else ACTION
+        if wanted is None:
+            return everything
+        return leads if wanted == THINKING else ~leads
+
+    def _ends(self, time_for: Thinking) -> bool:
+        """Whether a text stops here."""
+        if time_for is Thinking.END_SENTENCE:
+            return self.tokens[-1].id in self.cursor.compiled.sentence_ends()
+        return time_for is Thinking.END_NOW
+
+    def finished(self, text: str, values: Values, trajectory: FloatArray) -> list[Draw]:
+        """The finished draws: all the same, but for their index."""
+        plan, revised = values.get("plan"), values.get("revised_plan")
+        branch, thinking, codes = values.get(BRANCH), values.get("thinking"), values["trajectory"]
+        assert isinstance(codes, tuple)
+        return [
+            Draw(
+                index=index,
+                text=text,
+                plan=plan if isinstance(plan, Plan) else None,
+                branch=THINKING if branch == THINKING else ACTION if branch == ACTION else None,
+                think_probability=self.think_probability,
+                thinking=thinking if isinstance(thinking, str) else None,
+                revised_plan=revised if isinstance(revised, Plan) else None,
+                trajectory=trajectory,
+                codes=codes,
+                tokens=dict(Counter(token.section for token in self.tokens)),
+            )
+            for index in self.draws
+        ]

@@ -1,0 +1,91 @@
+"""The decoder that all others are compared with: one draw, one token at a time, by `transformers` alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+from transformers import DynamicCache
+
+from model.engines.engine import Draw, PlanRequest
+from model.engines.torch.sampler import choose, probabilities, uniform
+from model.formats.cf_vla import FORMATS
+from model.formats.cursor import CompiledFormat, Token
+from model.formats.pieces import BRANCH
+from model.formats.text import parse
+from model.network.checkpoint import Loaded
+
+
+def exactly(loaded: Loaded) -> Loaded:
+    """``loaded`` with norms that do not round to float32 on the way."""
+    for module in list(loaded.model.modules()):
+        for name, child in list(module.named_children()):
+            theirs: Any = child
+            if type(theirs).__name__ == "Qwen2_5_VLRMSNorm":
+                epsilon = theirs.variance_epsilon
+                norm: Any = nn.RMSNorm(len(theirs.weight), eps=epsilon, dtype=theirs.weight.dtype)
+                norm.weight, norm.variance_epsilon = theirs.weight, epsilon
+                setattr(module, name, norm)
+    return loaded
+
+
+def reference_draws(loaded: Loaded, request: PlanRequest) -> list[Draw]:
+    """All draws of a request, each from its own prompt."""
+    return [_draw(loaded, request, index) for index in range(request.controls.n)]
+
+
+def _draw(loaded: Loaded, request: PlanRequest, index: int) -> Draw:
+    model: Any = loaded.model
+    controls = request.controls
+    inputs = loaded.inputs.build(request.scene, request.format)
+    prompt = model.encode_prompt_embeddings(inputs)
+    cache = DynamicCache(config=model.config)
+    logits = model(
+        inputs_embeds=prompt.embeddings[None],
+        position_ids=prompt.position_ids[:, None],
+        past_key_values=cache,
+        use_cache=True,
+    ).logits[0, -1]
+    given = {} if controls.prefill is None else {"plan": controls.prefill}
+    cursor = CompiledFormat(FORMATS[request.format], loaded.vocabulary).start(given)
+    tokens: list[Token] = []
+    think_probability = None
+    while not cursor.done:
+        allowed = cursor.allowed()
+        scores = logits.double().numpy()[allowed.ids]
+        left = np.ones(len(allowed.ids), np.bool_)
+        if allowed.choice == BRANCH and len(allowed.ids) > 1:
+            thinks = np.array(["Thinking:" in cursor.option_texts(int(id)) for id in allowed.ids])
+            think_probability = float(probabilities(scores)[thinks].sum())
+            if controls.thinking != "adaptive":
+                left = thinks == (controls.thinking == "always")
+            elif controls.think_threshold is not None:
+                left = thinks == (think_probability > controls.think_threshold)
+        number = np.array([uniform(controls.seed, index, len(tokens))])
+        token = int(allowed.ids[left][choose(scores[left], controls.temperature, controls.top_p, number)[0]])
+        place = len(inputs.prompt.ids) + len(tokens)
+        tokens.append(Token(token, cursor.section))
+        cursor = cursor.advance(token)
+        logits = model(
+            input_ids=torch.tensor([[token]]),
+            position_ids=torch.full((3, 1, 1), place + prompt.position_offset),
+            past_key_values=cache,
+            use_cache=True,
+        ).logits[0, -1]
+    text = loaded.vocabulary.decode([token.id for token in tokens])
+    values: Any = parse(FORMATS[request.format], text)
+    return Draw(
+        index=index,
+        text=text,
+        plan=values.get("plan"),
+        branch=values.get(BRANCH),
+        think_probability=think_probability,
+        thinking=values.get("thinking"),
+        revised_plan=values.get("revised_plan"),
+        trajectory=loaded.codec.decode(request.scene.history[None], [values["trajectory"]])[0],
+        codes=values["trajectory"],
+        tokens=dict(Counter(token.section for token in tokens)),
+    )

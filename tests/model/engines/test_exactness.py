@@ -1,0 +1,185 @@
+"""The gate: no shortcut, batch, arrival, cancellation or chunk changes a response. In float64.
+
+`LOOKTWICE_EXACTNESS_MIXES=2000 pytest -s tests/model/engines/test_exactness.py` looks longer.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from model.driving.plan import plan_from_bins
+from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thinking
+from model.engines.torch.decoder import Decoder, Failed, Shortcuts
+from model.engines.torch.runner import Runner
+from model.network.checkpoint import Loaded, load
+from tests.checkpoints import noisy_scene
+from tests.model.engines.reference import exactly, reference_draws
+
+MIXES = int(os.environ.get("LOOKTWICE_EXACTNESS_MIXES", "8"))
+SCENES = [noisy_scene(index, route=index % 2 == 1) for index in range(4)]
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A request, the step it arrives at, and the step it is cancelled at, if it is."""
+
+    request: PlanRequest
+    step: int
+    cancelled: int | None
+
+
+@st.composite
+def arrivals(draw: st.DrawFn) -> list[Arrival]:
+    found = []
+    for index in range(draw(st.integers(1, 4))):
+        format = draw(st.sampled_from(["cf_vla", "cf_vla", "traj_only"]))
+        thinking: Thinking = draw(st.sampled_from(["adaptive", "adaptive", "always", "never"]))
+        prefill = None
+        if format == "cf_vla" and draw(st.integers(0, 3)) == 0:
+            bins = np.zeros((3, 64), np.int8)
+            bins[0, draw(st.integers(1, 63)) :] = 1
+            prefill = plan_from_bins(bins)
+        controls = Controls(
+            n=draw(st.integers(1, 5)),
+            thinking=thinking,
+            think_threshold=draw(st.sampled_from([None, 0.3, 0.6])) if thinking == "adaptive" else None,
+            prefill=prefill,
+            temperature=draw(st.sampled_from([0.0, 0.2, 0.7, 1.0, 1.5])),
+            top_p=draw(st.sampled_from([1.0, 0.9, 0.5])),
+            seed=draw(st.integers(0, 1000)),
+            # The clock stands still: deadlines only decide who gives way to whom, and make drafts.
+            deadline_ms=draw(st.sampled_from([None, None, 5_000, 8_000])),
+        )
+        scene = draw(st.sampled_from(SCENES))
+        found.append(
+            Arrival(
+                PlanRequest(f"r{index}", scene, format, controls),
+                step=draw(st.integers(0, 30)),
+                cancelled=draw(st.one_of(st.none(), st.none(), st.integers(1, 60))),
+            )
+        )
+    return found
+
+
+shortcuts = st.builds(Shortcuts, **{field.name: st.booleans() for field in fields(Shortcuts)})
+
+
+@pytest.fixture(scope="module")
+def exact(untrained_checkpoint: Path) -> Loaded:
+    return exactly(load(untrained_checkpoint, dtype=torch.float64))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _inference() -> Iterator[None]:
+    with torch.inference_mode():
+        yield
+
+
+def decode(decoder: Decoder, mix: list[Arrival]) -> dict[tuple[str, int], Draw]:
+    """Whatever finishes, requests arriving and leaving in their steps."""
+    draws: dict[tuple[str, int], Draw] = {}
+    waiting, step = list(mix), 0
+    while waiting or not decoder.idle:
+        for arrival in [each for each in waiting if each.step <= step]:
+            decoder.add(arrival.request)
+            waiting.remove(arrival)
+        for arrival in mix:
+            if arrival.cancelled == step:
+                decoder.cancel(arrival.request.request_id)
+        for name, event in decoder.step():
+            assert not isinstance(event, Failed), event
+            if isinstance(event, DrawFinished):
+                draws[name, event.draw.index] = event.draw
+        decoder.check_integrity()
+        step += 1
+    return draws
+
+
+compared = 0
+
+
+@settings(
+    max_examples=MIXES,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=list(HealthCheck),
+    database=None,
+)
+@given(mix=arrivals(), shortcuts=shortcuts, rows=st.integers(10, 20), chunk=st.sampled_from([7, 64, 256]))
+def test_nothing_that_makes_it_fast_changes_a_response(
+    exact: Loaded, mix: list[Arrival], shortcuts: Shortcuts, rows: int, chunk: int
+) -> None:
+    global compared
+    runner = Runner(exact, rows, rows, clip_bytes=1 << 20)
+    fast = decode(Decoder(runner, shortcuts, prompt_chunk=chunk, clock=lambda: 0.0), mix)
+    plain: dict[tuple[str, int], Draw] = {}
+    for arrival in mix:
+        alone = Decoder(Runner(exact, 10, 10), Shortcuts.none(), clock=lambda: 0.0)
+        plain |= decode(alone, [Arrival(arrival.request, 0, None)])
+    assert {arrival.request.request_id for arrival in mix if arrival.cancelled is None} <= {
+        name for name, _ in fast
+    }
+    for key, draw in fast.items():
+        same(draw, plain[key])
+    compared += len(fast)
+    if MIXES > 100:
+        print(f"\r{compared} responses compared", end="", flush=True)
+
+
+@settings(
+    max_examples=max(2, MIXES // 20),
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=list(HealthCheck),
+    database=None,
+)
+@given(mix=arrivals())
+def test_the_decoder_without_shortcuts_is_the_one_of_transformers(exact: Loaded, mix: list[Arrival]) -> None:
+    for arrival in mix[:1]:
+        draws = decode(
+            Decoder(Runner(exact, 10, 10), Shortcuts.none(), clock=lambda: 0.0),
+            [Arrival(arrival.request, 0, None)],
+        )
+        for reference in reference_draws(exact, arrival.request):
+            same(draws[arrival.request.request_id, reference.index], reference)
+
+
+def same(draw: Draw, other: Draw) -> None:
+    """Every token and the branch; the think probability within rounding."""
+    assert draw.text == other.text
+    assert draw.tokens == other.tokens
+    assert draw.branch == other.branch
+    if other.think_probability is not None:
+        assert draw.think_probability == pytest.approx(other.think_probability, rel=1e-9)
+
+
+def test_a_soak_leaves_nothing_behind(exact: Loaded) -> None:
+    """Requests come, end and are cancelled by chance; in the end everything is free."""
+    random = np.random.default_rng(0)
+    decoder = Decoder(Runner(exact, 12, 4, clip_bytes=1 << 20), prompt_chunk=64)
+    names: list[str] = []
+    for step in range(int(os.environ.get("LOOKTWICE_SOAK_STEPS", "300"))):
+        if random.random() < 0.2:
+            names.append(f"s{step}")
+            format = "traj_only" if random.random() < 0.6 else "cf_vla"
+            deadline_ms = None if random.random() < 0.5 else int(random.integers(0, 2000))
+            controls = Controls(n=int(random.integers(1, 7)), seed=step, deadline_ms=deadline_ms)
+            decoder.add(PlanRequest(names[-1], SCENES[step % 4], format, controls))
+        if names and random.random() < 0.03:
+            decoder.cancel(names[int(random.integers(len(names)))])
+        for _, event in decoder.step():
+            assert not isinstance(event, Failed), event
+        decoder.check_integrity()
+    for name in names:
+        decoder.cancel(name)
+    assert decoder.idle
+    decoder.check_integrity()
