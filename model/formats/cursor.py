@@ -107,7 +107,8 @@ class CompiledFormat:
         self._expanded: dict[PlanTracks | Track | TrackWord, Sequence] = {}
         self._codes = tuple(np.arange(ids.start, ids.stop) for ids in map(vocabulary.code_ids, range(6)))
         self._free_ids: dict[tuple[str, bool], npt.NDArray[np.int64]] = {}
-        self._sentence_ends: frozenset[int] | None = None
+        self.sentence_ends = frozenset(id for mark in ".!?" for id in self.literal(mark)[-1:])
+        """Ids of the tokens that end a sentence."""
 
     def start(self, given: Values | None = None) -> Cursor:
         """A cursor at the beginning; plans of the sections in ``given`` are forced, equal neighbours joined.
@@ -190,12 +191,6 @@ class CompiledFormat:
             mask[self.literal(stop)[0]] = may_stop
             self._free_ids[key] = np.flatnonzero(mask)
         return self._free_ids[key]
-
-    def sentence_ends(self) -> frozenset[int]:
-        """Ids of the tokens that end a sentence."""
-        if self._sentence_ends is None:
-            self._sentence_ends = frozenset(id for mark in ".!?" for id in self.literal(mark)[-1:])
-        return self._sentence_ends
 
     def codes(self, stage: int) -> npt.NDArray[np.int64]:
         """Ids of one stage's codes."""

@@ -14,8 +14,9 @@ import torch
 from torch import Tensor, nn
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
+from model.driving.trajectory import FloatArray
 from model.network.encoders import HistoryEncoder, RouteEncoder
-from model.network.inputs import ModelInputs, rotary_positions
+from model.network.inputs import ModelInputs, Prompt, rotary_positions
 from model.network.patches import normalisation
 from model.network.settings import CONFIG_KEY, VlaSettings
 from model.network.vision import attends_to_whole_pictures, encode_pictures
@@ -119,18 +120,23 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
 
     def encode_prompt_embeddings(self, inputs: ModelInputs) -> PromptEmbeddings:
         """One scene's prompt, ready to be prefilled."""
+        patches = torch.from_numpy(inputs.patches).to(self.device)
+        vision_tokens = self.vision(patches, torch.from_numpy(inputs.video_grid_thw))
+        return self.embed_prompt(inputs.prompt, vision_tokens, inputs.history, inputs.route)
+
+    def embed_prompt(
+        self, prompt: Prompt, vision_tokens: Tensor, history: FloatArray, route: FloatArray | None
+    ) -> PromptEmbeddings:
+        """A prompt whose pictures are encoded: ``vision_tokens`` [k, hidden] of all its placeholders."""
         device = self.device
-        vision_tokens = self.vision(
-            torch.from_numpy(inputs.patches).to(device), torch.from_numpy(inputs.video_grid_thw)
-        )
         embeddings = self.embed(
-            torch.from_numpy(inputs.prompt.ids).to(device)[None],
+            torch.from_numpy(prompt.ids).to(device)[None],
             vision_tokens,
-            _tensor(inputs.history, device)[None],
-            None if inputs.route is None else _tensor(inputs.route, device)[None],
+            _tensor(history, device)[None],
+            None if route is None else _tensor(route, device)[None],
         )
-        positions = torch.from_numpy(inputs.prompt.position_ids).to(device)
-        return PromptEmbeddings(embeddings[0], positions, inputs.prompt.position_offset)
+        positions = torch.from_numpy(prompt.position_ids).to(device)
+        return PromptEmbeddings(embeddings[0], positions, prompt.position_offset)
 
     def position_ids(self, input_ids: Tensor, attention_mask: Tensor | None = None) -> Tensor:
         """Rotary positions int64 [3, b, t] of whole sequences; zeros where the mask is 0."""

@@ -23,7 +23,7 @@ from model.engines.torch.rows import Request, Row
 from model.engines.torch.runner import Feed, Prompt, Runner
 from model.engines.torch.schedule import Schedule, urgency
 from model.formats.cf_vla import FORMATS
-from model.formats.pieces import ACTION, BRANCH, THINKING, FormatError, Values
+from model.formats.pieces import ACTION, BRANCH, THINKING, FormatError
 from model.formats.text import parse
 
 Logits = npt.NDArray[np.float64]
@@ -136,7 +136,14 @@ class Decoder:
         if plan_request.format not in self._runner.formats:
             known = ", ".join(self._runner.formats)
             raise RequestError(f"unknown format {plan_request.format!r}; this checkpoint writes {known}")
-        request = Request(plan_request, self._clock())
+        prefill = controls.prefill
+        try:
+            start = self._runner.formats[plan_request.format].start(
+                {} if prefill is None else {"plan": prefill}
+            )
+        except FormatError as error:
+            raise RequestError(f"prefill: {error}") from error
+        request = Request(plan_request, start, self._clock())
         if not self._schedule.fits(request):
             raise RequestError(
                 f"n is {controls.n}; this engine runs at most {self._runner.rows} draws at once"
@@ -145,10 +152,6 @@ class Decoder:
         cameras = {clip.camera for clip in plan_request.scene.clips}
         if missing := [camera for camera in loaded.card.cameras if camera not in cameras]:
             raise RequestError(f"the scene lacks camera {', '.join(missing)}, which this checkpoint needs")
-        try:
-            self._runner.formats[plan_request.format].start(_given(plan_request))
-        except FormatError as error:
-            raise RequestError(f"prefill: {error}") from error
         self._schedule.add(request)
 
     def cancel(self, request_id: str) -> None:
@@ -258,10 +261,12 @@ class Decoder:
 
     def _first_rows(self, request: Request) -> list[Row]:
         """The rows that a request begins with."""
-        start = self._runner.formats[request.plan_request.format].start(_given(request.plan_request))
         every = tuple(range(request.controls.n))
         shared = self._shortcuts.shared_rows and self._shortcuts.shared_prompts
-        return [Row(request, draws, start) for draws in ([every] if shared else [(draw,) for draw in every])]
+        return [
+            Row(request, draws, request.start)
+            for draws in ([every] if shared else [(draw,) for draw in every])
+        ]
 
     def _feed_of(self, row: Row) -> Feed:
         """A row's pending tokens and what is proposed behind them, with the decisions among both."""
@@ -303,7 +308,7 @@ class Decoder:
         """
         time_for = self._pace.thinking(row.request.deadline_s, self._clock())
         chosen = sorted(row.choices(logits, time_for), key=lambda choice: choice[0] != proposed)
-        parts = [(row.part(draws, draft=row.draft), token) for token, draws in chosen[1:]]
+        parts = [(row.part(draws), token) for token, draws in chosen[1:]]
         if row.request.drafts and row.cursor.allowed().choice == BRANCH:
             direct = next(int(id) for id in row.cursor.allowed().ids if row.branch_of(int(id)) == ACTION)
             thinking = [draws for token, draws in chosen if row.branch_of(token) == THINKING]
@@ -410,8 +415,3 @@ class Decoder:
         assert isinstance(codes, tuple)
         trajectory = loaded.codec.decode(request.scene.history[None], [codes])[0]
         return row.finished(text, values, trajectory)
-
-
-def _given(request: PlanRequest) -> Values:
-    prefill = request.controls.prefill
-    return {} if prefill is None else {"plan": prefill}

@@ -32,6 +32,7 @@ class Request:
     """A request as the engine tracks it; times are those of the engine's clock."""
 
     plan_request: PlanRequest
+    start: Cursor
     submitted_s: float
     arrival: int = field(default_factory=lambda: next(_arrivals))
 
@@ -94,7 +95,13 @@ class Row:
 
     def part(self, draws: tuple[int, ...], *, draft: bool = False) -> Row:
         """A row of its own for some of the draws."""
-        return replace(self, draws=draws, pending=list(self.pending), tokens=list(self.tokens), draft=draft)
+        return replace(
+            self,
+            draws=draws,
+            pending=list(self.pending),
+            tokens=list(self.tokens),
+            draft=self.draft or draft,
+        )
 
     def branch_of(self, token: int) -> Branch:
         """At the branch: where ``token`` leads."""
@@ -166,7 +173,7 @@ class Row:
                 stops: npt.NDArray[np.bool_] = allowed.ids == self.cursor.stop_id
                 return stops
             return everything
-        leads = np.array([THINKING in self.cursor.option_texts(int(token)) for token in allowed.ids])
+        leads = np.array([self.branch_of(int(token)) == THINKING for token in allowed.ids])
         self.think_probability = float(probabilities(logits)[leads].sum())
         wanted: Branch | None = None
         if time_for is Thinking.END_NOW or controls.thinking == "never":
@@ -182,7 +189,7 @@ class Row:
     def _ends(self, time_for: Thinking) -> bool:
         """Whether a text stops here."""
         if time_for is Thinking.END_SENTENCE:
-            return self.tokens[-1].id in self.cursor.compiled.sentence_ends()
+            return self.tokens[-1].id in self.cursor.compiled.sentence_ends
         return time_for is Thinking.END_NOW
 
     def finished(self, text: str, values: Values, trajectory: FloatArray) -> list[Draw]:

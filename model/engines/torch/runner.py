@@ -121,21 +121,16 @@ class Runner:
         Raises:
             ValueError: the scene cannot be made into inputs (missing camera, damaged picture).
         """
-        loaded, device = self.loaded, self.loaded.model.device
+        loaded = self.loaded
         route = scene.route if loaded.settings.with_route else None
         prompt = loaded.inputs.prompt(format, route=route is not None)
         vision_tokens = self._clips.tokens(loaded.inputs.slices(scene), self._encode)
-        embeddings = loaded.model.embed(
-            torch.from_numpy(prompt.ids).to(device)[None],
-            torch.cat(vision_tokens),
-            torch.tensor(scene.history, device=device)[None],
-            None if route is None else torch.tensor(route, device=device)[None],
-        )[0]
-        rotation = self._decoder.rotation(torch.from_numpy(prompt.position_ids).to(device))
+        embedded = loaded.model.embed_prompt(prompt, torch.cat(vision_tokens), scene.history, route)
+        rotation = self._decoder.rotation(embedded.position_ids)
         kept = len(prompt.ids) - 1
         begun = Prompt(
             row,
-            embeddings[:kept],
+            embedded.embeddings[:kept],
             Rotation(*(part[:kept] for part in rotation)),
             0,
             int(prompt.ids[-1]),
