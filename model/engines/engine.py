@@ -12,6 +12,7 @@ from typing import Any, Literal, Protocol
 from model.driving.plan import Plan
 from model.driving.scene import Scene
 from model.driving.trajectory import FloatArray
+from model.formats.pieces import ACTION, THINKING
 
 Thinking = Literal["adaptive", "always", "never"]
 Branch = Literal["Action:", "Thinking:"]
@@ -21,6 +22,13 @@ MAX_DRAWS = 64
 
 class EngineError(RuntimeError):
     """The engine failed; the request may be tried again."""
+
+    @classmethod
+    def because(cls, what: str, cause: Exception) -> EngineError:
+        """An error that keeps its cause, to be handed on instead of raised."""
+        error = cls(f"{what}: {cause}")
+        error.__cause__ = cause
+        return error
 
 
 class RequestError(ValueError):
@@ -69,6 +77,16 @@ class Controls:
                 raise RequestError("think_threshold only has a meaning with thinking: adaptive")
             if not 0.0 <= self.think_threshold <= 1.0:
                 raise RequestError(f"think_threshold must lie in 0..1, got {self.think_threshold}")
+
+    def branch(self, think_probability: float) -> Branch | None:
+        """The branch that is decided by these controls; None leaves it to the draw."""
+        if self.thinking == "never":
+            return ACTION
+        if self.thinking == "always":
+            return THINKING
+        if self.think_threshold is None:
+            return None
+        return THINKING if think_probability > self.think_threshold else ACTION
 
 
 @dataclass(frozen=True)
@@ -190,5 +208,5 @@ class Engine(Protocol):
         ...
 
     def cancel(self, request_id: str) -> None:
-        """Drop a request; unknown ids are ignored."""
+        """Drop a request, whose iterator raises `EngineError`; unknown ids are ignored."""
         ...

@@ -56,28 +56,36 @@ class Token(NamedTuple):
     section: str
 
 
-class _Run(NamedTuple):
+class Run(NamedTuple):
+    """Within forced tokens."""
+
     ids: tuple[int, ...]
     position: int
 
 
-class _AtChoice(NamedTuple):
+class AtChoice(NamedTuple):
+    """Within the words of a choice, at a node of its trie."""
+
     choice: Choice
     node: Node
 
 
-class _InText(NamedTuple):
+class InText(NamedTuple):
+    """Within free text, behind so many of its tokens."""
+
     piece: FreeText
     used: int
 
 
-class _AtCode(NamedTuple):
+class AtCode(NamedTuple):
+    """Before the code of a stage."""
+
     piece: Codes
     stage: int
 
 
-_Active = _Run | _AtChoice | _InText | _AtCode
-_Rest = tuple[Piece, str, "_Rest"] | None
+Active = Run | AtChoice | InText | AtCode
+Rest = tuple[Piece, str, "Rest"] | None
 """What comes behind the active piece: a linked list of pieces with the section each stands in."""
 
 
@@ -203,14 +211,14 @@ class CompiledFormat:
             self._tries[texts] = build_trie(texts, self.literal)
         return self._tries[texts]
 
-    def _enter(self, rest: _Rest) -> Cursor:
+    def _enter(self, rest: Rest) -> Cursor:
         """The cursor at the first token of ``rest``."""
         while rest is not None:
             piece, section, after = rest
             match piece:
                 case Literal(text):
                     if ids := self.literal(text):
-                        return Cursor(self, _Run(ids, 0), section, after)
+                        return Cursor(self, Run(ids, 0), section, after)
                     rest = after
                 case Sequence(parts):
                     for part in reversed(parts):
@@ -223,11 +231,11 @@ class CompiledFormat:
                         self._expanded[piece] = piece.expand()
                     rest = (self._expanded[piece], section, after)
                 case Choice():
-                    return Cursor(self, _AtChoice(piece, self.trie(piece)), section, after)
+                    return Cursor(self, AtChoice(piece, self.trie(piece)), section, after)
                 case FreeText():
-                    return Cursor(self, _InText(piece, 0), section, after)
+                    return Cursor(self, InText(piece, 0), section, after)
                 case Codes():
-                    return Cursor(self, _AtCode(piece, 0), section, after)
+                    return Cursor(self, AtCode(piece, 0), section, after)
         return Cursor(self, None, "", None)
 
 
@@ -236,30 +244,37 @@ class Cursor:
     """A position in a response. Made by `CompiledFormat.start` and `advance`."""
 
     compiled: CompiledFormat = field(repr=False)
-    _active: _Active | None
+    active: Active | None
+    """The piece that the next token belongs to, and where in it; None at the end."""
     section: str
     """The section the next token belongs to."""
-    _rest: _Rest = field(repr=False)
+    rest: Rest = field(repr=False)
+    """What comes behind the active piece."""
 
     @property
     def done(self) -> bool:
         """Whether the response is complete."""
-        return self._active is None
+        return self.active is None
+
+    @property
+    def ending(self) -> bool:
+        """Whether only forced tokens are left."""
+        return isinstance(self.active, Run) and self.rest is None
 
     def allowed(self) -> Allowed:
         """What may come next; a single id means the token is forced. Not to be called when done."""
         name: str | None = None
-        match self._active:
-            case _Run(ids, position):
+        match self.active:
+            case Run(ids, position):
                 allowed = np.array([ids[position]], np.int64)
-            case _AtChoice(choice, node):
+            case AtChoice(choice, node):
                 allowed, name = node.ids, choice.name
-            case _InText(piece, used):
+            case InText(piece, used):
                 if used >= piece.max_tokens:
                     allowed = np.array([self.compiled.literal(piece.stop)[0]], np.int64)
                 else:
                     allowed = self.compiled.free_ids(piece.stop, may_stop=used > 0)
-            case _AtCode(_, stage):
+            case AtCode(_, stage):
                 allowed = self.compiled.codes(stage)
             case None:
                 raise FormatError("the response is complete")
@@ -279,43 +294,43 @@ class Cursor:
 
     def advance(self, token: int) -> Cursor:
         """The cursor behind ``token``; raises `FormatError` when it is not allowed here."""
-        match self._active:
-            case _Run(ids, position) if ids[position] == token:
+        match self.active:
+            case Run(ids, position) if ids[position] == token:
                 if position + 1 < len(ids):
-                    return self._at(_Run(ids, position + 1))
-                return self.compiled._enter(self._rest)
-            case _AtChoice(choice, node) if token in node.children:
+                    return self._at(Run(ids, position + 1))
+                return self.compiled._enter(self.rest)
+            case AtChoice(choice, node) if token in node.children:
                 child = node.children[token]
                 if child.option is None:
-                    return self._at(_AtChoice(choice, child))
-                return self.compiled._enter((choice.options[child.option].then, self.section, self._rest))
-            case _InText(piece, used):
+                    return self._at(AtChoice(choice, child))
+                return self.compiled._enter((choice.options[child.option].then, self.section, self.rest))
+            case InText(piece, used):
                 stop = self.compiled.literal(piece.stop)
                 if token == stop[0] and used > 0:
                     if len(stop) > 1:
-                        return self._at(_Run(stop, 1))
-                    return self.compiled._enter(self._rest)
+                        return self._at(Run(stop, 1))
+                    return self.compiled._enter(self.rest)
                 ids_allowed = self.compiled.free_ids(piece.stop, may_stop=False)
                 if used < piece.max_tokens and _holds(ids_allowed, token):
-                    return self._at(_InText(piece, used + 1))
-            case _AtCode(piece, stage) if _holds(self.compiled.codes(stage), token):
+                    return self._at(InText(piece, used + 1))
+            case AtCode(piece, stage) if _holds(self.compiled.codes(stage), token):
                 if stage + 1 < piece.count:
-                    return self._at(_AtCode(piece, stage + 1))
-                return self.compiled._enter(self._rest)
+                    return self._at(AtCode(piece, stage + 1))
+                return self.compiled._enter(self.rest)
         raise FormatError(f"token {token} is not allowed in section {self.section or 'end'!r}")
 
     def option_texts(self, token: int) -> tuple[str, ...]:
         """At a choice: the options still reachable when ``token`` is taken."""
-        if not isinstance(self._active, _AtChoice):
+        if not isinstance(self.active, AtChoice):
             raise FormatError("not at a choice")
-        choice, node = self._active
+        choice, node = self.active
         return tuple(choice.options[position].text for position in node.children[token].options())
 
     @property
     def stop_id(self) -> int | None:
         """Within free text: the token that ends it; None elsewhere."""
-        if isinstance(self._active, _InText):
-            return self.compiled.literal(self._active.piece.stop)[0]
+        if isinstance(self.active, InText):
+            return self.compiled.literal(self.active.piece.stop)[0]
         return None
 
     def answer(self, values: Values) -> tuple[int, ...]:
@@ -323,14 +338,14 @@ class Cursor:
         if self.section not in values:
             raise FormatError(f"section {self.section!r} needs a value")
         value = values[self.section]
-        match self._active:
-            case _AtChoice(choice, _):
+        match self.active:
+            case AtChoice(choice, _):
                 for option in choice.options:
                     if option.text == value:
                         return self.compiled.literal(option.text)
                 known = ", ".join(option.text for option in choice.options)
                 raise FormatError(f"{value!r} is none of {known}")
-            case _InText(piece, _) if isinstance(value, str):
+            case InText(piece, _) if isinstance(value, str):
                 if not value or piece.stop in value:
                     raise FormatError(f"section {self.section!r} must be text without {piece.stop!r}")
                 ids = self.compiled.encode(value)
@@ -341,12 +356,12 @@ class Cursor:
                 # At its budget the text stops by itself: the stop's first token is forced then.
                 stop = self.compiled.literal(piece.stop)[:1] if len(ids) < piece.max_tokens else ()
                 return ids + stop
-            case _AtCode(piece, _) if isinstance(value, tuple) and len(value) == piece.count:
+            case AtCode(piece, _) if isinstance(value, tuple) and len(value) == piece.count:
                 return tuple(int(self.compiled.codes(stage)[code]) for stage, code in enumerate(value))
         raise FormatError(f"section {self.section!r} cannot be written from {value!r}")
 
-    def _at(self, active: _Active) -> Cursor:
-        return Cursor(self.compiled, active, self.section, self._rest)
+    def _at(self, active: Active) -> Cursor:
+        return Cursor(self.compiled, active, self.section, self.rest)
 
 
 def _holds(ids: npt.NDArray[np.int64], token: int) -> bool:

@@ -34,7 +34,7 @@ def write_card(folder: Path, settings: VlaSettings, parameters: int, details: Ma
 
 
 def read_card(folder: Path) -> dict[str, Any]:
-    """The card of a folder, with at least ``name``, ``revision`` and ``details``.
+    """The card of a folder, with at least ``name``, ``revision``, ``parameters`` and ``details``.
 
     Raises:
         CheckpointError: missing, damaged or of another version.
@@ -50,7 +50,7 @@ def read_card(folder: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{path} has version {card.get('version')}; this LookTwice reads version {CARD_VERSION}"
         )
-    if missing := {"name", "revision", "details"} - card.keys():
+    if missing := {"name", "revision", "parameters", "details"} - card.keys():
         raise CheckpointError(f"{path} lacks {', '.join(sorted(missing))}")
     return card
 

@@ -22,7 +22,7 @@ from model.engines.engine import ModelCard
 from model.network.card import CheckpointError, read_card, weight_files, write_card
 from model.network.codec import CodecError, TrajectoryCodec
 from model.network.inputs import InputBuilder
-from model.network.settings import CONFIG_KEY, SettingsError, VlaSettings
+from model.network.settings import SettingsError, VlaSettings
 from model.network.vla import LookTwiceVla, VlaConfig, nano_config, padded_size, parameters_of, with_settings
 from model.network.vocabulary import Vocabulary, VocabularyError, expand_tokenizer
 
@@ -35,18 +35,16 @@ name of its own class only, so a subclass has to say it."""
 
 
 @dataclass(frozen=True, eq=False)
-class Loaded:
-    """A checkpoint in memory.
+class Parts:
+    """What surrounds a checkpoint's network.
 
     Attributes:
-        model: the network, in evaluation mode.
         vocabulary: its tokenizer.
         codec: its trajectory codec.
         inputs: builds its inputs.
         card: what it is, for people; ``engine`` is ``torch``.
     """
 
-    model: LookTwiceVla
     vocabulary: Vocabulary
     codec: TrajectoryCodec
     inputs: InputBuilder
@@ -56,6 +54,13 @@ class Loaded:
     def settings(self) -> VlaSettings:
         """Cameras, sizes and formats."""
         return self.inputs.settings
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded(Parts):
+    """A checkpoint in memory: ``model`` is the network, in evaluation mode."""
+
+    model: LookTwiceVla
 
 
 def create_nano(
@@ -120,21 +125,29 @@ def load(folder: Path, dtype: torch.dtype = torch.float32, device: str = "cpu") 
     Raises:
         CheckpointError: the folder or one of its parts is missing or does not fit; says which.
     """
+    parts = read_parts(folder)
+    network: Any = _load_model(folder, _read_config(folder), dtype)
+    return Loaded(**vars(parts), model=network.to(device).eval())
+
+
+def read_parts(folder: Path) -> Parts:
+    """Read a checkpoint folder but for its weights.
+
+    Raises:
+        CheckpointError: a part is missing or does not fit; says which.
+    """
     card = read_card(folder)
     config = _read_config(folder)
     try:
         vocabulary = Vocabulary(AutoTokenizer.from_pretrained(folder, local_files_only=True))
         codec = TrajectoryCodec.load(folder)
-        settings = VlaSettings.from_dict(_own_settings(config))
+        settings = VlaSettings.of_config(config)
     except (VocabularyError, CodecError, SettingsError) as error:
         raise CheckpointError(f"{folder}: {error}") from error
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{folder}: its tokenizer cannot be loaded: {error}") from error
     _check_sizes(codec, vocabulary)
-    model = _load_model(folder, config, dtype)
-    network: Any = model
-    return Loaded(
-        model=network.to(device).eval(),
+    return Parts(
         vocabulary=vocabulary,
         codec=codec,
         inputs=InputBuilder(vocabulary, settings),
@@ -145,7 +158,7 @@ def load(folder: Path, dtype: torch.dtype = torch.float32, device: str = "cpu") 
             formats=settings.formats,
             cameras=settings.cameras,
             image_size=(settings.image_width, settings.image_height),
-            parameters=parameters_of(model),
+            parameters=card["parameters"],
             details=card["details"],
         ),
     )
@@ -236,13 +249,6 @@ def _read_config(folder: Path) -> VlaConfig:
         return Qwen2_5_VLConfig.from_pretrained(folder, local_files_only=True)
     except (json.JSONDecodeError, OSError) as error:
         raise CheckpointError(f"{path} is damaged: {error}") from error
-
-
-def _own_settings(config: VlaConfig) -> dict[str, Any]:
-    extra = getattr(config, CONFIG_KEY, None)
-    if not isinstance(extra, dict):
-        raise SettingsError(f"its config.json has no {CONFIG_KEY!r}: expand a stock checkpoint first")
-    return {key: value for key, value in extra.items() if not key.endswith("_token_id")}
 
 
 def _load_model(

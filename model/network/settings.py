@@ -83,6 +83,14 @@ class VlaSettings:
         }
 
     @classmethod
+    def of_config(cls, config: Any) -> VlaSettings:
+        """The settings in a backbone's configuration, a `transformers` one; raises `SettingsError`."""
+        extra = getattr(config, CONFIG_KEY, None)
+        if not isinstance(extra, dict):
+            raise SettingsError(f"its config.json has no {CONFIG_KEY!r}: expand a stock checkpoint first")
+        return cls.from_dict({key: value for key, value in extra.items() if not key.endswith("_token_id")})
+
+    @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> VlaSettings:
         """The inverse of `to_dict`; raises `SettingsError` for unknown or unfitting entries."""
         try:

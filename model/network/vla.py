@@ -59,10 +59,10 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
 
     def __init__(self, config: VlaConfig) -> None:
         super().__init__(config)
-        extra = dict(getattr(config, CONFIG_KEY))
-        self.history_token_id: int = extra.pop("history_token_id")
-        self.route_token_id: int = extra.pop("route_token_id")
-        self.settings = VlaSettings.from_dict(extra)
+        self.settings = VlaSettings.of_config(config)
+        extra = getattr(config, CONFIG_KEY)
+        self.history_token_id: int = extra["history_token_id"]
+        self.route_token_id: int = extra["route_token_id"]
         hidden_size = config.text_config.hidden_size
         self.history_encoder = HistoryEncoder(hidden_size)
         self.route_encoder = RouteEncoder(hidden_size) if self.settings.with_route else None

@@ -18,7 +18,6 @@ from model.evaluation.open_loop import expert_plan
 from model.network.checkpoint import Loaded
 
 _ROWS = 48
-_PROMPTS = 8
 
 
 def open_loop(
@@ -36,7 +35,7 @@ def open_loop(
     with torch.inference_mode():
         for format in formats:
             for route in (False, True):
-                decoder = Decoder(Runner(loaded, _ROWS, _PROMPTS))
+                decoder = Decoder(Runner(loaded, _ROWS))
                 for labelled in scenes:
                     scene = labelled.scene if route else replace(labelled.scene, route=None)
                     decoder.add(PlanRequest(scene.scene_id, scene, format, Controls(n=n, thinking="never")))

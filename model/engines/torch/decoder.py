@@ -18,13 +18,12 @@ from model.engines.engine import (
     PlanRequest,
     RequestError,
 )
+from model.engines.requests import begin, branch_of, read
 from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
 from model.engines.torch.runner import Feed, Prompt, Runner
 from model.engines.torch.schedule import Schedule, urgency
-from model.formats.cf_vla import FORMATS
-from model.formats.pieces import ACTION, BRANCH, THINKING, FormatError
-from model.formats.text import parse
+from model.formats.pieces import ACTION, BRANCH, THINKING
 
 Logits = npt.NDArray[np.float64]
 
@@ -112,7 +111,7 @@ class Decoder:
         self._drafts: dict[tuple[str, int], Draw] = {}
         self._paused: dict[str, list[Row]] = {}
         self._runner, self._shortcuts, self._chunk = runner, shortcuts, prompt_chunk
-        self._schedule = Schedule(runner.rows, runner.prompts, prompts_per_draw=not shortcuts.shared_prompts)
+        self._schedule = Schedule(runner.rows)
         self._beginnings: list[_Beginning] = []
         self._prompts: list[Prompt] = []
         self._rows: list[Row] = []
@@ -130,28 +129,15 @@ class Decoder:
             RequestError: it can never be served: unknown format, too many draws, a missing camera, a
                 prefill the format cannot write; or its id is in use.
         """
-        loaded, controls = self._runner.loaded, plan_request.controls
         if plan_request.request_id in self._schedule:
             raise RequestError(f"request id {plan_request.request_id} is in use")
-        if plan_request.format not in self._runner.formats:
-            known = ", ".join(self._runner.formats)
-            raise RequestError(f"unknown format {plan_request.format!r}; this checkpoint writes {known}")
-        prefill = controls.prefill
-        try:
-            start = self._runner.formats[plan_request.format].start(
-                {} if prefill is None else {"plan": prefill}
-            )
-        except FormatError as error:
-            raise RequestError(f"prefill: {error}") from error
+        start = begin(plan_request, self._runner.loaded.card, self._runner.formats)
         request = Request(plan_request, start, self._clock())
         if not self._schedule.fits(request):
             raise RequestError(
-                f"n is {controls.n}; this engine runs at most {self._runner.rows} draws at once"
+                f"n is {request.controls.n}; this engine runs at most {self._runner.rows} draws at once"
                 + (", half of them under a deadline" if request.drafts else "")
             )
-        cameras = {clip.camera for clip in plan_request.scene.clips}
-        if missing := [camera for camera in loaded.card.cameras if camera not in cameras]:
-            raise RequestError(f"the scene lacks camera {', '.join(missing)}, which this checkpoint needs")
         self._schedule.add(request)
 
     def cancel(self, request_id: str) -> None:
@@ -222,7 +208,6 @@ class Decoder:
         assert len(self._rows) <= self._runner.rows
         if not self._rows and not self._beginnings and self.idle:
             assert self._schedule.free_rows == self._runner.rows
-            assert self._schedule.free_prompts == self._runner.prompts
         for row in self._rows:
             assert row.draws
             assert row.pending or row.cursor.done, "a row has nothing to feed"
@@ -242,9 +227,7 @@ class Decoder:
             except ValueError as error:
                 return [self._fail(request, RequestError(str(error)))]
             except Exception as error:  # one scene that cannot be encoded must not end the others
-                failure = EngineError(f"the scene could not be encoded: {error}")
-                failure.__cause__ = error
-                return [self._fail(request, failure)]
+                return [self._fail(request, EngineError.because("the scene could not be encoded", error))]
             self._prompts.append(beginning.prompt)
         prompt = beginning.prompt
         self._runner.feed_prompt(prompt, self._chunk if self._rows else len(prompt.embeddings))
@@ -264,7 +247,7 @@ class Decoder:
         every = tuple(range(request.controls.n))
         shared = self._shortcuts.shared_rows and self._shortcuts.shared_prompts
         return [
-            Row(request, draws, request.start)
+            Row(request.start, request, draws)
             for draws in ([every] if shared else [(draw,) for draw in every])
         ]
 
@@ -306,12 +289,14 @@ class Decoder:
 
         The row goes on with those that choose ``proposed``, if any do.
         """
-        time_for = self._pace.thinking(row.request.deadline_s, self._clock())
+        time_for = self._pace.time_for(row.request.deadline_s, self._clock())
         chosen = sorted(row.choices(logits, time_for), key=lambda choice: choice[0] != proposed)
         parts = [(row.part(draws), token) for token, draws in chosen[1:]]
         if row.request.drafts and row.cursor.allowed().choice == BRANCH:
-            direct = next(int(id) for id in row.cursor.allowed().ids if row.branch_of(int(id)) == ACTION)
-            thinking = [draws for token, draws in chosen if row.branch_of(token) == THINKING]
+            direct = next(
+                int(id) for id in row.cursor.allowed().ids if branch_of(row.cursor, int(id)) == ACTION
+            )
+            thinking = [draws for token, draws in chosen if branch_of(row.cursor, token) == THINKING]
             parts += [(row.part(draws, draft=True), direct) for draws in thinking]
         token, row.draws = chosen[0]
         vocabulary = self._runner.loaded.vocabulary
@@ -336,10 +321,16 @@ class Decoder:
             if row not in self._rows:
                 continue  # its request failed with another of its rows
             try:
-                draws = self._read(row)
+                draws = read(
+                    row.request.plan_request,
+                    row.tokens,
+                    row.think_probability,
+                    row.draws,
+                    self._runner.loaded.vocabulary,
+                    self._runner.loaded.codec,
+                )
             except Exception as error:  # a response that cannot be read back must not end the others
-                failure = EngineError(f"a response could not be read back: {error}")
-                failure.__cause__ = error
+                failure = EngineError.because("a response could not be read back", error)
                 events.append(self._fail(row.request, failure))
                 continue
             if row.draft:
@@ -406,12 +397,3 @@ class Decoder:
         if last is not prompt:
             self._prompts[prompt.row] = last
             self._runner.move_prompt(last, prompt.row)
-
-    def _read(self, row: Row) -> list[Draw]:
-        loaded, request = self._runner.loaded, row.request.plan_request
-        text = loaded.vocabulary.decode([token.id for token in row.tokens])
-        values = parse(FORMATS[request.format], text)
-        codes = values["trajectory"]
-        assert isinstance(codes, tuple)
-        trajectory = loaded.codec.decode(request.scene.history[None], [codes])[0]
-        return row.finished(text, values, trajectory)

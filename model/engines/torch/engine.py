@@ -10,14 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from model.driving.images import encode_jpeg
-from model.driving.scene import CLIP_FRAMES, Clip, Scene
-from model.driving.trajectory import HISTORY_STEPS
 from model.engines.engine import (
-    Controls,
     DrawFinished,
     EngineError,
     Event,
@@ -27,6 +22,7 @@ from model.engines.engine import (
 )
 from model.engines.torch.decoder import Decoder, Failed, Shortcuts
 from model.engines.torch.runner import Runner
+from model.engines.warm_up import warm_up
 from model.network.checkpoint import load
 
 
@@ -43,7 +39,6 @@ class TorchSettings:
 
     Attributes:
         rows: draws decoded at once; more wait.
-        prompts: scenes decoded at once.
         clip_bytes: of vision tokens kept for pictures that come again.
         dtype: of weights, keys and values.
         products: what matrix products are worked out in; by default bfloat16 on CPUs that have units for
@@ -53,20 +48,11 @@ class TorchSettings:
     """
 
     rows: int = 96
-    prompts: int = 16
     clip_bytes: int = 256 << 20
     dtype: torch.dtype = torch.float32
     products: torch.dtype | None = field(default_factory=fast_products)
     device: str = "cpu"
     shortcuts: Shortcuts = field(default_factory=Shortcuts)
-
-
-def grey_scene(card: ModelCard) -> Scene:
-    """A standing ego that sees nothing but grey, through the cameras of a checkpoint."""
-    width, height = card.image_size
-    picture = encode_jpeg(np.full((height, width, 3), 128, np.uint8))
-    clips = tuple(Clip(camera, (picture,) * CLIP_FRAMES) for camera in card.cameras)
-    return Scene("grey", clips, np.zeros((HISTORY_STEPS, 4), np.float32))
 
 
 class TorchEngine:
@@ -90,10 +76,7 @@ class TorchEngine:
             raise EngineError("the engine runs already")
         self._thread = threading.Thread(target=self._run, name="looktwice-engine", daemon=True)
         self._thread.start()
-        for format in self.card.formats:
-            warm_up = PlanRequest(f"warm-up {format}", grey_scene(self.card), format, Controls(n=1))
-            async for _ in self.submit(warm_up):
-                pass
+        await warm_up(self)
 
     async def stop(self) -> None:
         """Cancel everything and end the thread; running requests get an `EngineError`."""
@@ -126,6 +109,7 @@ class TorchEngine:
 
     def cancel(self, request_id: str) -> None:
         """Drop a request; unknown ids are ignored."""
+        self._tell(request_id, Failed(EngineError("the request was cancelled")))
         self._commands.put(lambda decoder: decoder.cancel(request_id))
 
     def _add(self, decoder: Decoder, request: PlanRequest) -> None:
@@ -144,7 +128,6 @@ class TorchEngine:
         runner = Runner(
             self._loaded,
             settings.rows,
-            settings.prompts,
             clip_bytes=settings.clip_bytes,
             products=settings.products,
         )
@@ -156,8 +139,7 @@ class TorchEngine:
                     for request_id, event in decoder.step():
                         self._tell(request_id, event)
         except Exception as error:  # the thread's last word: everyone who waits must hear of it
-            reason = EngineError(f"decoding failed: {error}")
-            reason.__cause__ = error
+            reason = EngineError.because("decoding failed", error)
         for request_id in list(self._listeners):
             self._tell(request_id, Failed(reason))
 

@@ -14,8 +14,8 @@ _CALM: Final = 1.5
 """With less than so many times the necessary time left, a text ends at the next sentence."""
 
 
-class Thinking(Enum):
-    """What time allows a text to do."""
+class TimeFor(Enum):
+    """What there is time for, within a text."""
 
     GO_ON = "go on"
     END_SENTENCE = "end with this sentence"
@@ -37,13 +37,13 @@ class Pace:
         """A response took so many passes behind its text."""
         self.ending_passes += _MEMORY * (passes - self.ending_passes)
 
-    def thinking(self, deadline_s: float, now_s: float) -> Thinking:
+    def time_for(self, deadline_s: float, now_s: float) -> TimeFor:
         """What a text may do, so that what must follow it fits before the deadline."""
         left_s = deadline_s - now_s
         needed_s = self.step_s * self.ending_passes
         if left_s > _CALM * needed_s:
-            return Thinking.GO_ON
-        return Thinking.END_SENTENCE if left_s > needed_s else Thinking.END_NOW
+            return TimeFor.GO_ON
+        return TimeFor.END_SENTENCE if left_s > needed_s else TimeFor.END_NOW
 
     def last_step(self, deadline_s: float, now_s: float) -> bool:
         """Whether another step would end behind the deadline."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -11,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.plan import Plan
-from model.driving.trajectory import FloatArray
-from model.engines.engine import Branch, Controls, Draw, Event, PlanRequest, SectionFinished
-from model.engines.torch.pace import Thinking
+from model.engines.engine import Controls, Event, PlanRequest, SectionFinished
+from model.engines.requests import branch_of
+from model.engines.response import FinishedSection, Response
+from model.engines.torch.pace import TimeFor
 from model.engines.torch.sampler import choose, probabilities, uniforms
-from model.formats.cursor import Allowed, Cursor, Token
-from model.formats.pieces import ACTION, BRANCH, THINKING, Values
+from model.formats.cursor import Allowed, Cursor
+from model.formats.pieces import ACTION, BRANCH, THINKING
 from model.network.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
@@ -59,18 +58,15 @@ class Request:
 
 
 @dataclass(eq=False)
-class Row:
-    """One row of the batch.
+class Row(Response):
+    """One row of the batch: a response, and the draws that have written it.
 
     Attributes:
         request: whose.
-        draws: indices of the draws that have written ``tokens``, at least one.
-        cursor: where the response stands, behind everything in ``tokens``.
+        draws: indices of the draws, at least one.
         prompt: in whose memory its prompt lies; None while it has not begun or is paused.
         pending: tokens (of the response, before it the prompt's last) that the network has not seen yet.
         held: how many tokens its KV row holds.
-        tokens: the response so far.
-        think_probability: at the branch, once that is decided.
         draft: whether it is a direct trajectory beside a reflection.
         passes: how many it took part in.
         passes_before_ending: how many up to the end of its text.
@@ -78,12 +74,9 @@ class Row:
 
     request: Request
     draws: tuple[int, ...]
-    cursor: Cursor
     prompt: Prompt | None = None
     pending: list[int] = field(default_factory=list)
     held: int = 0
-    tokens: list[Token] = field(default_factory=list)
-    think_probability: float | None = None
     draft: bool = False
     passes: int = 0
     passes_before_ending: int = 0
@@ -103,10 +96,6 @@ class Row:
             draft=self.draft or draft,
         )
 
-    def branch_of(self, token: int) -> Branch:
-        """At the branch: where ``token`` leads."""
-        return THINKING if THINKING in self.cursor.option_texts(token) else ACTION
-
     def proposal(self) -> list[int]:
         """What may come behind ``pending``: a revised plan goes on as the first plan did, while it does."""
         if self.cursor.section != _REVISED:
@@ -121,7 +110,7 @@ class Row:
         self.pending = self.pending[count:]
 
     def choices(
-        self, logits: npt.NDArray[np.float64], time_for: Thinking
+        self, logits: npt.NDArray[np.float64], time_for: TimeFor
     ) -> list[tuple[int, tuple[int, ...]]]:
         """What the draws choose at the cursor: each token with the draws that choose it, in order.
 
@@ -141,29 +130,20 @@ class Row:
 
     def write(self, ids: Sequence[int], vocabulary: Vocabulary) -> list[Event]:
         """Append tokens and the forced run behind them; returns the sections that they finish."""
-        events: list[Event] = []
+        written, finished = len(self.tokens), list[FinishedSection]()
         was_text = self.cursor.stop_id is not None
         for token in ids:
-            events += self._append(token, vocabulary)
+            finished += self.append(token, vocabulary)
         if was_text and self.cursor.stop_id is None:
             self.passes_before_ending = self.passes
-        run, _ = self.cursor.forced()
-        for token, _ in run:
-            events += self._append(token, vocabulary)
-        return events
-
-    def _append(self, token: int, vocabulary: Vocabulary) -> list[Event]:
-        section = self.cursor.section
-        self.tokens.append(Token(token, section))
-        self.pending.append(token)
-        self.cursor = self.cursor.advance(token)
-        if self.cursor.section == section or self.draft:
+        finished += self.append_forced(vocabulary)
+        self.pending += [token.id for token in self.tokens[written:]]
+        if self.draft:
             return []
-        text = vocabulary.decode([token.id for token in self.tokens if token.section == section])
-        return [SectionFinished(index, section, text) for index in self.draws]
+        return [SectionFinished(index, *section) for section in finished for index in self.draws]
 
     def _controlled(
-        self, allowed: Allowed, logits: npt.NDArray[np.float64], time_for: Thinking
+        self, allowed: Allowed, logits: npt.NDArray[np.float64], time_for: TimeFor
     ) -> npt.NDArray[np.bool_]:
         """Which of the allowed ids the request's controls and its deadline leave."""
         controls = self.request.controls
@@ -173,42 +153,15 @@ class Row:
                 stops: npt.NDArray[np.bool_] = allowed.ids == self.cursor.stop_id
                 return stops
             return everything
-        leads = np.array([self.branch_of(int(token)) == THINKING for token in allowed.ids])
+        leads = np.array([branch_of(self.cursor, int(token)) == THINKING for token in allowed.ids])
         self.think_probability = float(probabilities(logits)[leads].sum())
-        wanted: Branch | None = None
-        if time_for is Thinking.END_NOW or controls.thinking == "never":
-            wanted = ACTION
-        elif controls.thinking == "always":
-            wanted = THINKING
-        elif controls.think_threshold is not None:
-            wanted = THINKING if self.think_probability > controls.think_threshold else ACTION
+        wanted = ACTION if time_for is TimeFor.END_NOW else controls.branch(self.think_probability)
         if wanted is None:
             return everything
         return leads if wanted == THINKING else ~leads
 
-    def _ends(self, time_for: Thinking) -> bool:
+    def _ends(self, time_for: TimeFor) -> bool:
         """Whether a text stops here."""
-        if time_for is Thinking.END_SENTENCE:
+        if time_for is TimeFor.END_SENTENCE:
             return self.tokens[-1].id in self.cursor.compiled.sentence_ends
-        return time_for is Thinking.END_NOW
-
-    def finished(self, text: str, values: Values, trajectory: FloatArray) -> list[Draw]:
-        """The finished draws: all the same, but for their index."""
-        plan, revised = values.get("plan"), values.get("revised_plan")
-        branch, thinking, codes = values.get(BRANCH), values.get("thinking"), values["trajectory"]
-        assert isinstance(codes, tuple)
-        return [
-            Draw(
-                index=index,
-                text=text,
-                plan=plan if isinstance(plan, Plan) else None,
-                branch=THINKING if branch == THINKING else ACTION if branch == ACTION else None,
-                think_probability=self.think_probability,
-                thinking=thinking if isinstance(thinking, str) else None,
-                revised_plan=revised if isinstance(revised, Plan) else None,
-                trajectory=trajectory,
-                codes=codes,
-                tokens=dict(Counter(token.section for token in self.tokens)),
-            )
-            for index in self.draws
-        ]
+        return time_for is TimeFor.END_NOW

@@ -69,8 +69,7 @@ class Runner:
 
     Args:
         loaded: its weights must not change while the runner is used.
-        rows: draws that can run at once.
-        prompts: prompts that can be held at once.
+        rows: draws that can run at once, each with a prompt of its own if need be.
         clip_bytes: of vision tokens kept for pictures that come again.
         products: what matrix products are worked out in; None for the weights' own type.
     """
@@ -79,13 +78,12 @@ class Runner:
         self,
         loaded: Loaded,
         rows: int,
-        prompts: int,
         *,
         clip_bytes: int = 0,
         products: torch.dtype | None = None,
     ) -> None:
         self.loaded = loaded
-        self.rows, self.prompts = rows, prompts
+        self.rows = rows
         self.formats = {
             name: CompiledFormat(FORMATS[name], loaded.vocabulary) for name in loaded.card.formats
         }
@@ -109,7 +107,7 @@ class Runner:
             "dtype": loaded.model.dtype,
             "device": loaded.model.device,
         }
-        self._prompts = KvRows(rows=prompts, length=max(kept), **sizes)
+        self._prompts = KvRows(rows=rows, length=max(kept), **sizes)
         self._draws = KvRows(rows=rows, length=length, **sizes)
         every_place = torch.arange(max(kept) + 1 + length, device=loaded.model.device)
         self._rotation = self._decoder.rotation(every_place.expand(3, -1))
@@ -170,7 +168,7 @@ class Runner:
                 for feed, count in zip(feeds, counts, strict=True)
             ]
         )
-        lengths = [0] * self.prompts
+        lengths = [0] * self.rows
         for feed in feeds:
             lengths[feed.prompt.row] = feed.prompt.held
         fed = [Fed(feed.prompt.row, feed.held, count) for feed, count in zip(feeds, counts, strict=True)]

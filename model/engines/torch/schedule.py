@@ -23,12 +23,10 @@ class Schedule:
 
     Args:
         rows: draws that can run at once.
-        prompts: prompts that can be held at once.
-        prompts_per_draw: each draw brings a prompt of its own instead of one for all.
     """
 
-    def __init__(self, rows: int, prompts: int, *, prompts_per_draw: bool = False) -> None:
-        self._rows, self._prompts, self._prompts_per_draw = rows, prompts, prompts_per_draw
+    def __init__(self, rows: int) -> None:
+        self._rows = rows
         self._waiting: list[Request] = []
         self._admitted: dict[str, Request] = {}
 
@@ -45,22 +43,13 @@ class Schedule:
         """Rows that no admitted request may claim."""
         return self._rows - sum(map(self.rows_of, self._admitted.values()))
 
-    @property
-    def free_prompts(self) -> int:
-        """Prompts that no admitted request may claim."""
-        return self._prompts - sum(map(self.prompts_of, self._admitted.values()))
-
     def rows_of(self, request: Request) -> int:
         """How many rows a request may come to use: every draw one, and one for its draft."""
         return request.controls.n * (2 if request.drafts else 1)
 
-    def prompts_of(self, request: Request) -> int:
-        """How many prompts a request holds."""
-        return request.controls.n if self._prompts_per_draw else 1
-
     def fits(self, request: Request) -> bool:
         """Whether a request could run if it were alone."""
-        return self.rows_of(request) <= self._rows and self.prompts_of(request) <= self._prompts
+        return self.rows_of(request) <= self._rows
 
     def add(self, request: Request) -> None:
         """Queue a request that `fits`."""
@@ -75,14 +64,14 @@ class Schedule:
         if not self._waiting or self._waiting[0].controls.deadline_ms is None:
             return []
         first, victims = self._waiting[0], list[Request]()
-        rows, prompts = self.free_rows, self.free_prompts
+        rows = self.free_rows
         for request in sorted(self._admitted.values(), key=urgency, reverse=True):
-            if rows >= self.rows_of(first) and prompts >= self.prompts_of(first):
+            if rows >= self.rows_of(first):
                 break
             if urgency(request) < urgency(first):
                 return []
             victims.append(request)
-            rows, prompts = rows + self.rows_of(request), prompts + self.prompts_of(request)
+            rows += self.rows_of(request)
         for request in victims:
             self._waiting.append(self._admitted.pop(request.id))
         return victims
@@ -93,7 +82,7 @@ class Schedule:
         self._waiting.sort(key=urgency)
         while self._waiting:
             request = self._waiting[0]
-            if self.rows_of(request) > self.free_rows or self.prompts_of(request) > self.free_prompts:
+            if self.rows_of(request) > self.free_rows:
                 break
             self._admitted[request.id] = self._waiting.pop(0)
             admitted.append(request)

@@ -119,11 +119,11 @@ def test_nothing_that_makes_it_fast_changes_a_response(
     exact: Loaded, mix: list[Arrival], shortcuts: Shortcuts, rows: int, chunk: int
 ) -> None:
     global compared
-    runner = Runner(exact, rows, rows, clip_bytes=1 << 20)
+    runner = Runner(exact, rows, clip_bytes=1 << 20)
     fast = decode(Decoder(runner, shortcuts, prompt_chunk=chunk, clock=lambda: 0.0), mix)
     plain: dict[tuple[str, int], Draw] = {}
     for arrival in mix:
-        alone = Decoder(Runner(exact, 10, 10), Shortcuts.none(), clock=lambda: 0.0)
+        alone = Decoder(Runner(exact, 10), Shortcuts.none(), clock=lambda: 0.0)
         plain |= decode(alone, [Arrival(arrival.request, 0, None)])
     assert {arrival.request.request_id for arrival in mix if arrival.cancelled is None} <= {
         name for name, _ in fast
@@ -146,7 +146,7 @@ def test_nothing_that_makes_it_fast_changes_a_response(
 def test_the_decoder_without_shortcuts_is_the_one_of_transformers(exact: Loaded, mix: list[Arrival]) -> None:
     for arrival in mix[:1]:
         draws = decode(
-            Decoder(Runner(exact, 10, 10), Shortcuts.none(), clock=lambda: 0.0),
+            Decoder(Runner(exact, 10), Shortcuts.none(), clock=lambda: 0.0),
             [Arrival(arrival.request, 0, None)],
         )
         for reference in reference_draws(exact, arrival.request):
@@ -165,7 +165,7 @@ def same(draw: Draw, other: Draw) -> None:
 def test_a_soak_leaves_nothing_behind(exact: Loaded) -> None:
     """Requests come, end and are cancelled by chance; in the end everything is free."""
     random = np.random.default_rng(0)
-    decoder = Decoder(Runner(exact, 12, 4, clip_bytes=1 << 20), prompt_chunk=64)
+    decoder = Decoder(Runner(exact, 12, clip_bytes=1 << 20), prompt_chunk=64)
     names: list[str] = []
     for step in range(int(os.environ.get("LOOKTWICE_SOAK_STEPS", "300"))):
         if random.random() < 0.2:

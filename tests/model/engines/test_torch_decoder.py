@@ -88,7 +88,7 @@ def test_draws_are_those_of_the_plain_decoder(
     exact: Loaded, plainly: dict[tuple[str, int], Draw], off: str | None
 ) -> None:
     shortcuts = Shortcuts.none() if off == "all" else replace(Shortcuts(), **({off: False} if off else {}))
-    decoder = Decoder(Runner(exact, 13, 13, clip_bytes=1 << 20), shortcuts, prompt_chunk=50)
+    decoder = Decoder(Runner(exact, 13, clip_bytes=1 << 20), shortcuts, prompt_chunk=50)
     draws = decode(decoder, *MIX)
     assert draws.keys() == plainly.keys()
     for key, draw in draws.items():
@@ -106,7 +106,7 @@ def test_shortcuts_save_what_they_are_for(exact: Loaded) -> None:
     one = request("a", 0, n=6, seed=1, temperature=0.3, thinking="always")
 
     def counts(**off: bool) -> Counts:
-        decoder = Decoder(Runner(exact, 6, 6), replace(Shortcuts(), **off))
+        decoder = Decoder(Runner(exact, 6), replace(Shortcuts(), **off))
         decode(decoder, one)
         return decoder.counts
 
@@ -120,7 +120,7 @@ def test_shortcuts_save_what_they_are_for(exact: Loaded) -> None:
 def test_cached_steps_equal_a_full_pass(exact: Loaded) -> None:
     """The decoder's greedy choice at every decision is that of one pass over the whole sequence."""
     one = request("a", 1, n=1, temperature=0.0, thinking="never")
-    draw = decode(Decoder(Runner(exact, 1, 1)), one)["a", 0]
+    draw = decode(Decoder(Runner(exact, 1)), one)["a", 0]
     inputs = exact.inputs.build(one.scene, "cf_vla")
     compiled = CompiledFormat(CF_VLA, exact.vocabulary)
     response = compiled.render(parse(CF_VLA, draw.text))
@@ -144,7 +144,7 @@ def test_cached_steps_equal_a_full_pass(exact: Loaded) -> None:
 
 @pytest.mark.parametrize("thinking", ["always", "never"])
 def test_the_caller_may_decide_the_branch(exact: Loaded, thinking: str) -> None:
-    draws = decode(Decoder(Runner(exact, 2, 2)), request("a", n=2, thinking=thinking))
+    draws = decode(Decoder(Runner(exact, 2)), request("a", n=2, thinking=thinking))
     for draw in draws.values():
         assert draw.branch == ("Thinking:" if thinking == "always" else "Action:")
         assert (draw.revised_plan is not None) == (thinking == "always")
@@ -153,7 +153,7 @@ def test_the_caller_may_decide_the_branch(exact: Loaded, thinking: str) -> None:
 
 
 def test_the_threshold_decides_by_think_probability(exact: Loaded) -> None:
-    decoder = Decoder(Runner(exact, 4, 4))
+    decoder = Decoder(Runner(exact, 4))
     draws = decode(decoder, request("a", n=1), request("b", n=1, think_threshold=0.0))
     assert draws["b", 0].branch == "Thinking:"
     probability = draws["a", 0].think_probability
@@ -163,7 +163,7 @@ def test_the_threshold_decides_by_think_probability(exact: Loaded) -> None:
 
 
 def test_a_prefilled_plan_stands(exact: Loaded) -> None:
-    draws = decode(Decoder(Runner(exact, 4, 4)), request("a", n=3, prefill=PLAN))
+    draws = decode(Decoder(Runner(exact, 4)), request("a", n=3, prefill=PLAN))
     assert all(draw.plan == PLAN for draw in draws.values())
 
 
@@ -178,12 +178,12 @@ class Clock:
 
 
 def test_a_passed_deadline_leaves_thinking_out(exact: Loaded) -> None:
-    draws = decode(Decoder(Runner(exact, 4, 2)), request("a", n=2, thinking="always", deadline_ms=0))
+    draws = decode(Decoder(Runner(exact, 4)), request("a", n=2, thinking="always", deadline_ms=0))
     assert all(draw.branch == "Action:" for draw in draws.values())
 
 
 def test_in_time_a_reflection_replaces_its_draft(exact: Loaded) -> None:
-    decoder = Decoder(Runner(exact, 4, 1), clock=Clock())
+    decoder = Decoder(Runner(exact, 4), clock=Clock())
     decoder.add(request("a", n=2, seed=4, thinking="always", deadline_ms=100_000))
     drafts, draws, order = {}, {}, []
     while not decoder.idle:
@@ -195,8 +195,8 @@ def test_in_time_a_reflection_replaces_its_draft(exact: Loaded) -> None:
                 draws[event.draw.index] = event.draw
                 order.append(("draw", event.draw.index))
         decoder.check_integrity()
-    unhurried = decode(Decoder(Runner(exact, 4, 1)), request("a", n=2, seed=4, thinking="always"))
-    direct = decode(Decoder(Runner(exact, 4, 1)), request("a", n=2, seed=4, thinking="never"))
+    unhurried = decode(Decoder(Runner(exact, 4)), request("a", n=2, seed=4, thinking="always"))
+    direct = decode(Decoder(Runner(exact, 4)), request("a", n=2, seed=4, thinking="never"))
     for index in range(2):
         assert order.index(("draft", index)) < order.index(("draw", index))
         assert draws[index].text == unhurried["a", index].text
@@ -205,7 +205,7 @@ def test_in_time_a_reflection_replaces_its_draft(exact: Loaded) -> None:
 
 def test_at_the_deadline_the_draft_is_the_answer(exact: Loaded) -> None:
     clock = Clock()
-    decoder = Decoder(Runner(exact, 4, 1), clock=clock)
+    decoder = Decoder(Runner(exact, 4), clock=clock)
     decoder.add(request("a", n=2, seed=4, thinking="always", deadline_ms=100_000))
     drafts, draws = {}, {}
     while not decoder.idle:
@@ -238,7 +238,7 @@ class Steady(Pace):
 
 def test_who_has_less_time_goes_first_and_the_others_lose_nothing(exact: Loaded) -> None:
     clock = Clock()
-    decoder = Decoder(Runner(exact, 4, 2), clock=clock)
+    decoder = Decoder(Runner(exact, 4), clock=clock)
     patient = request("patient", 0, n=4, seed=1, thinking="never")
     urgent = request("urgent", 1, "traj_only", n=2, seed=2, deadline_ms=1000)
     decoder.add(patient)
@@ -254,9 +254,9 @@ def test_who_has_less_time_goes_first_and_the_others_lose_nothing(exact: Loaded)
 
 def test_thinking_is_cut_when_the_rest_would_not_fit(exact: Loaded) -> None:
     asked = request("a", n=1, seed=4, thinking="always", deadline_ms=100_000)
-    unhurried = decode(Decoder(Runner(exact, 2, 1), clock=Clock()), asked)["a", 0]
+    unhurried = decode(Decoder(Runner(exact, 2), clock=Clock()), asked)["a", 0]
     clock = Clock()
-    decoder = Decoder(Runner(exact, 2, 1), clock=clock, pace=Steady())
+    decoder = Decoder(Runner(exact, 2), clock=clock, pace=Steady())
     decoder.add(asked)
     draws = []
     while not decoder.idle:
@@ -274,7 +274,7 @@ def test_thinking_is_cut_when_the_rest_would_not_fit(exact: Loaded) -> None:
 def test_every_response_parses_at_high_temperature(untrained_checkpoint: Path) -> None:
     loaded = load(untrained_checkpoint)
     requests = [request(f"{k}", k, n=8, temperature=1.5, seed=k) for k in range(3)]
-    draws = decode(Decoder(Runner(loaded, 24, 3)), *requests)
+    draws = decode(Decoder(Runner(loaded, 24)), *requests)
     compiled = CompiledFormat(CF_VLA, loaded.vocabulary)
     assert len(draws) == 24
     for draw in draws.values():
@@ -285,7 +285,7 @@ def test_every_response_parses_at_high_temperature(untrained_checkpoint: Path) -
 
 
 def test_events_name_sections_in_order(exact: Loaded) -> None:
-    decoder = Decoder(Runner(exact, 2, 2))
+    decoder = Decoder(Runner(exact, 2))
     decoder.add(request("a", n=1, thinking="always"))
     sections = []
     while not decoder.idle:
@@ -294,14 +294,14 @@ def test_events_name_sections_in_order(exact: Loaded) -> None:
 
 
 def test_requests_beyond_the_rows_wait_and_are_served(exact: Loaded) -> None:
-    decoder = Decoder(Runner(exact, 2, 2))
+    decoder = Decoder(Runner(exact, 2))
     draws = decode(decoder, *(request(f"{k}", k, "traj_only", n=2) for k in range(3)))
     assert len(draws) == 6
 
 
 def test_cancelling_frees_rows_and_spares_others(exact: Loaded) -> None:
-    expected = decode(Decoder(Runner(exact, 4, 4)), request("b", 1, "traj_only", n=2))
-    decoder = Decoder(Runner(exact, 4, 4))
+    expected = decode(Decoder(Runner(exact, 4)), request("b", 1, "traj_only", n=2))
+    decoder = Decoder(Runner(exact, 4))
     decoder.add(request("a", 0, n=2))
     decoder.add(request("b", 1, "traj_only", n=2))
     decoder.add(request("c", 2, n=2))
@@ -324,4 +324,4 @@ def test_cancelling_frees_rows_and_spares_others(exact: Loaded) -> None:
 )
 def test_impossible_requests_are_refused(exact: Loaded, change: dict[str, object], message: str) -> None:
     with pytest.raises(RequestError, match=message):
-        Decoder(Runner(exact, 8, 8)).add(request("a", **change))  # type: ignore[arg-type]
+        Decoder(Runner(exact, 8)).add(request("a", **change))  # type: ignore[arg-type]

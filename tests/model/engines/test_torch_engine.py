@@ -98,6 +98,21 @@ def test_an_id_is_used_once_at_a_time(untrained_checkpoint: Path) -> None:
     run(test)
 
 
+def test_cancelling_by_name_tells_who_waits(untrained_checkpoint: Path) -> None:
+    async def test() -> None:
+        async with running(untrained_checkpoint, rows=2) as engine:
+            request = PlanRequest("slow", noisy_scene(), controls=Controls(n=2, thinking="always"))
+            waiting = asyncio.create_task(plan(engine, request))
+            await asyncio.sleep(0.05)
+            engine.cancel("slow")
+            engine.cancel("unknown")
+            with pytest.raises(EngineError, match="cancelled"):
+                await waiting
+            assert len(await plan(engine, direct("next", n=2))) == 2
+
+    run(test)
+
+
 def test_stopping_tells_those_who_wait(untrained_checkpoint: Path) -> None:
     async def test() -> None:
         async with running(untrained_checkpoint) as engine:

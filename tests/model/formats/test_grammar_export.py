@@ -3,11 +3,14 @@ from __future__ import annotations
 from typing import ClassVar
 
 import llguidance
+import llguidance.numpy
+import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from model.formats.cf_vla import CF_VLA, FORMATS
-from model.formats.cursor import CompiledFormat
+from model.formats.cursor import CompiledFormat, Cursor
 from model.formats.grammar_export import to_lark
 from model.formats.pieces import Values
 from tests.model.formats.strategies import cf_vla_values
@@ -29,32 +32,61 @@ class _Tokenizer:
         return list(VOCABULARY.encode(text if isinstance(text, str) else text.decode()))
 
 
-def matcher(format_name: str) -> llguidance.LLMatcher:
-    tokenizer = llguidance.LLTokenizer(llguidance.TokenizerWrapper(_Tokenizer()))
-    grammar = to_lark(FORMATS[format_name], VOCABULARY)
-    matcher = llguidance.LLMatcher(tokenizer, llguidance.grammar_from("lark", grammar))
+TOKENIZER = llguidance.LLTokenizer(llguidance.TokenizerWrapper(_Tokenizer()))
+
+
+def matcher(cursor: Cursor) -> llguidance.LLMatcher:
+    matcher = llguidance.LLMatcher(TOKENIZER, llguidance.grammar_from("lark", to_lark(cursor)))
     assert not matcher.is_error(), matcher.get_error()
     return matcher
 
 
+def allowed_by(state: llguidance.LLMatcher) -> set[int]:
+    bits = llguidance.numpy.allocate_token_bitmask(1, len(VOCABULARY.texts))
+    llguidance.numpy.fill_next_token_bitmask(state, bits, 0)
+    return set(np.flatnonzero(np.unpackbits(bits.view(np.uint8), bitorder="little")).tolist())
+
+
+BASE = {name: matcher(CompiledFormat(format, VOCABULARY).start()) for name, format in FORMATS.items()}
+
+
 @pytest.mark.parametrize("name", sorted(FORMATS))
-def test_grammars_are_valid(name: str) -> None:
-    matcher(name)
-
-
-BASE = matcher("cf_vla")
+def test_it_begins_as_the_format_does(name: str) -> None:
+    cursor = CompiledFormat(FORMATS[name], VOCABULARY).start()
+    assert allowed_by(BASE[name].deep_copy()) == set(cursor.allowed().ids.tolist())
 
 
 @settings(max_examples=20, deadline=None)
 @given(cf_vla_values())
-def test_the_grammar_accepts_what_training_writes(values: Values) -> None:
+def test_it_allows_what_the_cursor_allows(values: Values) -> None:
+    state, cursor = BASE["cf_vla"].deep_copy(), COMPILED.start()
+    for token in COMPILED.render(values):
+        mine, theirs = set(cursor.allowed().ids.tolist()), allowed_by(state)
+        # A word may follow itself there, and a track may go on when the cursor has counted enough.
+        assert mine <= theirs
+        assert mine == theirs or cursor.section in ("plan", "revised_plan")
+        assert state.consume_token(token.id)
+        cursor = cursor.advance(token.id)
+    assert cursor.done
+    assert state.is_accepting()
+
+
+@settings(max_examples=20, deadline=None)
+@given(cf_vla_values(), st.integers(0, 400))
+def test_it_goes_on_from_any_cursor(values: Values, place: int) -> None:
     tokens = [token.id for token in COMPILED.render(values)]
-    state = BASE.deep_copy()
-    assert state.validate_tokens(tokens) == len(tokens)
+    place %= len(tokens)
+    cursor = COMPILED.start()
+    for token in tokens[:place]:
+        cursor = cursor.advance(token)
+    state = matcher(cursor)
+    # The very next token is the cursor's choice alone, however its grammar goes on.
+    assert allowed_by(state) == set(cursor.allowed().ids.tolist())
+    assert state.validate_tokens(tokens[place:]) == len(tokens) - place
 
 
-def test_the_grammar_refuses_a_gap() -> None:
+def test_it_refuses_a_gap() -> None:
     text = "Meta Actions:\n- longitudinal\n  - 0.0s-0.9s: Keep Speed\n  - 1.0s-"
     tokens = list(VOCABULARY.encode(text))
-    accepted = BASE.deep_copy().validate_tokens(tokens)
+    accepted = BASE["cf_vla"].deep_copy().validate_tokens(tokens)
     assert VOCABULARY.decode(tokens[:accepted]).endswith("Keep Speed\n  - ")

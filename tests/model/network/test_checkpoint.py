@@ -131,7 +131,7 @@ def test_other_versions_and_kinds_are_refused(nano_folder: Path, tmp_path: Path)
     with pytest.raises(CheckpointError, match="version 99"):
         load(folder)
     (folder / CARD_FILE).write_text(json.dumps({"version": 1}))
-    with pytest.raises(CheckpointError, match="details, name, revision"):
+    with pytest.raises(CheckpointError, match="details, name, parameters, revision"):
         load(folder)
     (folder / CARD_FILE).write_text(json.dumps(card))
     config = json.loads((folder / "config.json").read_text())

@@ -1,0 +1,1 @@
+"""The vLLM engine: for checkpoints and clusters that outgrow the torch engine."""

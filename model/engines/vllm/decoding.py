@@ -1,0 +1,187 @@
+"""One request to vLLM: its draws, the vLLM requests that write them, the events that this gives."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
+from contextlib import aclosing
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from model.engines.engine import DrawFinished, EngineError, Event, PlanRequest, SectionFinished
+from model.engines.requests import branch_of, read
+from model.engines.response import FinishedSection, Response
+from model.formats.cursor import Cursor
+from model.formats.pieces import ACTION, BRANCH, THINKING
+from model.network.checkpoint import Parts
+
+_SEEDS: Final = 2**63
+_FAR: Final = 700.0
+"""A difference of log-probabilities beyond which the exponential overflows."""
+
+
+class VllmPrompt(NamedTuple):
+    """A scene as vLLM takes it: token ids with one placeholder a clip, and what stands for them."""
+
+    ids: list[int]
+    data: dict[str, Any]
+
+    def then(self, written: Sequence[int]) -> dict[str, Any]:
+        """The prompt with what is written behind it."""
+        return {"prompt_token_ids": [*self.ids, *written], "multi_modal_data": self.data}
+
+
+@dataclass(eq=False)
+class _Walk(Response):
+    """A draw, walked along with vLLM."""
+
+    index: int
+
+
+class Decoding:
+    """Decodes one request; used once.
+
+    Args:
+        llm: a running ``AsyncLLM``.
+        parts: of the checkpoint that it runs.
+        grammar: what may follow a cursor, for vLLM.
+        request: what is asked.
+        start: where its response begins.
+    """
+
+    def __init__(
+        self,
+        llm: Any,
+        parts: Parts,
+        grammar: Callable[[Cursor], str],
+        request: PlanRequest,
+        start: Cursor,
+    ) -> None:
+        self._llm, self._parts, self._grammar = llm, parts, grammar
+        self._request, self._start = request, start
+        self._happened: asyncio.Queue[Event | Exception] = asyncio.Queue()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._requests = 0
+
+    async def events(self, prompt: VllmPrompt) -> AsyncGenerator[Event]:
+        """What happens, up to the last `DrawFinished`; closing it early frees everything."""
+        self._prompt = prompt
+        draws = [_Walk(self._start, index) for index in range(self._request.controls.n)]
+        try:
+            for draw in draws:
+                self._tell(draw, draw.append_forced(self._parts.vocabulary))
+            self._go_on(draws)
+            left = len(draws)
+            while left:
+                happened = await self._happened.get()
+                if isinstance(happened, Exception):
+                    raise happened
+                left -= isinstance(happened, DrawFinished)
+                yield happened
+        finally:
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def fail(self, error: Exception) -> None:
+        """End `events` with ``error``."""
+        self._happened.put_nowait(error)
+
+    def _go_on(self, draws: Sequence[_Walk]) -> None:
+        """Let vLLM write on for draws that have written the same."""
+        task = asyncio.create_task(self._follow(draws))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _follow(self, draws: Sequence[_Walk]) -> None:
+        try:
+            written = [token.id for token in draws[0].tokens]
+            number, self._requests = self._requests, self._requests + 1
+            stream = self._llm.generate(
+                self._prompt.then(written), self._parameters(draws), f"{self._request.request_id}/{number}"
+            )
+            following = {draw.index for draw in draws}
+            async with aclosing(stream):
+                async for output in stream:
+                    for part in output.outputs:
+                        draw = draws[part.index]
+                        if draw.index in following and not self._walk(draw, part.token_ids, part.logprobs):
+                            following.discard(draw.index)
+                    if not following:
+                        return
+            raise EngineError("vLLM ended a response before its format does")
+        except EngineError as error:
+            self.fail(error)
+        except Exception as error:  # vLLM's own, of whatever type
+            self.fail(EngineError.because("vLLM failed", error))
+
+    def _parameters(self, draws: Sequence[_Walk]) -> Any:
+        from vllm import SamplingParams
+        from vllm.sampling_params import RequestOutputKind, StructuredOutputsParams
+
+        controls, first = self._request.controls, draws[0]
+        seed = controls.seed
+        if first.tokens:
+            # Draws that go on apart must not repeat the random numbers of their beginnings.
+            place = [controls.seed % _SEEDS, first.index, len(first.tokens)]
+            seed = int(np.random.SeedSequence(place).generate_state(1, np.uint64)[0])
+        return SamplingParams(
+            n=len(draws),
+            temperature=controls.temperature,
+            top_p=controls.top_p,
+            seed=seed % _SEEDS,
+            max_tokens=first.cursor.compiled.longest(),
+            logprob_token_ids=self._branch_ids(first),
+            structured_outputs=StructuredOutputsParams(grammar=self._grammar(first.cursor)),
+            detokenize=False,
+            output_kind=RequestOutputKind.DELTA,
+        )
+
+    def _branch_ids(self, draw: _Walk) -> list[int] | None:
+        """The tokens whose probabilities decide the branch, where it is still to come."""
+        compiled = draw.cursor.compiled
+        if draw.think_probability is not None or BRANCH not in compiled.format.sections():
+            return None
+        return [compiled.literal(word)[0] for word in (ACTION, THINKING)]
+
+    def _walk(self, draw: _Walk, tokens: Sequence[int], logprobs: Sequence[Mapping[int, Any]] | None) -> bool:
+        """Write what vLLM wrote; False when the draw is done, or goes on elsewhere."""
+        for place, token in enumerate(tokens):
+            allowed, wanted = draw.cursor.allowed(), token
+            if allowed.choice == BRANCH and len(allowed.ids) > 1:
+                assert logprobs is not None
+                wanted = self._decide(draw, token, logprobs[place])
+            fits = wanted in allowed.ids
+            if fits:
+                self._tell(draw, draw.append(wanted, self._parts.vocabulary))
+            if fits and wanted == token and not draw.cursor.ending:
+                continue
+            self._tell(draw, draw.append_forced(self._parts.vocabulary))
+            if draw.cursor.done:
+                self._finish(draw)
+            else:
+                self._go_on([draw])
+            return False
+        return True
+
+    def _decide(self, draw: _Walk, token: int, logprobs: Mapping[int, Any]) -> int:
+        """At the branch: the token that the controls decide for, vLLM's own where they leave it open."""
+        options = {branch_of(draw.cursor, int(id)): int(id) for id in draw.cursor.allowed().ids}
+        action, thinking = (logprobs[options[branch]].logprob for branch in (ACTION, THINKING))
+        draw.think_probability = 1 / (1 + math.exp(min(action - thinking, _FAR)))
+        branch = self._request.controls.branch(draw.think_probability)
+        return token if branch is None else options[branch]
+
+    def _finish(self, draw: _Walk) -> None:
+        vocabulary, codec = self._parts.vocabulary, self._parts.codec
+        for finished in read(
+            self._request, draw.tokens, draw.think_probability, [draw.index], vocabulary, codec
+        ):
+            self._happened.put_nowait(DrawFinished(finished))
+
+    def _tell(self, draw: _Walk, sections: Iterable[FinishedSection]) -> None:
+        for section in sections:
+            self._happened.put_nowait(SectionFinished(draw.index, *section))

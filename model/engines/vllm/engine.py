@@ -1,0 +1,186 @@
+"""The vLLM engine: `AsyncLLM` behind the same interface, for checkpoints and clusters that outgrow ours."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+from collections.abc import AsyncIterator, Mapping
+from contextlib import aclosing
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from model.driving.scene import Scene
+from model.engines.engine import EngineError, Event, ModelCard, PlanRequest, RequestError
+from model.engines.requests import begin
+from model.engines.vllm.decoding import Decoding, VllmPrompt
+from model.engines.warm_up import warm_up
+from model.formats.cf_vla import FORMATS
+from model.formats.cursor import Active, CompiledFormat, Cursor, Rest
+from model.formats.grammar_export import to_lark
+from model.network.checkpoint import read_parts
+from model.network.vocabulary import VIDEO_PAD
+
+_ENVIRONMENT: Final = {"VLLM_NO_USAGE_STATS": "1", "HF_HUB_OFFLINE": "1", "VLLM_CPU_KVCACHE_SPACE": "2"}
+"""Unless set otherwise: nothing is sent or fetched; 2 GiB of keys and values where there is no GPU."""
+_GRAMMARS: Final = 256
+"""Kept, some 40 kB each: those of formats and branches, and of the latest places where draws went on."""
+
+
+@dataclass(frozen=True)
+class VllmSettings:
+    """How the vLLM engine runs.
+
+    Attributes:
+        rows: draws decoded at once; more wait.
+        dtype: of weights, keys and values, as vLLM names it.
+        arguments: anything else that vLLM's ``AsyncEngineArgs`` take, such as ``tensor_parallel_size``,
+            ``data_parallel_size``, ``distributed_executor_backend``, ``gpu_memory_utilization``.
+    """
+
+    rows: int = 96
+    dtype: str = "auto"
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+
+class VllmEngine:
+    """`model.engines.engine.Engine` over a checkpoint folder; see there for the contract.
+
+    vLLM writes tokens under a grammar, and a cursor walks along with every draw. Where the two part (a
+    control decides the branch otherwise, or the grammar allows what the format forbids), the draw goes on
+    from what the cursor allows in a request of its own, whose beginning lies in vLLM's prefix cache.
+
+    Deadlines are refused: vLLM cannot cut a text short and go on. Random numbers are vLLM's, so a seed
+    gives other draws than with the torch engine; at temperature 0 both write the same.
+    """
+
+    def __init__(self, checkpoint: Path, settings: VllmSettings = VllmSettings()) -> None:
+        self._checkpoint, self._settings = checkpoint, settings
+        self._parts = read_parts(checkpoint)
+        self._card = replace(self._parts.card, engine="vllm")
+        self._formats = {
+            name: CompiledFormat(FORMATS[name], self._parts.vocabulary) for name in self._card.formats
+        }
+        self._llm: Any = None
+        self._running: dict[str, Decoding] = {}
+
+        @lru_cache(_GRAMMARS)
+        def grammar(compiled: CompiledFormat, active: Active, rest: Rest) -> str:
+            return to_lark(Cursor(compiled, active, "", rest))
+
+        self._grammar = grammar
+
+    @property
+    def card(self) -> ModelCard:
+        """What is loaded."""
+        return self._card
+
+    @property
+    def llm(self) -> Any:
+        """vLLM's own ``AsyncLLM``; raises `EngineError` while the engine does not run."""
+        if self._llm is None:
+            raise EngineError("the engine is not running")
+        return self._llm
+
+    async def start(self) -> None:
+        """Start vLLM's processes and plan once for a grey scene in every format."""
+        if self._llm is not None:
+            raise EngineError("the engine runs already")
+        for name, value in _ENVIRONMENT.items():
+            os.environ.setdefault(name, value)
+        try:
+            self._llm = await asyncio.to_thread(self._load)
+        except Exception as error:  # vLLM's own, of whatever type
+            raise EngineError.because("vLLM did not start", error) from error
+        await warm_up(self)
+
+    async def stop(self) -> None:
+        """Cancel everything and end vLLM's processes; running requests get an `EngineError`."""
+        if self._llm is None:
+            return
+        for decoding in self._running.values():
+            decoding.fail(EngineError("the engine was stopped"))
+        llm, self._llm = self._llm, None
+        # Else it would take the end of vLLM's processes for their death, and say so.
+        if llm.output_handler is not None:
+            llm.output_handler.cancel()
+        await asyncio.to_thread(llm.shutdown)
+        # vLLM shuts down once more when it is collected, which fails where the interpreter ends first.
+        del llm
+        gc.collect()
+
+    async def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
+        """Queue a request and iterate over its events; see `Engine.submit`."""
+        llm = self.llm
+        if request.request_id in self._running:
+            raise RequestError(f"request id {request.request_id} is in use")
+        start = begin(request, self._card, self._formats)
+        if request.controls.deadline_ms is not None:
+            raise RequestError("deadline_ms needs the torch engine: vLLM cannot cut a text short and go on")
+        decoding = Decoding(llm, self._parts, self._grammar_of, request, start)
+        self._running[request.request_id] = decoding
+        try:
+            prompt = await asyncio.to_thread(self.prompt, request.scene, request.format)
+            async with aclosing(decoding.events(prompt)) as events:
+                async for event in events:
+                    yield event
+        finally:
+            del self._running[request.request_id]
+
+    def cancel(self, request_id: str) -> None:
+        """Drop a request; unknown ids are ignored."""
+        if decoding := self._running.get(request_id):
+            decoding.fail(EngineError("the request was cancelled"))
+
+    def prompt(self, scene: Scene, format: str) -> VllmPrompt:
+        """A scene as vLLM takes it.
+
+        Raises:
+            RequestError: the scene cannot be made into inputs (missing camera, damaged picture).
+        """
+        try:
+            inputs = self._parts.inputs.build(scene, format)
+        except ValueError as error:
+            raise RequestError(str(error)) from error
+        ids, placeholder = inputs.prompt.ids, self._parts.vocabulary.id_of(VIDEO_PAD)
+        # vLLM wants one placeholder a clip and repeats it by itself.
+        kept = (ids != placeholder) | (np.roll(ids, 1) != placeholder)
+        data = {
+            "video": inputs.patches.reshape(len(inputs.video_grid_thw), -1, inputs.patches.shape[1]),
+            "history": inputs.history[None],
+        }
+        if inputs.route is not None:
+            data["route"] = inputs.route[None]
+        return VllmPrompt(ids[kept].tolist(), data)
+
+    def _grammar_of(self, cursor: Cursor) -> str:
+        assert cursor.active is not None
+        return self._grammar(cursor.compiled, cursor.active, cursor.rest)
+
+    def _load(self) -> Any:
+        from vllm.engine.arg_utils import AsyncEngineArgs
+        from vllm.v1.engine.async_llm import AsyncLLM
+
+        settings = self._parts.settings
+        prompts = [
+            len(self._parts.inputs.prompt(format, route=route).ids)
+            for format in self._card.formats
+            for route in {False, settings.with_route}
+        ]
+        limits = {"video": len(settings.cameras), "history": 1} | (
+            {"route": 1} if settings.with_route else {}
+        )
+        arguments = {
+            "model": str(self._checkpoint),
+            "dtype": self._settings.dtype,
+            "max_num_seqs": self._settings.rows,
+            "max_model_len": max(prompts) + max(each.longest() for each in self._formats.values()),
+            "limit_mm_per_prompt": limits,
+            "structured_outputs_config": {"backend": "guidance"},
+            "disable_log_stats": True,
+        }
+        return AsyncLLM.from_engine_args(AsyncEngineArgs(**(arguments | dict(self._settings.arguments))))

@@ -1,0 +1,26 @@
+"""The first requests of an engine, before anybody waits for one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from model.driving.images import encode_jpeg
+from model.driving.scene import CLIP_FRAMES, Clip, Scene
+from model.driving.trajectory import HISTORY_STEPS
+from model.engines.engine import Controls, Engine, ModelCard, PlanRequest
+
+
+def grey_scene(card: ModelCard) -> Scene:
+    """A standing ego that sees nothing but grey, through the cameras of a checkpoint."""
+    width, height = card.image_size
+    picture = encode_jpeg(np.full((height, width, 3), 128, np.uint8))
+    clips = tuple(Clip(camera, (picture,) * CLIP_FRAMES) for camera in card.cameras)
+    return Scene("grey", clips, np.zeros((HISTORY_STEPS, 4), np.float32))
+
+
+async def warm_up(engine: Engine) -> None:
+    """Plan once for a grey scene in every format."""
+    for format in engine.card.formats:
+        request = PlanRequest(f"warm-up {format}", grey_scene(engine.card), format, Controls(n=1))
+        async for _ in engine.submit(request):
+            pass

@@ -1,0 +1,232 @@
+"""Real vLLM (CPU build) over the bundled checkpoint, beside the torch engine."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+import pytest
+
+from model.bundled import CHECKPOINT, SCENES
+from model.driving.plan import parse_plan
+from model.driving.scene import Clip, Scene
+from model.driving.scene_store import read_scenes
+from model.engines.engine import (
+    Controls,
+    Draw,
+    DrawFinished,
+    Engine,
+    EngineError,
+    Event,
+    PlanRequest,
+    RequestError,
+    SectionFinished,
+)
+from model.engines.torch.engine import TorchEngine, TorchSettings
+from model.engines.vllm.engine import VllmEngine, VllmSettings
+from model.formats.cf_vla import FORMATS
+from model.formats.text import parse
+
+T = TypeVar("T")
+Run = Callable[[Awaitable[T]], T]
+BUNDLED = [labelled.scene for labelled in read_scenes(SCENES)]
+
+
+@pytest.fixture(scope="module")
+def loop() -> Iterator[asyncio.AbstractEventLoop]:
+    """One loop for all: vLLM belongs to the loop that it was started in."""
+    loop = asyncio.new_event_loop()
+    yield loop
+    loop.close()
+
+
+@pytest.fixture(scope="module")
+def vllm(loop: asyncio.AbstractEventLoop) -> Iterator[VllmEngine]:
+    arguments = {"enforce_eager": True, "block_size": 32}
+    engine = VllmEngine(CHECKPOINT, VllmSettings(rows=48, dtype="float32", arguments=arguments))
+    loop.run_until_complete(engine.start())
+    yield engine
+    loop.run_until_complete(engine.stop())
+
+
+@pytest.fixture(scope="module")
+def torch_engine(loop: asyncio.AbstractEventLoop) -> Iterator[TorchEngine]:
+    engine = TorchEngine(CHECKPOINT, TorchSettings(products=None))
+    loop.run_until_complete(engine.start())
+    yield engine
+    loop.run_until_complete(engine.stop())
+
+
+async def events_of(engine: Engine, request: PlanRequest) -> list[Event]:
+    return [event async for event in engine.submit(request)]
+
+
+async def plan(engine: Engine, request: PlanRequest) -> list[Draw]:
+    events = await events_of(engine, request)
+    draws = [event.draw for event in events if isinstance(event, DrawFinished)]
+    return sorted(draws, key=lambda draw: draw.index)
+
+
+async def plans(engine: Engine, requests: list[PlanRequest]) -> list[list[Draw]]:
+    return await asyncio.gather(*(plan(engine, request) for request in requests))
+
+
+def greedy(name: str, scene: Scene, **controls: object) -> PlanRequest:
+    return PlanRequest(name, scene, controls=Controls(n=1, temperature=0.0, **controls))  # type: ignore[arg-type]
+
+
+def mixed_scenes(count: int) -> list[Scene]:
+    """Bundled pictures with histories and routes of other bundled scenes; every third without a route."""
+    size = len(BUNDLED)
+    return [
+        replace(
+            BUNDLED[k % size],
+            scene_id=f"mixed-{k}",
+            history=BUNDLED[(k + k // size) % size].history,
+            route=None if k % 3 == 0 else BUNDLED[(k + k // size) % size].route,
+        )
+        for k in range(count)
+    ]
+
+
+def test_both_engines_write_the_same_at_temperature_0(
+    loop: asyncio.AbstractEventLoop, vllm: VllmEngine, torch_engine: TorchEngine
+) -> None:
+    requests = [greedy(scene.scene_id, scene) for scene in mixed_scenes(108)]
+    ours = loop.run_until_complete(plans(torch_engine, requests))
+    theirs = loop.run_until_complete(plans(vllm, requests))
+    parted = [
+        f"{request.request_id}:\n{mine.text}\n{other.text}"
+        for request, [mine], [other] in zip(requests, ours, theirs, strict=True)
+        if mine.text != other.text
+    ]
+    assert not parted, "\n\n".join(parted)
+    for [mine], [other] in zip(ours, theirs, strict=True):
+        assert mine.codes == other.codes
+        assert mine.tokens == other.tokens
+        assert mine.think_probability is not None
+        assert other.think_probability == pytest.approx(mine.think_probability, rel=1e-2, abs=1e-6)
+        np.testing.assert_array_equal(mine.trajectory, other.trajectory)
+
+
+@pytest.mark.parametrize("thinking", ["always", "never"])
+def test_the_branch_can_be_forced(
+    loop: asyncio.AbstractEventLoop, vllm: VllmEngine, torch_engine: TorchEngine, thinking: str
+) -> None:
+    requests = [greedy(scene.scene_id, scene, thinking=thinking) for scene in mixed_scenes(8)]
+    ours = loop.run_until_complete(plans(torch_engine, requests))
+    theirs = loop.run_until_complete(plans(vllm, requests))
+    assert [draw.text for [draw] in ours] == [draw.text for [draw] in theirs]
+    assert {draw.branch for [draw] in theirs} == {"Thinking:" if thinking == "always" else "Action:"}
+    assert all(draw.think_probability is not None for [draw] in theirs)
+
+
+def test_the_threshold_decides(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
+    scene = BUNDLED[0]
+    [free] = loop.run_until_complete(plan(vllm, greedy("free", scene)))
+    assert free.think_probability is not None
+    below, above = free.think_probability * 0.5, min(1.0, free.think_probability * 2 + 1e-6)
+    [thinks] = loop.run_until_complete(plan(vllm, greedy("below", scene, think_threshold=below)))
+    [acts] = loop.run_until_complete(plan(vllm, greedy("above", scene, think_threshold=above)))
+    assert (thinks.branch, acts.branch) == ("Thinking:", "Action:")
+    assert thinks.thinking
+    assert thinks.revised_plan is not None
+
+
+def test_a_given_plan_is_kept(
+    loop: asyncio.AbstractEventLoop, vllm: VllmEngine, torch_engine: TorchEngine
+) -> None:
+    given = parse_plan(
+        "- longitudinal\n  - 0.0s-3.0s: Decelerate\n  - 3.0s-6.4s: Wait\n"
+        "- lateral\n  - 0.0s-6.4s: Straight\n- lane\n  - 0.0s-6.4s: Keep Lane\n"
+    )
+    request = greedy("given", BUNDLED[1], prefill=given)
+    events = loop.run_until_complete(events_of(vllm, request))
+    sections = [event.section for event in events if isinstance(event, SectionFinished)]
+    assert sections[:2] == ["plan", "branch"]
+    [draw] = [event.draw for event in events if isinstance(event, DrawFinished)]
+    assert draw.plan == given
+    [mine] = loop.run_until_complete(plan(torch_engine, request))
+    assert draw.text == mine.text
+
+
+def test_draws_are_valid_and_repeat_with_their_seed(
+    loop: asyncio.AbstractEventLoop, vllm: VllmEngine
+) -> None:
+    def request(name: str, seed: int) -> PlanRequest:
+        return PlanRequest(name, BUNDLED[2], controls=Controls(n=6, temperature=1.5, seed=seed))
+
+    async def all_three() -> list[list[Draw]]:
+        return [await plan(vllm, request(f"{k}", seed)) for k, seed in enumerate((3, 3, 4))]
+
+    first, again, other = loop.run_until_complete(all_three())
+    assert [draw.index for draw in first] == list(range(6))
+    assert [draw.text for draw in first] == [draw.text for draw in again]
+    assert [draw.text for draw in first] != [draw.text for draw in other]
+    assert len({draw.text for draw in first}) == 6
+    for draw in first + other:
+        assert parse(FORMATS["cf_vla"], draw.text)["trajectory"] == draw.codes
+
+
+def test_sections_come_before_their_draw(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
+    request = PlanRequest("stream", BUNDLED[3], controls=Controls(n=2, thinking="always"))
+    events = loop.run_until_complete(events_of(vllm, request))
+    for index in range(2):
+        mine = [
+            event.section if isinstance(event, SectionFinished) else "done"
+            for event in events
+            if (event.index if isinstance(event, SectionFinished) else event.draw.index) == index
+        ]
+        assert mine == ["plan", "branch", "thinking", "revised_plan", "trajectory", "done"]
+
+
+def test_leaving_early_frees_vllm(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
+    async def test() -> None:
+        request = PlanRequest("early", BUNDLED[4], controls=Controls(n=4, thinking="always"))
+        async for _ in (events := vllm.submit(request)):
+            break
+        await events.aclose()  # type: ignore[attr-defined]
+        assert vllm.llm.get_num_unfinished_requests() == 0
+        waiting = asyncio.create_task(plan(vllm, request))
+        while not vllm.llm.get_num_unfinished_requests():
+            await asyncio.sleep(0.01)
+        vllm.cancel("early")
+        vllm.cancel("unknown")
+        with pytest.raises(EngineError, match="cancelled"):
+            await waiting
+        assert vllm.llm.get_num_unfinished_requests() == 0
+        assert len(await plan(vllm, request)) == 4
+
+    loop.run_until_complete(test())
+
+
+def test_bad_requests_fail_alone(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
+    scene = BUNDLED[5]
+    damaged = replace(scene, clips=(Clip(scene.clips[0].camera, (b"\xff\xd8no",) * 4), *scene.clips[1:]))
+
+    async def test() -> None:
+        good = asyncio.create_task(plan(vllm, PlanRequest("good", scene, controls=Controls(n=2))))
+        for bad, message in (
+            (PlanRequest("a", damaged), "picture"),
+            (PlanRequest("b", replace(scene, clips=scene.clips[:1])), "lacks camera"),
+            (PlanRequest("c", scene, "elf_vla"), "unknown format"),
+            (PlanRequest("d", scene, controls=Controls(deadline_ms=50)), "torch engine"),
+            (PlanRequest("good", scene), "in use"),
+        ):
+            with pytest.raises(RequestError, match=message):
+                await plan(vllm, bad)
+        assert len(await good) == 2
+
+    loop.run_until_complete(test())
+
+
+def test_the_trajectory_alone(
+    loop: asyncio.AbstractEventLoop, vllm: VllmEngine, torch_engine: TorchEngine
+) -> None:
+    request = PlanRequest("direct", BUNDLED[6], "traj_only", Controls(n=1, temperature=0.0))
+    [draw], [mine] = (loop.run_until_complete(plan(engine, request)) for engine in (vllm, torch_engine))
+    assert draw.think_probability is None
+    assert draw.codes == mine.codes
