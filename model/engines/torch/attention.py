@@ -2,7 +2,7 @@
 
 A `PromptPass` writes and reads one prompt. A `DrawPass` feeds all running draws: a draw's token sees its
 scene's prompt, which lies in memory once, and what the draw itself has written. The two parts are worked
-out apart, the prompt's for all draws of a scene in one product, and joined by their softmax sums
+out apart, the prompt's for all draws of a scene at once, and joined by the sums of their softmaxes
 (log-sum-exp merging as in FlashDecoding, https://pytorch.org/blog/flash-decoding/).
 """
 
@@ -67,6 +67,7 @@ class DrawPass:
     """The next tokens of the first ``len(fed)`` draws, packed row after row.
 
     Args:
+        heads: of queries; keys and values have as many or fewer.
         prompts: keys and values of prompts.
         draws: keys and values of draws.
         fed: one a row.
@@ -74,37 +75,33 @@ class DrawPass:
     """
 
     def __init__(
-        self, prompts: KvRows, draws: KvRows, fed: Sequence[Fed], prompt_lengths: Sequence[int]
+        self, heads: int, prompts: KvRows, draws: KvRows, fed: Sequence[Fed], prompt_lengths: Sequence[int]
     ) -> None:
         self._prompts, self._draws = prompts, draws
-        device = draws.keys.device
-        # Sums of many small shares need more digits than bfloat16 has.
-        self._exact = torch.promote_types(draws.keys.dtype, torch.float32)
+        device, groups = draws.keys.device, draws.heads
         counts = np.array([row.fed for row in fed])
         held = np.array([row.held for row in fed])
         row_of = np.repeat(np.arange(len(fed)), counts)
-        within = np.arange(len(row_of)) - np.repeat(np.cumsum(counts) - counts, counts)
+        within = _count_up(counts)
         places = held[row_of] + within
-        heads = row_of[:, None] * draws.heads + np.arange(draws.heads)
-        self._written = _tensor((heads * draws.length + places[:, None]).ravel(), device)
+        slots = (row_of[:, None] * groups + np.arange(groups)) * draws.length + places[:, None]
+        self._written = _tensor(slots.ravel(), device)
         self._span = int((held + counts).max())
-        self._own = _Padding.of(row_of, within, len(fed), device)
+        self._own = _Grouping.of(row_of, within, heads, groups, device)
         seen = np.arange(self._span) <= held[:, None, None] + np.arange(self._own.width)[:, None]
-        self._own_mask = _additive(seen, self._exact, device)
+        self._own_mask = _additive(seen.repeat(heads // groups, axis=1), draws.keys)
         prompt_of = np.array([row.prompt for row in fed])[row_of]
-        self._prompt_rows = int(prompt_of.max()) + 1
         order = np.argsort(prompt_of, kind="stable")
-        sizes = np.bincount(prompt_of, minlength=self._prompt_rows)
         behind = np.empty_like(order)
-        behind[order] = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-        self._shared = _Padding.of(prompt_of, behind, self._prompt_rows, device)
-        lengths = np.array(prompt_lengths[: self._prompt_rows])
+        behind[order] = _count_up(np.bincount(prompt_of))
+        self._shared = _Grouping.of(prompt_of, behind, heads, groups, device)
+        lengths = np.array(prompt_lengths[: self._shared.rows])
         self._prompt_span = int(lengths.max())
         self._shared_mask = None
         if (lengths < self._prompt_span).any():
             # A row whose prompt is not there yet holds zeros; it feeds nothing, so what it sees is no matter.
             seen = np.arange(self._prompt_span) < np.maximum(lengths, 1)[:, None, None]
-            self._shared_mask = _additive(seen, self._exact, device)
+            self._shared_mask = _additive(seen, draws.keys)
 
     def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
         """Store ``key`` and ``value`` [t, g, d]; what ``query`` [t, h, d], scaled, sees: [t, h x d]."""
@@ -112,73 +109,92 @@ class DrawPass:
         width = draws.head_dim
         for memory, new in ((draws.keys, key), (draws.values, value)):
             memory[layer].view(-1, width).index_copy_(0, self._written, new.reshape(-1, width))
-        own = self._part(draws, layer, query, self._own, self._span, self._own_mask)
-        shared = self._part(prompts, layer, query, self._shared, self._prompt_span, self._shared_mask)
-        largest = torch.maximum(own[..., width:-1], shared[..., width:-1])
-        own_share = (own[..., width:-1] - largest).exp_()
-        shared_share = (shared[..., width:-1] - largest).exp_()
-        mixed = own[..., :width] * own_share + shared[..., :width] * shared_share
-        mixed /= own[..., -1:] * own_share + shared[..., -1:] * shared_share
-        return mixed.flatten(1).to(query.dtype)
-
-    def _part(
-        self,
-        memory: KvRows,
-        layer: int,
-        query: Tensor,
-        padding: _Padding,
-        span: int,
-        mask: Tensor | None,
-    ) -> Tensor:
-        """[t, h, d + 2]: weighted sums of values, largest scores, sums of weights."""
-        rows, width, groups = padding.rows, padding.width, memory.heads
-        shared_by = query.shape[1] // groups
-        asked = padding.pad(query).view(rows, width, groups, shared_by, memory.head_dim)
-        asked = asked.transpose(1, 2).reshape(rows * groups, width * shared_by, memory.head_dim)
-        keys = memory.keys[layer, :rows, :, :span].flatten(0, 1).transpose(1, 2)
-        values = memory.values[layer, :rows, :, :span].flatten(0, 1)
-        scores = torch.bmm(asked, keys).to(self._exact)
-        if mask is not None:
-            scores.view(rows, groups, width, shared_by, span).add_(mask[:, None, :, None])
-        largest = scores.amax(dim=-1, keepdim=True)
-        weights = scores.sub_(largest).exp_()
-        sums = torch.bmm(weights.to(values.dtype), values).to(self._exact)
-        parts = torch.cat([sums, largest, weights.sum(dim=-1, keepdim=True)], dim=-1)
-        parts = parts.view(rows, groups, width, shared_by, memory.head_dim + 2).transpose(1, 2)
-        return padding.unpad(parts.reshape(rows * width, groups * shared_by, -1))
+        flat = query.reshape(-1, width)
+        own, own_sums = self._own.attend(draws, layer, flat, self._span, self._own_mask)
+        shared, shared_sums = self._shared.attend(prompts, layer, flat, self._prompt_span, self._shared_mask)
+        share = own_sums.sub_(shared_sums).sigmoid_().to(own.dtype)
+        return shared.lerp_(own, share[:, None]).view(len(query), -1)
 
 
-class _Padding(NamedTuple):
-    """Between tokens in a packed order and rows of equal width; no indices where both are the same."""
+class _Grouping(NamedTuple):
+    """Packed tokens as rows of equal width, all heads that share keys side by side.
+
+    Attributes:
+        rows, width: of tokens; empty places repeat the first token.
+        into: places in queries [t x h, d] of what is asked [rows x groups x width x heads a group, d].
+        back: places in the answers to that of [t x h, d].
+        back_of_sums: the same in their sums [rows x width x heads a group x groups].
+    """
 
     rows: int
     width: int
-    into: Tensor | None
-    back: Tensor | None
+    into: Tensor
+    back: Tensor
+    back_of_sums: Tensor
 
     @classmethod
-    def of(cls, row_of: IntArray, within: IntArray, rows: int, device: torch.device) -> _Padding:
-        width = int(within.max()) + 1
-        back = row_of * width + within
-        if len(back) == rows * width and (back == np.arange(len(back))).all():
-            return cls(rows, width, None, None)
-        into = np.zeros(rows * width, np.int64)
-        into[back] = np.arange(len(back))
-        return cls(rows, width, _tensor(into, device), _tensor(back, device))
+    def of(
+        cls, row_of: IntArray, within: IntArray, heads: int, groups: int, device: torch.device
+    ) -> _Grouping:
+        rows, width, shared_by = int(row_of.max()) + 1, int(within.max()) + 1, heads // groups
+        group, member = np.divmod(np.arange(heads), shared_by)
+        row, place = row_of[:, None], within[:, None]
+        back = ((row * groups + group) * width + place) * shared_by + member
+        into = np.zeros(rows * groups * width * shared_by, np.int64)
+        into[back] = np.arange(len(row_of) * heads).reshape(back.shape)
+        back_of_sums = ((row * width + place) * shared_by + member) * groups + group
+        return cls(rows, width, *(_tensor(each.ravel(), device) for each in (into, back, back_of_sums)))
 
-    def pad(self, packed: Tensor) -> Tensor:
-        """[t, ...] -> [rows x width, ...]; empty places repeat the first token."""
-        return packed if self.into is None else packed.index_select(0, self.into)
+    def attend(
+        self, memory: KvRows, layer: int, query: Tensor, span: int, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """What queries [t x h, d] see, [t x h, d], and the logarithms of its softmax sums, [t x h]."""
+        width = memory.head_dim
+        asked = query.index_select(0, self.into).view(self.rows, memory.heads, -1, width)
+        keys, values = (part[layer, : self.rows, :, :span] for part in (memory.keys, memory.values))
+        seen, sums = attention_with_sums(asked, keys, values, mask)
+        return (
+            seen.reshape(-1, width).index_select(0, self.back),
+            sums.transpose(1, 2).reshape(-1).index_select(0, self.back_of_sums),
+        )
 
-    def unpad(self, padded: Tensor) -> Tensor:
-        """[rows x width, ...] -> [t, ...]."""
-        return padded if self.back is None else padded.index_select(0, self.back)
+
+def attention_with_sums(
+    query: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Attention [r, g, q, d] over keys and values [r, g, k, d], and log-sum-exp of its scores [r, g, q].
+
+    ``mask`` is added to the scores. CPUs have a fused kernel that gives the sums as well.
+    """
+    if query.device.type == "cpu":
+        seen, sums = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu(
+            query, keys, values, 0.0, False, attn_mask=mask, scale=1.0
+        )
+        return seen, sums
+    return plain_attention_with_sums(query, keys, values, mask)
 
 
-def _additive(seen: npt.NDArray[np.bool_], dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.zeros(seen.shape, dtype=dtype, device=device).masked_fill_(
-        torch.from_numpy(~seen).to(device), float("-inf")
-    )
+def plain_attention_with_sums(
+    query: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """`attention_with_sums` in plain operations, for any device."""
+    # Sums of many small shares need more digits than bfloat16 has.
+    scores = (query @ keys.transpose(-1, -2)).to(torch.promote_types(query.dtype, torch.float32))
+    if mask is not None:
+        scores += mask
+    sums = scores.logsumexp(dim=-1, keepdim=True)
+    return scores.sub_(sums).exp_().to(values.dtype) @ values, sums[..., 0]
+
+
+def _count_up(counts: IntArray) -> IntArray:
+    """0, 1, … as often as each of ``counts`` says."""
+    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def _additive(seen: npt.NDArray[np.bool_], like: Tensor) -> Tensor:
+    """[r, 1, q, k] of zeros where ``seen`` [r, q, k], minus infinity elsewhere."""
+    mask = torch.zeros(seen.shape, dtype=torch.promote_types(like.dtype, torch.float32), device=like.device)
+    return mask.masked_fill_(torch.from_numpy(~seen).to(like.device), float("-inf"))[:, None]
 
 
 def _tensor(array: IntArray, device: torch.device) -> Tensor:

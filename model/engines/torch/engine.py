@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import queue
-import threading
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from model.engines.engine import (
 )
 from model.engines.torch.decoder import Decoder, Failed, Shortcuts
 from model.engines.torch.runner import Runner
+from model.engines.torch.worker import Worker
 from model.engines.warm_up import warm_up
 from model.network.checkpoint import load
 
@@ -60,10 +61,12 @@ class TorchEngine:
 
     def __init__(self, checkpoint: Path, settings: TorchSettings = TorchSettings()) -> None:
         self._settings = settings
-        self._loaded = load(checkpoint, dtype=settings.dtype, device=settings.device)
+        self._worker = Worker("looktwice-engine")
+        loading = self._worker.submit(lambda: load(checkpoint, settings.dtype, settings.device))
+        self._loaded = loading.result()
+        self._decoding: Future[None] | None = None
         self._commands: queue.SimpleQueue[Callable[[Decoder], None] | None] = queue.SimpleQueue()
         self._listeners: dict[str, tuple[asyncio.AbstractEventLoop, asyncio.Queue[Event | Failed]]] = {}
-        self._thread: threading.Thread | None = None
 
     @property
     def card(self) -> ModelCard:
@@ -72,23 +75,22 @@ class TorchEngine:
 
     async def start(self) -> None:
         """Start the decoding thread and plan once for a grey scene in every format."""
-        if self._thread is not None:
+        if self._decoding is not None:
             raise EngineError("the engine runs already")
-        self._thread = threading.Thread(target=self._run, name="looktwice-engine", daemon=True)
-        self._thread.start()
+        self._decoding = self._worker.submit(self._run)
         await warm_up(self)
 
     async def stop(self) -> None:
         """Cancel everything and end the thread; running requests get an `EngineError`."""
-        if self._thread is None:
+        if self._decoding is None:
             return
         self._commands.put(None)
-        await asyncio.to_thread(self._thread.join)
-        self._thread = None
+        await asyncio.wrap_future(self._decoding)
+        self._decoding = None
 
     async def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
         """Queue a request and iterate over its events; see `Engine.submit`."""
-        if self._thread is None or not self._thread.is_alive():
+        if self._decoding is None or self._decoding.done():
             raise EngineError("the engine is not running")
         if request.request_id in self._listeners:
             raise RequestError(f"request id {request.request_id} is in use")

@@ -52,8 +52,8 @@ class PackedDecoder:
 
     Args:
         text_model: `Qwen2_5_VLTextModel` with full attention in all layers.
-        products: what matrix products are worked out in, where it is not the weights' type; everything
-            else, sums over layers and attention above all, stays as it is.
+        products: what matrix products and all between them are worked out in, where it is not the weights'
+            type; sums over layers, and norms, stay in that.
     """
 
     def __init__(self, text_model: Any, products: torch.dtype | None = None) -> None:
@@ -62,7 +62,7 @@ class PackedDecoder:
             raise ValueError("the torch engine runs decoders with full attention in every layer only")
         self._rotary = text_model.rotary_emb
         self._epsilon = config.rms_norm_eps
-        self._heads, self._groups = config.num_attention_heads, config.num_key_value_heads
+        self.heads, self._groups = config.num_attention_heads, config.num_key_value_heads
         self._head_dim = config.hidden_size // config.num_attention_heads
         self._final_norm = text_model.norm.weight
         self._products = products or self._final_norm.dtype
@@ -70,27 +70,25 @@ class PackedDecoder:
 
     def rotation(self, position_ids: Tensor) -> Rotation:
         """The rotary embedding of positions int64 [3, t]."""
-        cosines, sines = (part[0, :, None] for part in self._rotary(self._final_norm, position_ids[:, None]))
+        parts = self._rotary(self._final_norm, position_ids[:, None])
+        cosines, sines = (part[0, :, None].to(self._products) for part in parts)
         half = self._head_dim // 2
         return Rotation(cosines, torch.cat([-sines[..., :half], sines[..., half:]], dim=-1))
 
     def __call__(self, embeddings: Tensor, rotation: Rotation, attention: Attention) -> Tensor:
         """Final hidden states [t, hidden] of tokens [t, hidden]."""
         x = embeddings
-        turned = self._heads + self._groups
+        turned = self.heads + self._groups
         for index, layer in enumerate(self._layers):
-            qkv = self._product(self._norm(x, layer.norm_in), layer.qkv, layer.qkv_bias)
-            qkv = qkv.view(len(x), -1, self._head_dim)
+            normed = self._norm(x, layer.norm_in).to(self._products)
+            qkv = functional.linear(normed, layer.qkv, layer.qkv_bias).view(len(x), -1, self._head_dim)
             looking = rotation(qkv[:, :turned])
-            query, key, value = looking[:, : self._heads], looking[:, self._heads :], qkv[:, turned:]
-            x = x + self._product(attention.attend(index, query, key, value), layer.out)
+            query, key, value = looking[:, : self.heads], looking[:, self.heads :], qkv[:, turned:]
+            x = x + functional.linear(attention.attend(index, query, key, value), layer.out)
             normed = self._norm(x, layer.norm_mlp).to(self._products)
             gate, up = functional.linear(normed, layer.gate_up).chunk(2, dim=-1)
-            x = x + self._product(functional.silu(gate).mul_(up), layer.down)
+            x += functional.linear(functional.silu(gate).mul_(up), layer.down)
         return self._norm(x, self._final_norm)
-
-    def _product(self, x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-        return functional.linear(x.to(self._products), weight, bias).to(self._final_norm.dtype)
 
     def _norm(self, x: Tensor, weight: Tensor) -> Tensor:
         return functional.rms_norm(x, (x.shape[-1],), weight, self._epsilon)

@@ -104,7 +104,7 @@ class Runner:
             "layers": text.num_hidden_layers,
             "heads": text.num_key_value_heads,
             "head_dim": text.hidden_size // text.num_attention_heads,
-            "dtype": loaded.model.dtype,
+            "dtype": products or loaded.model.dtype,
             "device": loaded.model.device,
         }
         self._prompts = KvRows(rows=rows, length=max(kept), **sizes)
@@ -172,7 +172,7 @@ class Runner:
         for feed in feeds:
             lengths[feed.prompt.row] = feed.prompt.held
         fed = [Fed(feed.prompt.row, feed.held, count) for feed, count in zip(feeds, counts, strict=True)]
-        attention = DrawPass(self._prompts, self._draws, fed, lengths)
+        attention = DrawPass(self._decoder.heads, self._prompts, self._draws, fed, lengths)
         embeddings = self.loaded.model.get_input_embeddings()(torch.from_numpy(ids).to(device))
         hidden = self._decoder(embeddings, self._rotation.at(torch.from_numpy(places).to(device)), attention)
         starts = np.cumsum(counts) - counts

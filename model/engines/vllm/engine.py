@@ -93,7 +93,7 @@ class VllmEngine:
         for name, value in _ENVIRONMENT.items():
             os.environ.setdefault(name, value)
         try:
-            self._llm = await asyncio.to_thread(self._load)
+            await asyncio.to_thread(self._load)
         except Exception as error:  # vLLM's own, of whatever type
             raise EngineError.because("vLLM did not start", error) from error
         await warm_up(self)
@@ -161,7 +161,7 @@ class VllmEngine:
         assert cursor.active is not None
         return self._grammar(cursor.compiled, cursor.active, cursor.rest)
 
-    def _load(self) -> Any:
+    def _load(self) -> None:
         from vllm.engine.arg_utils import AsyncEngineArgs
         from vllm.v1.engine.async_llm import AsyncLLM
 
@@ -183,4 +183,4 @@ class VllmEngine:
             "structured_outputs_config": {"backend": "guidance"},
             "disable_log_stats": True,
         }
-        return AsyncLLM.from_engine_args(AsyncEngineArgs(**(arguments | dict(self._settings.arguments))))
+        self._llm = AsyncLLM.from_engine_args(AsyncEngineArgs(**(arguments | dict(self._settings.arguments))))
