@@ -72,10 +72,17 @@ class DrawPass:
         draws: keys and values of draws.
         fed: one a row.
         prompt_lengths: tokens in each of the first prompts.
+        size: tokens of the pass; those behind what is fed are padding, and nothing becomes of them.
     """
 
     def __init__(
-        self, heads: int, prompts: KvRows, draws: KvRows, fed: Sequence[Fed], prompt_lengths: Sequence[int]
+        self,
+        heads: int,
+        prompts: KvRows,
+        draws: KvRows,
+        fed: Sequence[Fed],
+        prompt_lengths: Sequence[int],
+        size: int,
     ) -> None:
         self._prompts, self._draws = prompts, draws
         device, groups = draws.keys.device, draws.heads
@@ -87,14 +94,15 @@ class DrawPass:
         slots = (row_of[:, None] * groups + np.arange(groups)) * draws.length + places[:, None]
         self._written = _tensor(slots.ravel(), device)
         self._span = int((held + counts).max())
-        self._own = _Grouping.of(row_of, within, heads, groups, device)
+        self._fed = len(row_of)
+        self._own = _Grouping.of(row_of, within, size, heads, groups, device)
         seen = np.arange(self._span) <= held[:, None, None] + np.arange(self._own.width)[:, None]
         self._own_mask = _additive(seen.repeat(heads // groups, axis=1), draws.keys)
         prompt_of = np.array([row.prompt for row in fed])[row_of]
         order = np.argsort(prompt_of, kind="stable")
         behind = np.empty_like(order)
         behind[order] = _count_up(np.bincount(prompt_of))
-        self._shared = _Grouping.of(prompt_of, behind, heads, groups, device)
+        self._shared = _Grouping.of(prompt_of, behind, size, heads, groups, device)
         lengths = np.array(prompt_lengths[: self._shared.rows])
         self._prompt_span = int(lengths.max())
         self._shared_mask = None
@@ -108,7 +116,7 @@ class DrawPass:
         draws, prompts = self._draws, self._prompts
         width = draws.head_dim
         for memory, new in ((draws.keys, key), (draws.values, value)):
-            memory[layer].view(-1, width).index_copy_(0, self._written, new.reshape(-1, width))
+            memory[layer].view(-1, width).index_copy_(0, self._written, new[: self._fed].reshape(-1, width))
         flat = query.reshape(-1, width)
         own, own_sums = self._own.attend(draws, layer, flat, self._span, self._own_mask)
         shared, shared_sums = self._shared.attend(prompts, layer, flat, self._prompt_span, self._shared_mask)
@@ -134,7 +142,7 @@ class _Grouping(NamedTuple):
 
     @classmethod
     def of(
-        cls, row_of: IntArray, within: IntArray, heads: int, groups: int, device: torch.device
+        cls, row_of: IntArray, within: IntArray, size: int, heads: int, groups: int, device: torch.device
     ) -> _Grouping:
         rows, width, shared_by = int(row_of.max()) + 1, int(within.max()) + 1, heads // groups
         group, member = np.divmod(np.arange(heads), shared_by)
@@ -143,7 +151,9 @@ class _Grouping(NamedTuple):
         into = np.zeros(rows * groups * width * shared_by, np.int64)
         into[back] = np.arange(len(row_of) * heads).reshape(back.shape)
         back_of_sums = ((row * width + place) * shared_by + member) * groups + group
-        return cls(rows, width, *(_tensor(each.ravel(), device) for each in (into, back, back_of_sums)))
+        padding = ((0, size - len(row_of)), (0, 0))
+        indices = (into, np.pad(back, padding), np.pad(back_of_sums, padding))
+        return cls(rows, width, *(_tensor(each.ravel(), device) for each in indices))
 
     def attend(
         self, memory: KvRows, layer: int, query: Tensor, span: int, mask: Tensor | None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,7 @@ from model.engines.engine import (
     RequestError,
 )
 from model.engines.requests import begin, branch_of, read
+from model.engines.torch.habits import CONTEXT, Habits
 from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
 from model.engines.torch.runner import Feed, Prompt, Runner
@@ -26,6 +28,13 @@ from model.engines.torch.schedule import Schedule, urgency
 from model.formats.pieces import ACTION, BRANCH, THINKING
 
 Logits = npt.NDArray[np.float64]
+Ids = npt.NDArray[np.int64]
+
+_GUESS_ROWS: Final = 12
+"""Tokens fed ahead cost next to nothing while so few rows run, and as much as others when many do."""
+_GUESS_TOKENS: Final = 32
+_HABITUAL: Final = 64
+"""Decisions between more tokens than this (codes, free words) are no matter of habit."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +56,8 @@ class Shortcuts:
         jump: a forced run goes through the network in one pass with the token before it.
         shared_rows: draws that have written the same tokens are one row.
         shared_prompts: a scene's prompt is worked out and held once for all its draws.
-        speculate: a revised plan is fed as far as it may repeat the first one, and checked.
+        speculate: a revised plan is fed as far as it may repeat the first one, and, while few rows run, any
+            response as far as others usually went on; what is fed ahead is checked.
     """
 
     jump: bool = True
@@ -112,6 +122,7 @@ class Decoder:
         self._paused: dict[str, list[Row]] = {}
         self._runner, self._shortcuts, self._chunk = runner, shortcuts, prompt_chunk
         self._schedule = Schedule(runner.rows)
+        self._habits = Habits()
         self._beginnings: list[_Beginning] = []
         self._prompts: list[Prompt] = []
         self._rows: list[Row] = []
@@ -256,16 +267,23 @@ class Decoder:
         assert row.prompt is not None
         if not self._shortcuts.jump and len(row.pending) > 1:
             return Feed(row.prompt, row.held, row.pending[:1], ())
-        proposal = row.proposal() if self._shortcuts.speculate else []
-        wanted, cursor = [], row.cursor
-        for place in range(len(row.pending) - 1, len(row.pending) + len(proposal)):
-            if cursor.done:
+        tokens, wanted, cursor = list(row.pending), list[tuple[int, Ids]](), row.cursor
+        copied = iter(row.proposal() if self._shortcuts.speculate else ())
+        context = [token.id for token in row.tokens[-CONTEXT:]]
+        may_guess = self._shortcuts.speculate and len(self._rows) <= _GUESS_ROWS
+        while not cursor.done:
+            ids = cursor.allowed().ids
+            if len(ids) > 1:
+                wanted.append((len(tokens) - 1, ids))
+            token = next(copied, None)
+            if token is None and may_guess and len(tokens) < len(row.pending) + _GUESS_TOKENS:
+                token = int(ids[0]) if len(ids) == 1 else self._habits.usual(context)
+            if token is None or token not in ids:
                 break
-            if len(ids := cursor.allowed().ids) > 1:
-                wanted.append((place, ids))
-            if place + 1 < len(row.pending) + len(proposal):
-                cursor = cursor.advance(proposal[place + 1 - len(row.pending)])
-        return Feed(row.prompt, row.held, [*row.pending, *proposal], wanted)
+            tokens.append(token)
+            context.append(token)
+            cursor = cursor.advance(token)
+        return Feed(row.prompt, row.held, tokens, wanted)
 
     def _apply(self, row: Row, feed: Feed, found: list[Logits]) -> list[StepEvent]:
         """Choose at the decisions of a feed, one after the other, while what was fed is what is chosen."""
@@ -291,6 +309,10 @@ class Decoder:
         """
         time_for = self._pace.time_for(row.request.deadline_s, self._clock())
         chosen = sorted(row.choices(logits, time_for), key=lambda choice: choice[0] != proposed)
+        if len(logits) <= _HABITUAL:
+            context = [token.id for token in row.tokens[-CONTEXT:]]
+            for token, draws in chosen:
+                self._habits.saw(context, token, len(draws))
         parts = [(row.part(draws), token) for token, draws in chosen[1:]]
         if row.request.drafts and row.cursor.allowed().choice == BRANCH:
             direct = next(

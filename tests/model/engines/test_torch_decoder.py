@@ -325,3 +325,16 @@ def test_cancelling_frees_rows_and_spares_others(exact: Loaded) -> None:
 def test_impossible_requests_are_refused(exact: Loaded, change: dict[str, object], message: str) -> None:
     with pytest.raises(RequestError, match=message):
         Decoder(Runner(exact, 8)).add(request("a", **change))  # type: ignore[arg-type]
+
+
+def test_habits_save_passes_and_change_nothing(exact: Loaded) -> None:
+    def texts(decoder: Decoder, name: str) -> list[str]:
+        draws = decode(decoder, request(name, n=3, seed=6, temperature=0.3))
+        return [draws[name, index].text for index in range(3)]
+
+    decoder = Decoder(Runner(exact, 3))
+    first = texts(decoder, "first")
+    passes = decoder.counts.passes
+    assert [texts(decoder, "second"), texts(decoder, "third")] == [first, first]
+    assert decoder.counts.passes - passes < 2 * passes * 0.7
+    assert texts(Decoder(Runner(exact, 3), replace(Shortcuts(), speculate=False)), "alone") == first
