@@ -329,7 +329,7 @@ def test_impossible_requests_are_refused(exact: Loaded, change: dict[str, object
 
 def test_habits_save_passes_and_change_nothing(exact: Loaded) -> None:
     def texts(decoder: Decoder, name: str) -> list[str]:
-        draws = decode(decoder, request(name, n=3, seed=6, temperature=0.3))
+        draws = decode(decoder, request(name, n=3, seed=6, temperature=0.3, thinking="never"))
         return [draws[name, index].text for index in range(3)]
 
     decoder = Decoder(Runner(exact, 3))
