@@ -112,6 +112,7 @@ class Draw:
         trajectory: float32 [64, 4] in the ego frame.
         codes: the trajectory codes it was decoded from.
         tokens: tokens per section, forced ones included.
+        passes: how often the network was run for it, its prompt apart.
     """
 
     index: int
@@ -124,6 +125,7 @@ class Draw:
     trajectory: FloatArray
     codes: tuple[int, ...]
     tokens: Mapping[str, int]
+    passes: int = 0
 
 
 @dataclass(frozen=True)

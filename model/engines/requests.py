@@ -45,6 +45,7 @@ def read(
     request: PlanRequest,
     tokens: Sequence[Token],
     think_probability: float | None,
+    passes: int,
     draws: Iterable[int],
     vocabulary: Vocabulary,
     codec: TrajectoryCodec,
@@ -73,6 +74,7 @@ def read(
             trajectory=trajectory,
             codes=codes,
             tokens=counts,
+            passes=passes,
         )
         for index in draws
     ]

@@ -347,6 +347,7 @@ class Decoder:
                     row.request.plan_request,
                     row.tokens,
                     row.think_probability,
+                    row.passes,
                     row.draws,
                     self._runner.loaded.vocabulary,
                     self._runner.loaded.codec,

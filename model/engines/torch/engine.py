@@ -20,7 +20,7 @@ from model.engines.engine import (
     PlanRequest,
     RequestError,
 )
-from model.engines.torch.decoder import Decoder, Failed, Shortcuts
+from model.engines.torch.decoder import Counts, Decoder, Failed, Shortcuts
 from model.engines.torch.runner import Runner
 from model.engines.torch.worker import Worker
 from model.engines.warm_up import warm_up
@@ -65,6 +65,7 @@ class TorchEngine:
         loading = self._worker.submit(lambda: load(checkpoint, settings.dtype, settings.device))
         self._loaded = loading.result()
         self._decoding: Future[None] | None = None
+        self._counts = Counts()
         self._commands: queue.SimpleQueue[Callable[[Decoder], None] | None] = queue.SimpleQueue()
         self._listeners: dict[str, tuple[asyncio.AbstractEventLoop, asyncio.Queue[Event | Failed]]] = {}
 
@@ -72,6 +73,11 @@ class TorchEngine:
     def card(self) -> ModelCard:
         """What is loaded."""
         return self._loaded.card
+
+    @property
+    def counts(self) -> Counts:
+        """What decoding took so far."""
+        return self._counts
 
     async def start(self) -> None:
         """Start the decoding thread and plan once for a grey scene in every format."""
@@ -134,6 +140,7 @@ class TorchEngine:
             products=settings.products,
         )
         decoder = Decoder(runner, settings.shortcuts)
+        self._counts = decoder.counts
         reason: Exception = EngineError("the engine was stopped")
         try:
             with torch.inference_mode():

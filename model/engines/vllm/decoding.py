@@ -36,9 +36,10 @@ class VllmPrompt(NamedTuple):
 
 @dataclass(eq=False)
 class _Walk(Response):
-    """A draw, walked along with vLLM."""
+    """A draw, walked along with vLLM; every token that vLLM writes is a pass."""
 
     index: int
+    passes: int = 0
 
 
 class Decoding:
@@ -150,6 +151,7 @@ class Decoding:
     def _walk(self, draw: _Walk, tokens: Sequence[int], logprobs: Sequence[Mapping[int, Any]] | None) -> bool:
         """Write what vLLM wrote; False when the draw is done, or goes on elsewhere."""
         for place, token in enumerate(tokens):
+            draw.passes += 1
             allowed, wanted = draw.cursor.allowed(), token
             if allowed.choice == BRANCH and len(allowed.ids) > 1:
                 assert logprobs is not None
@@ -176,9 +178,14 @@ class Decoding:
         return token if branch is None else options[branch]
 
     def _finish(self, draw: _Walk) -> None:
-        vocabulary, codec = self._parts.vocabulary, self._parts.codec
         for finished in read(
-            self._request, draw.tokens, draw.think_probability, [draw.index], vocabulary, codec
+            self._request,
+            draw.tokens,
+            draw.think_probability,
+            draw.passes,
+            [draw.index],
+            self._parts.vocabulary,
+            self._parts.codec,
         ):
             self._happened.put_nowait(DrawFinished(finished))
 

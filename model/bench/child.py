@@ -1,0 +1,93 @@
+"""A contender's process: reads one workload a line, answers it, writes one line of figures.
+
+Each contender has a process of its own, so that their threads do not get into each other's way and peak
+memory can be told. Figures go to a file descriptor of their own: libraries write to standard output.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from model.bench.contenders import SHORTCUTS, Contender, EngineContender, PlainVllm, Transformers
+from model.bench.memory import peak_bytes
+from model.bench.workload import Workload
+from model.driving.scene_store import read_scenes
+
+_ROWS = 96
+_MAX_TOKENS = 600
+"""More than the longest response that a trained model writes."""
+
+
+def contenders(names: list[str], checkpoint: Path, device: str) -> dict[str, Contender]:
+    """The contenders of one process; those with ``vllm`` in their name share one engine."""
+    made: dict[str, Contender] = {}
+    for name in names:
+        if name.startswith("vllm"):
+            from model.engines.vllm.engine import VllmEngine, VllmSettings
+
+            if "vllm-grammar" not in made:
+                engine = VllmEngine(checkpoint, VllmSettings(_ROWS, "bfloat16", {"enforce_eager": True}))
+                made["vllm-grammar"] = EngineContender(engine)
+                made["vllm"] = PlainVllm(checkpoint, engine, _MAX_TOKENS)
+        elif name == "transformers":
+            import torch
+
+            made[name] = Transformers(checkpoint, dtype=torch.bfloat16, device=device, max_tokens=_MAX_TOKENS)
+        else:
+            made[name] = EngineContender(_torch_engine(name, checkpoint, device))
+    return made
+
+
+def _torch_engine(name: str, checkpoint: Path, device: str) -> Any:
+    """``torch``, or ``torch+…`` with some shortcuts only: ``torch+none``, ``torch+jump,shared_prompts``."""
+    import torch
+
+    from model.engines.torch.decoder import Shortcuts
+    from model.engines.torch.engine import TorchEngine, TorchSettings
+
+    settings: dict[str, Any] = {"rows": _ROWS, "device": device}
+    if device != "cpu":
+        settings |= {"dtype": torch.bfloat16, "products": None}
+    if "+" in name:
+        wanted = name.partition("+")[2].split(",")
+        settings["shortcuts"] = Shortcuts(**{each: each in wanted for each in SHORTCUTS})
+    return TorchEngine(checkpoint, TorchSettings(**settings))
+
+
+async def _serve(job: Mapping[str, Any], replies: Any) -> None:
+    made = contenders(job["contenders"], Path(job["checkpoint"]), job["device"])
+    scenes = [labelled.scene for labelled in read_scenes(Path(job["scenes"]), dense=False)]
+    for contender in made.values():
+        await contender.start()
+    print(json.dumps({"ready": sorted(made)}), file=replies, flush=True)
+    # Reading blocks the loop, which has nothing to do meanwhile.
+    for line in sys.stdin:
+        asked = json.loads(line)
+        contender = made[asked["contender"]]
+        requests = Workload(**asked["workload"]).requests(scenes, asked["number"])
+        before, began_s = contender.counts(), time.perf_counter()
+        answers = await contender.answer(requests)
+        wall_s = time.perf_counter() - began_s
+        counts = {name: count - before[name] for name, count in contender.counts().items()}
+        reply = {
+            "wall_s": wall_s,
+            "answers": [asdict(answer) for answer in answers],
+            "counts": counts,
+            "peak_bytes": peak_bytes(),
+        }
+        print(json.dumps(reply), file=replies, flush=True)
+    for contender in made.values():
+        await contender.stop()
+
+
+if __name__ == "__main__":
+    with os.fdopen(int(sys.argv[1]), "w", encoding="utf-8") as replies:
+        asyncio.run(_serve(json.loads(sys.argv[2]), replies))

@@ -1,0 +1,216 @@
+"""What is measured: ways to answer plan requests, each at its best settings."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from model.engines.engine import Draw, DrawFinished, Engine, PlanRequest
+from model.formats.cf_vla import FORMATS
+from model.formats.pieces import FormatError
+from model.formats.text import parse
+from model.network.vocabulary import END_OF_TEXT, IM_END, Vocabulary
+
+SHORTCUTS = ("jump", "shared_prompts", "shared_rows", "speculate")
+"""The torch engine's, in the order in which the bench switches them on."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """One draw as the bench counts it: tokens, network passes, and whether it parses."""
+
+    tokens: int
+    passes: int
+    valid: bool
+    branch: str | None = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One request: seconds from submission to its last draw, and its draws."""
+
+    latency_s: float
+    responses: tuple[Response, ...]
+
+
+class Contender(Protocol):
+    """Something that answers requests."""
+
+    async def start(self) -> None:
+        """Load and warm up."""
+        ...
+
+    async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
+        """Answer requests that arrive at once."""
+        ...
+
+    def counts(self) -> dict[str, int]:
+        """What decoding took so far, where that is known."""
+        ...
+
+    async def stop(self) -> None:
+        """Free everything."""
+        ...
+
+
+async def _each(
+    requests: Sequence[PlanRequest], respond: Callable[[PlanRequest], Awaitable[list[Response]]]
+) -> list[Answer]:
+    async def timed(request: PlanRequest) -> Answer:
+        began_s = time.perf_counter()
+        responses = await respond(request)
+        return Answer(time.perf_counter() - began_s, tuple(responses))
+
+    return list(await asyncio.gather(*map(timed, requests)))
+
+
+class EngineContender:
+    """An engine behind our interface."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+
+    async def start(self) -> None:
+        """Load and warm up."""
+        await self._engine.start()
+
+    async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
+        """Answer requests that arrive at once."""
+
+        async def respond(request: PlanRequest) -> list[Response]:
+            events = [event async for event in self._engine.submit(request)]
+            return [_counted(event.draw) for event in events if isinstance(event, DrawFinished)]
+
+        return await _each(requests, respond)
+
+    def counts(self) -> dict[str, int]:
+        """What decoding took so far."""
+        counts = getattr(self._engine, "counts", None)
+        return {} if counts is None else asdict(counts)
+
+    async def stop(self) -> None:
+        """Free everything."""
+        await self._engine.stop()
+
+
+def _counted(draw: Draw) -> Response:
+    return Response(sum(draw.tokens.values()), draw.passes, valid=True, branch=draw.branch)
+
+
+class PlainVllm:
+    """vLLM without a grammar: whatever the model writes, up to its end-of-message token."""
+
+    def __init__(self, checkpoint: Path, engine: Any, max_tokens: int) -> None:
+        from model.network.checkpoint import read_parts
+
+        self._engine, self._max_tokens = engine, max_tokens
+        self._vocabulary = read_parts(checkpoint).vocabulary
+
+    async def start(self) -> None:
+        """The engine is started by whoever made it."""
+
+    async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
+        """Answer requests that arrive at once."""
+        from vllm import SamplingParams
+        from vllm.sampling_params import RequestOutputKind
+
+        async def respond(request: PlanRequest) -> list[Response]:
+            controls = request.controls
+            parameters = SamplingParams(
+                n=controls.n,
+                temperature=controls.temperature,
+                seed=controls.seed,
+                max_tokens=self._max_tokens,
+                detokenize=False,
+                output_kind=RequestOutputKind.FINAL_ONLY,
+            )
+            prompt = await asyncio.to_thread(self._engine.prompt, request.scene, request.format)
+            responses: list[Response] = []
+            async for output in self._engine.llm.generate(prompt.then([]), parameters, request.request_id):
+                responses += [
+                    _read(list(part.token_ids), request.format, self._vocabulary) for part in output.outputs
+                ]
+            return responses
+
+        return await _each(requests, respond)
+
+    def counts(self) -> dict[str, int]:
+        """Not known."""
+        return {}
+
+    async def stop(self) -> None:
+        """The engine is stopped by whoever made it."""
+
+
+class Transformers:
+    """`generate` over one batch of all requests' draws; pictures are encoded once a scene."""
+
+    def __init__(self, checkpoint: Path, *, dtype: Any, device: str, max_tokens: int) -> None:
+        from model.network.checkpoint import load
+
+        self._loaded = load(checkpoint, dtype, device)
+        self._max_tokens = max_tokens
+
+    async def start(self) -> None:
+        """It is loaded already."""
+
+    async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
+        """Answer requests as one batch, on this thread: torch gets slower where a second one uses it."""
+        import torch
+
+        began_s = time.perf_counter()
+        loaded, n, format = self._loaded, requests[0].controls.n, requests[0].format
+        vocabulary, model = loaded.vocabulary, loaded.model
+        generate: Any = model.generate
+        with torch.inference_mode():
+            prompts = [
+                model.encode_prompt_embeddings(loaded.inputs.build(request.scene, format))
+                for request in requests
+            ]
+            embeddings = torch.stack([prompt.embeddings for prompt in prompts]).repeat_interleave(n, 0)
+            positions = torch.stack([prompt.position_ids for prompt in prompts], 1).repeat_interleave(n, 1)
+            torch.manual_seed(requests[0].controls.seed)
+            written = generate(
+                inputs_embeds=embeddings,
+                position_ids=positions,
+                attention_mask=torch.ones(embeddings.shape[:2], dtype=torch.long, device=embeddings.device),
+                do_sample=True,
+                temperature=requests[0].controls.temperature,
+                top_k=0,
+                top_p=1.0,
+                max_new_tokens=self._max_tokens,
+                eos_token_id=vocabulary.id_of(IM_END),
+                pad_token_id=vocabulary.id_of(END_OF_TEXT),
+            )
+        steps, padding = written.shape[1], vocabulary.id_of(END_OF_TEXT)
+        responses = [
+            _read([token for token in row if token != padding], format, vocabulary, steps)
+            for row in written.tolist()
+        ]
+        latency_s = time.perf_counter() - began_s
+        return [
+            Answer(latency_s, tuple(responses[first : first + n])) for first in range(0, len(responses), n)
+        ]
+
+    def counts(self) -> dict[str, int]:
+        """Not known."""
+        return {}
+
+    async def stop(self) -> None:
+        """Nothing runs."""
+
+
+def _read(ids: list[int], format: str, vocabulary: Vocabulary, steps: int | None = None) -> Response:
+    """A response written without a grammar; it took a pass for each token."""
+    try:
+        values = parse(FORMATS[format], vocabulary.decode(ids))
+    except FormatError:
+        return Response(len(ids), steps or len(ids), valid=False)
+    branch = values.get("branch")
+    return Response(
+        len(ids), steps or len(ids), valid=True, branch=branch if isinstance(branch, str) else None
+    )

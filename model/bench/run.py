@@ -1,0 +1,190 @@
+"""The bench: workloads over contenders in shuffled order, repeated; medians with their spread."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.bench.workload import Workload
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is compared.
+
+    Attributes:
+        contenders: names; ``torch`` may carry shortcuts, see `model.bench.child`.
+        workloads: each is asked of each contender that can do it.
+        checkpoint, scenes: the same for all.
+        repeats: measured rounds, after one that is not.
+        device: ``cpu`` or ``cuda``.
+        vllm_python: the interpreter that has vLLM.
+    """
+
+    contenders: tuple[str, ...]
+    workloads: tuple[Workload, ...]
+    checkpoint: Path
+    scenes: Path
+    repeats: int = 5
+    device: str = "cpu"
+    vllm_python: str = sys.executable
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of one contender at one workload; a plan is a request with all its draws.
+
+    ``plans_per_s_spread`` are the slowest and the fastest round; ``valid_share`` counts draws that parse.
+    """
+
+    engine: str
+    scenes: int
+    n: int
+    thinking: str
+    temperature: float
+    latency_p50_s: float
+    latency_p95_s: float
+    plans_per_s: float
+    plans_per_s_spread: tuple[float, float]
+    tokens_per_s: float
+    passes_per_response: float
+    tokens_per_response: float
+    valid_share: float
+    peak_bytes: int
+    counts: Mapping[str, float] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """For scripts."""
+        return asdict(self)
+
+
+def can_do(contender: str, workload: Workload) -> bool:
+    """Without a grammar nothing decides the branch but the model."""
+    return workload.thinking == "adaptive" or contender not in ("transformers", "vllm")
+
+
+def run(job: Job, tell: Callable[[str], None]) -> list[Row]:
+    """Run a job; ``tell`` hears what is being done.
+
+    Raises:
+        RuntimeError: a contender's process ended early.
+    """
+    pairs = [(name, load) for load in job.workloads for name in job.contenders if can_do(name, load)]
+    replies: dict[tuple[str, Workload], list[dict[str, Any]]] = {pair: [] for pair in pairs}
+    order = random.Random(0)
+    with ExitStack() as stack:
+        processes: dict[str, _Process] = {}
+        for names in _together(job.contenders):
+            tell(f"starting {', '.join(names)}")
+            process = stack.enter_context(_process(job, names))
+            processes |= dict.fromkeys(names, process)
+        for repeat in range(job.repeats + 1):
+            order.shuffle(pairs)
+            for name, load in pairs:
+                tell(f"round {repeat} of {job.repeats}: {name}, {load.scenes} x {load.n}, {load.thinking}")
+                number = repeat * len(job.workloads) + job.workloads.index(load)
+                reply = processes[name].ask({"contender": name, "workload": asdict(load), "number": number})
+                if repeat:
+                    replies[name, load].append(reply)
+    return [
+        _row(name, load, replies[name, load])
+        for load in job.workloads
+        for name in job.contenders
+        if (name, load) in replies
+    ]
+
+
+def _together(names: Sequence[str]) -> list[list[str]]:
+    """Names that share a process."""
+    shared = [name for name in names if name.startswith("vllm")]
+    return [[name] for name in names if name not in shared] + ([shared] if shared else [])
+
+
+class _Process:
+    def __init__(self, name: str, process: subprocess.Popen[str], replies: Any) -> None:
+        self._name, self._process, self._replies = name, process, replies
+
+    def read(self) -> dict[str, Any]:
+        line = self._replies.readline()
+        if not line:
+            raise RuntimeError(f"the process of {self._name} ended early, with {self._process.wait()}")
+        reply: dict[str, Any] = json.loads(line)
+        return reply
+
+    def ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(question) + "\n")
+        self._process.stdin.flush()
+        return self.read()
+
+
+@contextmanager
+def _process(job: Job, names: Sequence[str]) -> Iterator[_Process]:
+    python = job.vllm_python if names[0].startswith("vllm") else sys.executable
+    settings = {
+        "contenders": list(names),
+        "checkpoint": str(job.checkpoint),
+        "scenes": str(job.scenes),
+        "device": job.device,
+    }
+    reading, writing = os.pipe()
+    log = Path(os.environ.get("LOOKTWICE_BENCH_LOG", os.devnull)).open("a")
+    with log, os.fdopen(reading, encoding="utf-8") as replies:
+        process = subprocess.Popen(
+            [python, "-m", "model.bench.child", str(writing), json.dumps(settings)],
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=log,
+            pass_fds=(writing,),
+            text=True,
+        )
+        os.close(writing)
+        try:
+            made = _Process(", ".join(names), process, replies)
+            made.read()
+            yield made
+        finally:
+            assert process.stdin is not None
+            process.stdin.close()
+            try:
+                process.wait(30)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _row(name: str, load: Workload, replies: Sequence[Mapping[str, Any]]) -> Row:
+    answers = [answer for reply in replies for answer in reply["answers"]]
+    latencies = [answer["latency_s"] for answer in answers]
+    responses = [response for answer in answers for response in answer["responses"]]
+    rates = [load.scenes / reply["wall_s"] for reply in replies]
+    plans = len(answers)
+    keys = replies[0]["counts"]
+    return Row(
+        engine=name,
+        scenes=load.scenes,
+        n=load.n,
+        thinking=load.thinking,
+        temperature=load.temperature,
+        latency_p50_s=float(np.percentile(latencies, 50)),
+        latency_p95_s=float(np.percentile(latencies, 95)),
+        plans_per_s=statistics.median(rates),
+        plans_per_s_spread=(min(rates), max(rates)),
+        tokens_per_s=sum(each["tokens"] for each in responses) / sum(reply["wall_s"] for reply in replies),
+        passes_per_response=statistics.mean(each["passes"] for each in responses),
+        tokens_per_response=statistics.mean(each["tokens"] for each in responses),
+        valid_share=statistics.mean(each["valid"] for each in responses),
+        peak_bytes=max(reply["peak_bytes"] for reply in replies),
+        counts={key: sum(reply["counts"][key] for reply in replies) / plans for key in keys},
+    )
