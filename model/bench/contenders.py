@@ -164,8 +164,8 @@ class Transformers:
 
         began_s = time.perf_counter()
         loaded, n, format = self._loaded, requests[0].controls.n, requests[0].format
-        vocabulary, model = loaded.vocabulary, loaded.model
-        generate: Any = model.generate
+        vocabulary = loaded.vocabulary
+        model: Any = loaded.model
         with torch.inference_mode():
             prompts = [
                 model.encode_prompt_embeddings(loaded.inputs.build(request.scene, format))
@@ -174,7 +174,7 @@ class Transformers:
             embeddings = torch.stack([prompt.embeddings for prompt in prompts]).repeat_interleave(n, 0)
             positions = torch.stack([prompt.position_ids for prompt in prompts], 1).repeat_interleave(n, 1)
             torch.manual_seed(requests[0].controls.seed)
-            written = generate(
+            written = model.generate(
                 inputs_embeds=embeddings,
                 position_ids=positions,
                 attention_mask=torch.ones(embeddings.shape[:2], dtype=torch.long, device=embeddings.device),

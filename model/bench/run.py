@@ -139,8 +139,8 @@ def _process(job: Job, names: Sequence[str]) -> Iterator[_Process]:
         "device": job.device,
     }
     reading, writing = os.pipe()
-    log = Path(os.environ.get("LOOKTWICE_BENCH_LOG", os.devnull)).open("a")
-    with log, os.fdopen(reading, encoding="utf-8") as replies:
+    log_path = os.environ.get("LOOKTWICE_BENCH_LOG", os.devnull)
+    with open(log_path, "a", encoding="utf-8") as log, os.fdopen(reading, encoding="utf-8") as replies:
         process = subprocess.Popen(
             [python, "-m", "model.bench.child", str(writing), json.dumps(settings)],
             stdin=subprocess.PIPE,

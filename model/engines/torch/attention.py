@@ -1,6 +1,6 @@
 """Attention of one pass over rows of keys and values.
 
-A `PromptPass` writes and reads one prompt. A `DrawPass` feeds all running draws: a draw's token sees its
+A `PromptPass` writes and reads prompts. A `DrawPass` feeds all running draws: a draw's token sees its
 scene's prompt, which lies in memory once, and what the draw itself has written. The two parts are worked
 out apart, the prompt's for all draws of a scene at once, and joined by the sums of their softmaxes
 (log-sum-exp merging as in FlashDecoding, https://pytorch.org/blog/flash-decoding/).
@@ -22,27 +22,44 @@ from model.engines.torch.kv import KvRows
 IntArray = npt.NDArray[np.int64]
 
 
-class PromptPass:
-    """The next ``count`` tokens of the prompt in ``row``, behind ``start`` that are there."""
+class PromptPart(NamedTuple):
+    """The next ``fed`` tokens of the prompt in ``row``, behind ``held`` that are there."""
 
-    def __init__(self, prompts: KvRows, row: int, start: int, count: int) -> None:
-        self._prompts, self._row, self._start, self._end = prompts, row, start, start + count
-        self._mask: Tensor | None = None
-        if start:
-            seen = torch.arange(self._end, device=prompts.keys.device)
-            self._mask = seen <= seen[start:, None]
+    row: int
+    held: int
+    fed: int
+
+
+class PromptPass:
+    """The next tokens of some prompts, packed one after the other."""
+
+    def __init__(self, prompts: KvRows, parts: Sequence[PromptPart]) -> None:
+        self._prompts, self._parts = prompts, parts
+        self._masks = []
+        for _, held, fed in parts:
+            seen = torch.arange(held + fed, device=prompts.keys.device)
+            self._masks.append(seen <= seen[held:, None] if held else None)
 
     def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
         """Store ``key`` and ``value`` [t, g, d]; what ``query`` [t, h, d], scaled, sees: [t, h x d]."""
-        keys, values = (memory[layer, self._row] for memory in (self._prompts.keys, self._prompts.values))
-        keys[:, self._start : self._end] = key.transpose(0, 1)
-        values[:, self._start : self._end] = value.transpose(0, 1)
+        counts = [part.fed for part in self._parts]
+        fed = (torch.split(each, counts) for each in (query, key, value))
+        every = zip(self._parts, self._masks, *fed, strict=True)
+        return torch.cat([self._attend(layer, *each) for each in every])
+
+    def _attend(
+        self, layer: int, part: PromptPart, mask: Tensor | None, query: Tensor, key: Tensor, value: Tensor
+    ) -> Tensor:
+        keys, values = (memory[layer, part.row] for memory in (self._prompts.keys, self._prompts.values))
+        end = part.held + part.fed
+        keys[:, part.held : end] = key.transpose(0, 1)
+        values[:, part.held : end] = value.transpose(0, 1)
         attended = functional.scaled_dot_product_attention(
             query.transpose(0, 1)[None],
-            keys[None, :, : self._end],
-            values[None, :, : self._end],
-            attn_mask=self._mask,
-            is_causal=self._mask is None,
+            keys[None, :, :end],
+            values[None, :, :end],
+            attn_mask=mask,
+            is_causal=mask is None,
             scale=1.0,
             enable_gqa=True,
         )

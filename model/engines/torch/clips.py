@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
 from hashlib import blake2b
 
 from torch import Tensor
@@ -27,23 +26,16 @@ class ClipCache:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def tokens(
-        self, slices: Sequence[Pictures], encode: Callable[[list[Pictures]], Sequence[Tensor]]
-    ) -> list[Tensor]:
-        """The vision tokens of every slice; those not kept come from one call of ``encode``."""
-        keys = [_key(pictures) for pictures in slices]
-        missing = {key: pictures for key, pictures in zip(keys, slices, strict=True) if key not in self._kept}
-        made: dict[bytes, Tensor] = {}
-        if missing:
-            made.update(zip(missing, encode(list(missing.values())), strict=True))
-        found = [made[key] if key in made else self._kept[key] for key in keys]
-        for key, tokens in zip(keys, found, strict=True):
-            self._keep(key, tokens)
-        return found
+    def find(self, key: bytes) -> Tensor | None:
+        """What is kept under a `digest`."""
+        if key not in self._kept:
+            return None
+        self._kept.move_to_end(key)
+        return self._kept[key]
 
-    def _keep(self, key: bytes, tokens: Tensor) -> None:
+    def keep(self, key: bytes, tokens: Tensor) -> None:
+        """Keep ``tokens``, and forget others until they fit; too large ones are not kept at all."""
         if key in self._kept:
-            self._kept.move_to_end(key)
             return
         self._kept[key] = tokens
         self._bytes += tokens.nbytes
@@ -52,9 +44,10 @@ class ClipCache:
             self._bytes -= forgotten.nbytes
 
 
-def _key(pictures: Pictures) -> bytes:
-    digest = blake2b(digest_size=16)
+def digest(pictures: Pictures) -> bytes:
+    """What tells the pictures of one slice from all others."""
+    hashed = blake2b(digest_size=16)
     for picture in pictures:
-        digest.update(len(picture).to_bytes(8, "little"))
-        digest.update(picture)
-    return digest.digest()
+        hashed.update(len(picture).to_bytes(8, "little"))
+        hashed.update(picture)
+    return hashed.digest()

@@ -33,6 +33,8 @@ Ids = npt.NDArray[np.int64]
 _GUESS_ROWS: Final = 12
 """Tokens fed ahead cost next to nothing while so few rows run, and as much as others when many do."""
 _GUESS_TOKENS: Final = 32
+_ALONE: Final = 4
+"""So many times as many tokens of prompts go through in a step while no draw waits for it."""
 _HABITUAL: Final = 64
 """Decisions between more tokens than this (codes, free words) are no matter of habit."""
 
@@ -103,7 +105,7 @@ class Decoder:
     Args:
         runner: network and memory; the decoder's alone.
         shortcuts: see there.
-        prompt_chunk: tokens of a new prompt that go through the network in one step while draws run.
+        prompt_chunk: tokens of new prompts that go through the network in one step while draws run.
         clock: seconds, ever growing; deadlines count from a request's arrival on it.
         pace: what is known of how long things take.
     """
@@ -113,7 +115,7 @@ class Decoder:
         runner: Runner,
         shortcuts: Shortcuts = Shortcuts(),
         *,
-        prompt_chunk: int = 256,
+        prompt_chunk: int = 512,
         clock: Callable[[], float] = time.monotonic,
         pace: Pace | None = None,
     ) -> None:
@@ -182,7 +184,7 @@ class Decoder:
             rows = self._paused.pop(request.id, None) or self._first_rows(request)
             groups = [rows] if self._shortcuts.shared_prompts else [[row] for row in rows]
             self._beginnings += [_Beginning(request, group) for group in groups]
-        events = self._bring_prompt_on()
+        events = self._bring_prompts_on()
         if not self._rows:
             return events
         rows = list(self._rows)
@@ -223,34 +225,53 @@ class Decoder:
             assert row.draws
             assert row.pending or row.cursor.done, "a row has nothing to feed"
 
-    def _bring_prompt_on(self) -> list[StepEvent]:
-        """A chunk of the most urgent prompt; all of it while no draw waits for the pass."""
-        if not self._beginnings:
-            return []
-        beginning = min(self._beginnings, key=lambda each: urgency(each.request))
-        request = beginning.request
-        plan_request = request.plan_request
-        if beginning.prompt is None:
-            try:
-                beginning.prompt = self._runner.begin_prompt(
-                    plan_request.scene, plan_request.format, len(self._prompts)
-                )
-            except ValueError as error:
-                return [self._fail(request, RequestError(str(error)))]
-            except Exception as error:  # one scene that cannot be encoded must not end the others
-                return [self._fail(request, EngineError.because("the scene could not be encoded", error))]
-            self._prompts.append(beginning.prompt)
-        prompt = beginning.prompt
-        self._runner.feed_prompt(prompt, self._chunk if self._rows else len(prompt.embeddings))
-        if not prompt.ready:
-            return []
-        self._beginnings.remove(beginning)
+    def _bring_prompts_on(self) -> list[StepEvent]:
+        """Some tokens of the most urgent prompts; many while no draw waits for the pass."""
+        left = self._chunk if self._rows else _ALONE * self._chunk
+        taken: list[tuple[_Beginning, int]] = []
+        for beginning in sorted(self._beginnings, key=lambda each: urgency(each.request)):
+            if left <= 0:
+                break
+            count = min(left, self._runner.prompt_tokens)
+            taken.append((beginning, count))
+            left -= count
+        events = self._open([beginning for beginning, _ in taken if beginning.prompt is None])
+        parts = [
+            (beginning.prompt, count)
+            for beginning, count in taken
+            if beginning.prompt is not None and beginning in self._beginnings
+        ]
+        if parts:
+            self._runner.feed_prompts(parts)
+        for beginning in [each for each in self._beginnings if each.prompt is not None and each.prompt.ready]:
+            assert beginning.prompt is not None
+            self._beginnings.remove(beginning)
+            for row in beginning.rows:
+                row.begin(beginning.prompt, beginning.prompt.last_token)
+                self._rows.append(row)
+                if not row.tokens:
+                    told = row.write((), self._runner.loaded.vocabulary)
+                    events += [(beginning.request.id, event) for event in told]
+        return events
+
+    def _open(self, beginnings: list[_Beginning]) -> list[StepEvent]:
+        """Begin prompts, their pictures encoded together; requests whose scene cannot be read fail."""
+        asked = [each.request.plan_request for each in beginnings]
+        scenes = [(request.scene, request.format) for request in asked]
         events: list[StepEvent] = []
-        for row in beginning.rows:
-            row.begin(prompt, prompt.last_token)
-            self._rows.append(row)
-            if not row.tokens:
-                events += [(request.id, event) for event in row.write((), self._runner.loaded.vocabulary)]
+        for beginning, begun in zip(
+            beginnings, self._runner.begin_prompts(scenes, len(self._prompts)), strict=True
+        ):
+            if not isinstance(begun, Exception):
+                beginning.prompt = begun
+                self._prompts.append(begun)
+            elif beginning not in self._beginnings:
+                continue  # its request failed with another of its prompts
+            elif isinstance(begun, ValueError):
+                events.append(self._fail(beginning.request, RequestError(str(begun))))
+            else:
+                error = EngineError.because("the scene could not be encoded", begun)
+                events.append(self._fail(beginning.request, error))
         return events
 
     def _first_rows(self, request: Request) -> list[Row]:

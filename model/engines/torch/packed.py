@@ -75,16 +75,29 @@ class PackedDecoder:
         half = self._head_dim // 2
         return Rotation(cosines, torch.cat([-sines[..., :half], sines[..., half:]], dim=-1))
 
-    def __call__(self, embeddings: Tensor, rotation: Rotation, attention: Attention) -> Tensor:
-        """Final hidden states [t, hidden] of tokens [t, hidden]."""
+    def __call__(
+        self, embeddings: Tensor, rotation: Rotation, attention: Attention, wanted: Tensor | None
+    ) -> Tensor:
+        """Final hidden states [k, hidden] of some of the tokens [t, hidden].
+
+        Args:
+            wanted: int64 [k], the tokens whose states are asked for; None for none of them, when all that
+                matters is the keys and values that ``attention`` stores.
+        """
         x = embeddings
-        turned = self.heads + self._groups
+        turned, last = self.heads + self._groups, len(self._layers) - 1
         for index, layer in enumerate(self._layers):
             normed = self._norm(x, layer.norm_in).to(self._products)
             qkv = functional.linear(normed, layer.qkv, layer.qkv_bias).view(len(x), -1, self._head_dim)
             looking = rotation(qkv[:, :turned])
             query, key, value = looking[:, : self.heads], looking[:, self.heads :], qkv[:, turned:]
-            x = x + functional.linear(attention.attend(index, query, key, value), layer.out)
+            attended = attention.attend(index, query, key, value)
+            if index == last:
+                # Nothing comes behind the last layer but the states that are wanted.
+                if wanted is None:
+                    return x[:0]
+                x, attended = x.index_select(0, wanted), attended.index_select(0, wanted)
+            x = x + functional.linear(attended, layer.out)
             normed = self._norm(x, layer.norm_mlp).to(self._products)
             gate, up = functional.linear(normed, layer.gate_up).chunk(2, dim=-1)
             x += functional.linear(functional.silu(gate).mul_(up), layer.down)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,8 +13,8 @@ import torch
 from torch import Tensor
 
 from model.driving.scene import Scene
-from model.engines.torch.attention import DrawPass, Fed, PromptPass
-from model.engines.torch.clips import ClipCache, Pictures
+from model.engines.torch.attention import DrawPass, Fed, PromptPart, PromptPass
+from model.engines.torch.clips import ClipCache, digest
 from model.engines.torch.head import AllowedHead, Ids
 from model.engines.torch.kv import KvRows
 from model.engines.torch.packed import PackedDecoder, Rotation
@@ -64,14 +65,26 @@ class Feed(NamedTuple):
     wanted: Sequence[tuple[int, Ids]]
 
 
+class _Opened(NamedTuple):
+    """A scene's slices by digest, the vision tokens that are kept, and the patches of the others."""
+
+    keys: list[bytes]
+    kept: dict[bytes, Tensor]
+    patches: dict[bytes, npt.NDArray[np.uint8]]
+
+
 def pass_size(count: int) -> int:
     """Tokens that a pass with ``count`` of them is padded to: one of few sizes, at most a quarter too large.
 
     For every new size of a product in bfloat16 a CPU's library makes a kernel first, which takes as long
     as using it forty times.
     """
-    step = 1 << max(0, (count - 1).bit_length() - 3)
+    step = 1 << max(0, (count - 1).bit_length() - 3) if count else 1
     return -(-count // step) * step
+
+
+def _padded(values: npt.NDArray[np.int64], size: int, device: torch.device) -> Tensor:
+    return torch.from_numpy(np.pad(values, (0, size - len(values)))).to(device)
 
 
 class Runner:
@@ -82,6 +95,9 @@ class Runner:
         rows: draws that can run at once, each with a prompt of its own if need be.
         clip_bytes: of vision tokens kept for pictures that come again.
         products: what matrix products are worked out in; None for the weights' own type.
+
+    Attributes:
+        prompt_tokens: that the longest prompt holds.
     """
 
     def __init__(
@@ -105,6 +121,8 @@ class Runner:
         self._decoder = PackedDecoder(model.model.language_model, products)
         self._head = AllowedHead(model.lm_head.weight)
         self._clips = ClipCache(clip_bytes)
+        tower = model.model.visual
+        self._tower = tower if products is None else copy.deepcopy(tower).to(products)
         kept = [
             len(loaded.inputs.prompt(format, route=route).ids) - 1
             for format in loaded.card.formats
@@ -117,45 +135,53 @@ class Runner:
             "dtype": products or loaded.model.dtype,
             "device": loaded.model.device,
         }
-        self._prompts = KvRows(rows=rows, length=max(kept), **sizes)
+        self.prompt_tokens = max(kept)
+        self._prompts = KvRows(rows=rows, length=self.prompt_tokens, **sizes)
         self._draws = KvRows(rows=rows, length=length, **sizes)
         every_place = torch.arange(max(kept) + 1 + length, device=loaded.model.device)
         self._rotation = self._decoder.rotation(every_place.expand(3, -1))
         self._heads: dict[str, tuple[Tensor, Tensor]] = {}
 
-    def begin_prompt(self, scene: Scene, format: str, row: int) -> Prompt:
-        """A scene's prompt, its pictures encoded, nothing of it in its row but what all scenes share.
+    def begin_prompts(self, scenes: Sequence[tuple[Scene, str]], first_row: int) -> list[Prompt | Exception]:
+        """Prompts of scenes in formats, from ``first_row`` on, their pictures encoded all at once.
 
-        Raises:
-            ValueError: the scene cannot be made into inputs (missing camera, damaged picture).
+        Of each prompt its row holds what all scenes share. A scene that cannot be made into inputs (missing
+        camera, damaged picture) gets its exception and no row.
         """
-        loaded = self.loaded
-        route = scene.route if loaded.settings.with_route else None
-        prompt = loaded.inputs.prompt(format, route=route is not None)
-        vision_tokens = self._clips.tokens(loaded.inputs.slices(scene), self._encode)
-        embedded = loaded.model.embed_prompt(prompt, torch.cat(vision_tokens), scene.history, route)
-        rotation = self._decoder.rotation(embedded.position_ids)
-        kept = len(prompt.ids) - 1
-        begun = Prompt(
-            row,
-            embedded.embeddings[:kept],
-            Rotation(*(part[:kept] for part in rotation)),
-            0,
-            int(prompt.ids[-1]),
-            prompt.position_offset,
-        )
-        is_video = prompt.ids == loaded.model.config.video_token_id
-        self._begin_with_head(begun, format, int(is_video.argmax()))
+        opened = [self._open(scene) for scene, _ in scenes]
+        new: dict[bytes, npt.NDArray[np.uint8]] = {}
+        for each in opened:
+            if not isinstance(each, Exception):
+                new |= each.patches
+        made = self._encode(new)
+        begun: list[Prompt | Exception] = []
+        row = first_row
+        for (scene, format), each in zip(scenes, opened, strict=True):
+            if isinstance(each, Exception):
+                begun.append(each)
+                continue
+            tokens = [each.kept[key] if key in each.kept else made[key] for key in each.keys]
+            begun.append(self._begin_prompt(scene, format, row, torch.cat(tokens)))
+            row += 1
+        for key, vision_tokens in made.items():
+            self._clips.keep(key, vision_tokens)
         return begun
 
-    def feed_prompt(self, prompt: Prompt, count: int) -> None:
-        """Run up to ``count`` more of a prompt's tokens into its row."""
-        end = min(prompt.held + count, len(prompt.embeddings))
-        part = slice(prompt.held, end)
-        attention = PromptPass(self._prompts, prompt.row, prompt.held, end - prompt.held)
-        rotation = Rotation(*(values[part] for values in prompt.rotation))
-        self._decoder(prompt.embeddings[part], rotation, attention)
-        prompt.held = end
+    def feed_prompts(self, parts: Sequence[tuple[Prompt, int]]) -> None:
+        """Run up to so many more of each prompt's tokens into its row, in one pass."""
+        spans = [
+            (prompt, slice(prompt.held, min(prompt.held + count, len(prompt.embeddings))))
+            for prompt, count in parts
+        ]
+        attention = PromptPass(
+            self._prompts,
+            [PromptPart(prompt.row, span.start, span.stop - span.start) for prompt, span in spans],
+        )
+        embeddings = torch.cat([prompt.embeddings[span] for prompt, span in spans])
+        rotations = zip(*([part[span] for part in prompt.rotation] for prompt, span in spans), strict=True)
+        self._decoder(embeddings, Rotation(*(torch.cat(part) for part in rotations)), attention, None)
+        for prompt, span in spans:
+            prompt.held = span.stop
 
     def copy_row(self, source: int, target: int, length: int) -> None:
         """Make a draw's row hold what another holds in its first ``length`` places."""
@@ -182,39 +208,73 @@ class Runner:
         for feed in feeds:
             lengths[feed.prompt.row] = feed.prompt.held
         fed = [Fed(feed.prompt.row, feed.held, count) for feed, count in zip(feeds, counts, strict=True)]
-        size = pass_size(len(ids))
-        attention = DrawPass(self._decoder.heads, self._prompts, self._draws, fed, lengths, size)
-        ids, places = (np.pad(each, (0, size - len(each))) for each in (ids, places))
-        embeddings = self.loaded.model.get_input_embeddings()(torch.from_numpy(ids).to(device))
-        hidden = self._decoder(embeddings, self._rotation.at(torch.from_numpy(places).to(device)), attention)
         starts = np.cumsum(counts) - counts
         asked = [
             (row, int(starts[row]) + place, ids)
             for row, feed in enumerate(feeds)
             for place, ids in feed.wanted
         ]
+        size = pass_size(len(ids))
+        attention = DrawPass(self._decoder.heads, self._prompts, self._draws, fed, lengths, size)
+        embeddings = self.loaded.model.get_input_embeddings()(_padded(ids, size, device))
+        rotation = self._rotation.at(_padded(places, size, device))
+        at = _padded(np.array([place for _, place, _ in asked], np.int64), pass_size(len(asked)), device)
+        hidden = self._decoder(embeddings, rotation, attention, at if asked else None)
         found: list[list[npt.NDArray[np.float64]]] = [[] for _ in feeds]
         if asked:
-            at = torch.tensor([place for _, place, _ in asked], device=device)
-            logits = self._head.logits(hidden.index_select(0, at), [ids for _, _, ids in asked])
+            logits = self._head.logits(hidden[: len(asked)], [ids for _, _, ids in asked])
             for (row, _, _), values in zip(asked, logits, strict=True):
                 found[row].append(values)
         return found
 
-    def _encode(self, slices: list[Pictures]) -> Sequence[Tensor]:
+    def _open(self, scene: Scene) -> _Opened | Exception:
+        """A scene's pictures: what is kept of them, and the patches of the others."""
+        try:
+            slices = self.loaded.inputs.slices(scene)
+            keys = [digest(pictures) for pictures in slices]
+            kept = {key: tokens for key in keys if (tokens := self._clips.find(key)) is not None}
+            patches = {
+                key: self.loaded.inputs.patches(pictures)
+                for key, pictures in zip(keys, slices, strict=True)
+                if key not in kept
+            }
+        except Exception as error:  # one scene that cannot be read must not end the others
+            return error
+        return _Opened(keys, kept, patches)
+
+    def _encode(self, patches: Mapping[bytes, npt.NDArray[np.uint8]]) -> dict[bytes, Tensor]:
         """Vision tokens of slices, each [k, hidden]."""
+        if not patches:
+            return {}
         loaded = self.loaded
-        patches = np.concatenate([loaded.inputs.patches(pictures) for pictures in slices])
-        grid = torch.tensor([[1, *loaded.settings.grid[1:]]] * len(slices))
-        device = loaded.model.device
-        with torch.autocast(device.type, self._products, enabled=self._products is not None):
-            tokens = loaded.model.vision(torch.from_numpy(patches).to(device), grid)
-        return tokens.view(len(slices), -1, tokens.shape[-1]).unbind()
+        grid = torch.tensor([[1, *loaded.settings.grid[1:]]] * len(patches))
+        pixels = torch.from_numpy(np.concatenate(list(patches.values()))).to(loaded.model.device)
+        tokens = loaded.model.vision(pixels, grid, self._tower)
+        return dict(zip(patches, tokens.view(len(patches), -1, tokens.shape[-1]).unbind(), strict=True))
+
+    def _begin_prompt(self, scene: Scene, format: str, row: int, vision_tokens: Tensor) -> Prompt:
+        loaded = self.loaded
+        route = scene.route if loaded.settings.with_route else None
+        prompt = loaded.inputs.prompt(format, route=route is not None)
+        embedded = loaded.model.embed_prompt(prompt, vision_tokens, scene.history, route)
+        rotation = self._decoder.rotation(embedded.position_ids)
+        kept = len(prompt.ids) - 1
+        begun = Prompt(
+            row,
+            embedded.embeddings[:kept],
+            Rotation(*(part[:kept] for part in rotation)),
+            0,
+            int(prompt.ids[-1]),
+            prompt.position_offset,
+        )
+        is_video = prompt.ids == loaded.model.config.video_token_id
+        self._begin_with_head(begun, format, int(is_video.argmax()))
+        return begun
 
     def _begin_with_head(self, prompt: Prompt, format: str, count: int) -> None:
         memory = (self._prompts.keys, self._prompts.values)
         if format not in self._heads:
-            self.feed_prompt(prompt, count)
+            self.feed_prompts([(prompt, count)])
             keys, values = (part[:, prompt.row, :, :count].clone() for part in memory)
             self._heads[format] = (keys, values)
             return

@@ -185,7 +185,7 @@ class VllmEngine:
             "disable_log_stats": True,
         }
         if current_platform.is_cpu():
-            # Blocks of 128 tokens would leave most of a prompt out of the prefix cache; and where prompts come
-            # in chunks, a seed ends vLLM ("CPU Generator does not use offset", 0.32).
+            # Blocks of 128 tokens would leave most of a prompt out of the prefix cache; where prompts come in
+            # chunks, a seed ends vLLM ("CPU Generator does not use offset", 0.32).
             arguments |= {"block_size": 32, "enable_chunked_prefill": False, "max_num_batched_tokens": 8192}
         self._llm = AsyncLLM.from_engine_args(AsyncEngineArgs(**(arguments | dict(self._settings.arguments))))
