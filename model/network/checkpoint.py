@@ -126,7 +126,7 @@ def load(folder: Path, dtype: torch.dtype = torch.float32, device: str = "cpu") 
         CheckpointError: the folder or one of its parts is missing or does not fit; says which.
     """
     parts = read_parts(folder)
-    network: Any = _load_model(folder, _read_config(folder), dtype)
+    network: Any = _load_model(folder, read_config(folder), dtype)
     return Loaded(**vars(parts), model=network.to(device).eval())
 
 
@@ -137,7 +137,7 @@ def read_parts(folder: Path) -> Parts:
         CheckpointError: a part is missing or does not fit; says which.
     """
     card = read_card(folder)
-    config = _read_config(folder)
+    config = read_config(folder)
     try:
         vocabulary = Vocabulary(AutoTokenizer.from_pretrained(folder, local_files_only=True))
         codec = TrajectoryCodec.load(folder)
@@ -191,7 +191,7 @@ def expand_stock(
     """
     if source.resolve() == target.resolve():
         raise CheckpointError("the expanded checkpoint must go to another folder than the stock one")
-    config = _read_config(source)
+    config = read_config(source)
     vision = config.vision_config
     try:
         tokenizer = AutoTokenizer.from_pretrained(source, local_files_only=True)
@@ -238,7 +238,8 @@ def write_code_embeddings(model: LookTwiceVla, codec: TrajectoryCodec, vocabular
             weight[ids.start : ids.stop] = (spread * scaled / scaled.std()).to(weight.dtype)
 
 
-def _read_config(folder: Path) -> VlaConfig:
+def read_config(folder: Path) -> VlaConfig:
+    """The configuration of a folder's network; raises `CheckpointError`."""
     path = folder / "config.json"
     if not path.is_file():
         raise CheckpointError(f"{folder} has no config.json")

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from model.network.attention import attend
+from model.network.patches import normalisation
 
 
 def attends_to_whole_pictures(vision_config: Any) -> bool:
@@ -26,11 +27,16 @@ def encode_pictures(visual: Any, patches: Tensor, rows: int, columns: int) -> Te
 
     Args:
         visual: `Qwen2_5_VisionTransformerPretrainedModel` for which `attends_to_whole_pictures` holds.
-        patches: normalised [k x rows x columns, 3 x temporal x patch x patch], in the processor's order.
+        patches: [k x rows x columns, 3 x temporal x patch x patch] in the processor's order: floats that are
+            normalised, or uint8 as they are.
         rows, columns: patches per picture.
     """
-    weight = visual.patch_embed.proj.weight
-    x = functional.linear(patches.to(weight.dtype), weight.flatten(1))
+    weight, bias = visual.patch_embed.proj.weight.flatten(1), None
+    if patches.dtype == torch.uint8:
+        # Normalising is linear too: cheaper done to the weights than to all patches.
+        scale, shift = (torch.from_numpy(part).to(weight) for part in normalisation(patches.shape[1]))
+        weight, bias = weight * scale, weight @ shift
+    x = functional.linear(patches.to(weight.dtype), weight, bias)
     tokens = rows * columns
     x = x.view(-1, tokens, x.shape[-1])
     cos, sin = _rotation(visual, rows, columns, x)

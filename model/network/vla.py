@@ -74,20 +74,20 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
 
         Args:
             patches: [p, 1176], normalised floats as Qwen2.5-VL's processor makes them, or uint8, which
-                are normalised here (a quarter of the memory to move).
+                are normalised on the way (a quarter of the memory to move).
             grid_thw: int64 [clips, 3], slices, rows, columns of patches.
             tower: a copy of the vision tower in another type, to be used in its place.
         """
-        if patches.dtype == torch.uint8:
-            scale, shift = (
-                torch.from_numpy(part).to(patches.device) for part in normalisation(patches.shape[1])
-            )
-            patches = patches.float() * scale + shift
         visual: Any = self.model.visual if tower is None else tower
         grids = set(map(tuple, grid_thw.tolist()))
         if self._fast_vision and len(grids) == 1 and not visual.gradient_checkpointing:
             _, rows, columns = grids.pop()
             return encode_pictures(visual, patches, rows, columns)
+        if patches.dtype == torch.uint8:
+            scale, shift = (
+                torch.from_numpy(part).to(patches.device) for part in normalisation(patches.shape[1])
+            )
+            patches = patches.float() * scale + shift
         features: Tensor = visual(patches.to(visual.dtype), grid_thw, return_dict=True).pooler_output
         return features
 

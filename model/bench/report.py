@@ -1,0 +1,123 @@
+"""What the bench found, for people and scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from model.bench.roofline import Machine, Work
+from model.bench.run import Row
+
+
+@dataclass(frozen=True)
+class Roofline:
+    """One plan of the torch engine against the machine: ``scenes`` at once, ``n`` draws each."""
+
+    machine: Machine
+    scenes: int
+    n: int
+    work: Work
+    least_s: float
+    measured_s: float
+
+    @property
+    def share(self) -> float:
+        """Of the time that arithmetic and memory need at least."""
+        return self.least_s / self.measured_s
+
+
+@dataclass(frozen=True)
+class BenchReport:
+    """All figures of a run.
+
+    Attributes:
+        rows: engines at workloads.
+        shortcuts: the torch engine with more and more of its shortcuts, in order.
+        rooflines: of the torch engine, adaptive.
+    """
+
+    rows: tuple[Row, ...]
+    shortcuts: tuple[Row, ...]
+    rooflines: tuple[Roofline, ...]
+
+    def ratios(self) -> list[dict[str, Any]]:
+        """Latency and plans per second against ours at the same workload; above 1 is slower."""
+        ours = {_load(row): row for row in self.rows if row.engine == "torch"}
+        return [
+            {
+                "engine": row.engine,
+                "scenes": row.scenes,
+                "n": row.n,
+                "thinking": row.thinking,
+                "latency_p50": row.latency_p50_s / ours[_load(row)].latency_p50_s,
+                "plans_per_s": ours[_load(row)].plans_per_s / row.plans_per_s,
+            }
+            for row in self.rows
+            if row.engine != "torch" and _load(row) in ours
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """For scripts; ``rows`` and ``roofline`` are a contract."""
+        return {
+            "rows": [row.to_json() for row in self.rows],
+            "ratios": self.ratios(),
+            "shortcuts": [row.to_json() for row in self.shortcuts],
+            "roofline": {
+                "machine": asdict(self.rooflines[0].machine) if self.rooflines else None,
+                "plans": [
+                    {
+                        "scenes": each.scenes,
+                        "n": each.n,
+                        "flops": each.work.flops,
+                        "bytes": each.work.bytes,
+                        "least_s": each.least_s,
+                        "measured_s": each.measured_s,
+                        "share": each.share,
+                    }
+                    for each in self.rooflines
+                ],
+            },
+        }
+
+    def __str__(self) -> str:
+        parts = [_table(self.rows)]
+        if others := self.ratios():
+            lines = [
+                f"{each['engine']:<14}{each['scenes']:>4} x {each['n']}  {each['thinking']:<9}"
+                f"{each['latency_p50']:>9.1f}{each['plans_per_s']:>10.1f}"
+                for each in others
+            ]
+            head = f"{'against torch':<31}{'latency':>9}{'plans/s':>10}"
+            parts.append("\n".join([head, *lines]))
+        if self.shortcuts:
+            parts.append("shortcuts, one after the other\n" + _table(self.shortcuts))
+        for each in self.rooflines:
+            machine = each.machine
+            parts.append(
+                f"{each.scenes} x {each.n}: a plan takes {each.work.flops / 1e9:.1f} GFLOP and moves "
+                f"{each.work.bytes / 1e6:.0f} MB; at {machine.flops_per_s / 1e9:.0f} GFLOP/s "
+                f"({machine.dtype}) and {machine.copy_bytes_per_s / 1e9:.1f} GB/s that is "
+                f"{each.least_s * 1e3:.1f} ms, {each.share:.0%} of what was measured"
+            )
+        return "\n\n".join(parts)
+
+
+def _load(row: Row) -> tuple[int, int, str, float]:
+    return row.scenes, row.n, row.thinking, row.temperature
+
+
+def _table(rows: Sequence[Row]) -> str:
+    head = (
+        f"{'engine':<40}{'load':>8}  {'thinking':<9}{'p50 ms':>8}{'p95 ms':>8}{'plans/s':>9}{'spread':>13}"
+        f"{'tokens/s':>10}{'passes':>8}{'tokens':>8}{'valid':>7}{'MiB':>7}"
+    )
+    lines = [
+        f"{row.engine:<40}{f'{row.scenes} x {row.n}':>8}  {row.thinking:<9}{row.latency_p50_s * 1e3:>8.0f}"
+        f"{row.latency_p95_s * 1e3:>8.0f}{row.plans_per_s:>9.2f}"
+        f"{f'{row.plans_per_s_spread[0]:.2f}-{row.plans_per_s_spread[1]:.2f}':>13}{row.tokens_per_s:>10.0f}"
+        f"{row.passes_per_response:>8.1f}{row.tokens_per_response:>8.1f}{row.valid_share:>7.0%}"
+        f"{row.peak_bytes / 2**20:>7.0f}"
+        for row in rows
+    ]
+    return "\n".join([head, *lines])

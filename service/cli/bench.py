@@ -1,0 +1,134 @@
+"""`looktwice bench`: speed, as ratios within one run."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, ScenePath, told
+
+if TYPE_CHECKING:
+    from model.bench.report import Roofline
+    from model.bench.run import Row
+
+bench = typer.Typer(help="Measure speed, as ratios within one run.", no_args_is_help=True)
+
+_ENGINES = "torch,transformers,vllm,vllm-grammar"
+
+
+@bench.callback()
+def _group() -> None:
+    """Keep `engine` a command of its own."""
+
+
+@bench.command()
+def engine(
+    scenes: ScenePath = DEFAULT_SCENES,
+    checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
+    engines: Annotated[str, typer.Option(help="Which, by commas.")] = _ENGINES,
+    at_once: Annotated[str, typer.Option(help="Scenes at once, by commas.")] = "1,4,16",
+    draws: Annotated[str, typer.Option(help="Draws a scene, by commas.")] = "1,6",
+    thinking: Annotated[str, typer.Option(help="Modes, by commas.")] = "adaptive,always,never",
+    temperature: Annotated[float, typer.Option(help="Of all draws.", min=0.0, max=2.0)] = 1.0,
+    repeats: Annotated[int, typer.Option(help="Measured rounds.", min=1)] = 5,
+    shortcuts: Annotated[bool, typer.Option(help="Also our shortcuts, one after the other.")] = True,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    vllm_python: Annotated[
+        Path, typer.Option(help="The interpreter that has vLLM; `make vllm` makes this one.")
+    ] = Path(".venv-vllm/bin/python"),
+    preset: Annotated[str, typer.Option(help="A published size instead of a checkpoint: cf-vla-3b.")] = "",
+    random_weights: Annotated[bool, typer.Option(help="Said with a preset: its weights are random.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Our engine, transformers and vLLM on the same checkpoint, scenes and controls."""
+    with told(), tempfile.TemporaryDirectory() as folder:
+        from model.bench.report import BenchReport
+        from model.bench.run import Job, run
+        from model.bench.workload import Workload
+        from model.engines.engine import Controls
+
+        if preset:
+            checkpoint = _random_checkpoint(preset, checkpoint, Path(folder), device, random_weights)
+        modes: list[Any] = thinking.split(",")
+        loads = tuple(
+            Workload(_whole(count), _whole(n), mode, temperature)
+            for count in at_once.split(",")
+            for n in draws.split(",")
+            for mode in modes
+        )
+        for load in loads:
+            Controls(
+                thinking=load.thinking, n=load.n, temperature=load.temperature
+            )  # checked before the work
+        names = tuple(engines.split(","))
+        if unknown := set(names) - set(_ENGINES.split(",")):
+            raise ValueError(f"unknown engine {', '.join(sorted(unknown))}; known are {_ENGINES}")
+        # Not resolved: an environment's interpreter is a link, and found by where it lies.
+        python = str(vllm_python.absolute()) if vllm_python.exists() else sys.executable
+
+        def tell(what: str) -> None:
+            typer.echo(what, err=True)
+
+        job = Job(names, loads, checkpoint, scenes, repeats, device, python)
+        rows = run(job, tell)
+        steps: list[Row] = []
+        if shortcuts and "torch" in names:
+            for chosen in _ladder():
+                ladder = tuple(load for load in loads if load.n > 1 and load.thinking == "adaptive")
+                steps += run(Job((chosen,), ladder, checkpoint, scenes, repeats, device), tell)
+        report = BenchReport(tuple(rows), tuple(steps), tuple(_rooflines(rows, checkpoint, device)))
+        typer.echo(json.dumps(report.to_json()) if as_json else str(report))
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal() or not int(text):
+        raise ValueError(f"{text!r} is no positive number")
+    return int(text)
+
+
+def _ladder() -> list[str]:
+    """The torch engine without shortcuts, then with one more at a time."""
+    from model.bench.contenders import SHORTCUTS
+
+    return ["torch+none"] + [f"torch+{','.join(SHORTCUTS[:count])}" for count in range(1, len(SHORTCUTS) + 1)]
+
+
+def _random_checkpoint(preset: str, words_of: Path, folder: Path, device: str, agreed: bool) -> Path:
+    from model.bench.presets import PRESETS, write_random
+
+    if preset not in PRESETS:
+        raise ValueError(f"unknown preset {preset!r}; known are {', '.join(PRESETS)}")
+    if not agreed:
+        raise ValueError("a preset has no trained weights: say --random-weights")
+    write_random(PRESETS[preset], words_of, folder / preset, device=device)
+    return folder / preset
+
+
+def _rooflines(rows: list[Row], checkpoint: Path, device: str) -> list[Roofline]:
+    import torch
+
+    from model.bench.report import Roofline
+    from model.bench.roofline import measure, work_of_plan
+    from model.engines.torch.engine import fast_products
+    from model.network.checkpoint import read_config, read_parts
+
+    dtype = torch.bfloat16 if device != "cpu" else fast_products() or torch.float32
+    machine, parts = measure(device, dtype), read_parts(checkpoint)
+    prompt = len(parts.inputs.prompt("cf_vla", route=parts.settings.with_route).ids)
+    slices, grid_rows, columns = parts.settings.grid
+    patches = len(parts.settings.cameras) * slices * grid_rows * columns
+    found = []
+    for row in rows:
+        if row.engine != "torch" or row.thinking != "adaptive":
+            continue
+        work = work_of_plan(
+            read_config(checkpoint), prompt, patches, row.counts["tokens"], row.counts["passes"], dtype
+        )
+        least_s, measured_s = work.seconds(machine), 1 / row.plans_per_s
+        found.append(Roofline(machine, row.scenes, row.n, work, least_s, measured_s))
+    return found
