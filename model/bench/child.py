@@ -11,15 +11,16 @@ import json
 import os
 import sys
 import time
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from model.bench.contenders import SHORTCUTS, Contender, EngineContender, PlainVllm, Transformers
+from model.bench.contenders import SHORTCUTS, Answer, Contender, EngineContender, PlainVllm, Transformers
 from model.bench.memory import peak_bytes
 from model.bench.workload import Workload
 from model.driving.scene_store import read_scenes
+from model.engines.engine import PlanRequest
 
 _ROWS = 96
 _MAX_TOKENS = 600
@@ -48,18 +49,14 @@ def contenders(names: list[str], checkpoint: Path, device: str) -> dict[str, Con
 
 def _torch_engine(name: str, checkpoint: Path, device: str) -> Any:
     """``torch``, or ``torch+…`` with some shortcuts only: ``torch+none``, ``torch+jump,shared_prompts``."""
-    import torch
-
     from model.engines.torch.decoder import Shortcuts
     from model.engines.torch.engine import TorchEngine, TorchSettings
 
-    settings: dict[str, Any] = {"rows": _ROWS, "device": device}
-    if device != "cpu":
-        settings |= {"dtype": torch.bfloat16, "products": None}
+    settings = TorchSettings.on(device, _ROWS)
     if "+" in name:
         wanted = name.partition("+")[2].split(",")
-        settings["shortcuts"] = Shortcuts(**{each: each in wanted for each in SHORTCUTS})
-    return TorchEngine(checkpoint, TorchSettings(**settings))
+        settings = replace(settings, shortcuts=Shortcuts(**{each: each in wanted for each in SHORTCUTS}))
+    return TorchEngine(checkpoint, settings)
 
 
 async def _serve(job: Mapping[str, Any], replies: Any) -> None:
@@ -72,9 +69,9 @@ async def _serve(job: Mapping[str, Any], replies: Any) -> None:
     for line in sys.stdin:
         asked = json.loads(line)
         contender = made[asked["contender"]]
-        requests = Workload(**asked["workload"]).requests(scenes, asked["number"])
+        requests = Workload(**asked["workload"]).requests(scenes, asked["number"], asked["step"])
         before, began_s = contender.counts(), time.perf_counter()
-        answers = await contender.answer(requests)
+        answers = await _answers(contender, requests, asked["arrivals_s"])
         wall_s = time.perf_counter() - began_s
         counts = {name: count - before[name] for name, count in contender.counts().items()}
         reply = {
@@ -86,6 +83,21 @@ async def _serve(job: Mapping[str, Any], replies: Any) -> None:
         print(json.dumps(reply), file=replies, flush=True)
     for contender in made.values():
         await contender.stop()
+
+
+async def _answers(
+    contender: Contender, requests: Sequence[PlanRequest], arrivals_s: Sequence[float]
+) -> list[Answer]:
+    """The answers to requests that arrive at once, or each so many seconds from now."""
+    if not arrivals_s:
+        return await contender.answer(requests)
+
+    async def later(request: PlanRequest, arrival_s: float) -> Answer:
+        await asyncio.sleep(arrival_s)
+        [answer] = await contender.answer([request])
+        return answer
+
+    return list(await asyncio.gather(*map(later, requests, arrivals_s)))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from model.bench.roofline import Machine, Work
-from model.bench.run import Row
+from model.bench.run import Deadlines, Planner, Row
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,15 @@ class BenchReport:
         rows: engines at workloads.
         shortcuts: the torch engine with more and more of its shortcuts, in order.
         rooflines: of the torch engine, adaptive.
+        planners: the torch engine asked again for the same pictures.
+        deadlines: the torch engine at a steady load.
     """
 
     rows: tuple[Row, ...]
     shortcuts: tuple[Row, ...]
     rooflines: tuple[Roofline, ...]
+    planners: tuple[Planner, ...] = ()
+    deadlines: tuple[Deadlines, ...] = ()
 
     def ratios(self) -> list[dict[str, Any]]:
         """Latency and plans per second against ours at the same workload; above 1 is slower."""
@@ -63,6 +67,8 @@ class BenchReport:
             "rows": [row.to_json() for row in self.rows],
             "ratios": self.ratios(),
             "shortcuts": [row.to_json() for row in self.shortcuts],
+            "planner": [asdict(each) | {"ratio": each.ratio} for each in self.planners],
+            "deadlines": [asdict(each) for each in self.deadlines],
             "roofline": {
                 "machine": asdict(self.rooflines[0].machine) if self.rooflines else None,
                 "plans": [
@@ -92,6 +98,17 @@ class BenchReport:
             parts.append("\n".join([head, *lines]))
         if self.shortcuts:
             parts.append("shortcuts, one after the other\n" + _table(self.shortcuts))
+        for planner in self.planners:
+            parts.append(
+                f"a planner's next request, n = {planner.n}: {planner.next_p50_s * 1e3:.0f} ms, "
+                f"{planner.ratio:.2f} of the {planner.cold_p50_s * 1e3:.0f} ms of the first"
+            )
+        for asked in self.deadlines:
+            parts.append(
+                f"{asked.requests} requests of {asked.n} draws, {asked.per_s:.1f} a second: "
+                f"{asked.honoured:.1%} within {asked.deadline_ms} ms; "
+                f"p50 {asked.latency_p50_s * 1e3:.0f} ms, p99 {asked.latency_p99_s * 1e3:.0f} ms"
+            )
         for each in self.rooflines:
             machine = each.machine
             parts.append(

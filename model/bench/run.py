@@ -94,7 +94,7 @@ def run(job: Job, tell: Callable[[str], None]) -> list[Row]:
             for name, load in pairs:
                 tell(f"round {repeat} of {job.repeats}: {name}, {load.scenes} x {load.n}, {load.thinking}")
                 number = repeat * len(job.workloads) + job.workloads.index(load)
-                reply = processes[name].ask({"contender": name, "workload": asdict(load), "number": number})
+                reply = processes[name].ask(name, load, number)
                 if repeat:
                     replies[name, load].append(reply)
     return [
@@ -103,6 +103,69 @@ def run(job: Job, tell: Callable[[str], None]) -> list[Row]:
         for name in job.contenders
         if (name, load) in replies
     ]
+
+
+@dataclass(frozen=True)
+class Planner:
+    """Latency of a planner's first request for a scene, and of the next ones: same pictures, moved on."""
+
+    n: int
+    cold_p50_s: float
+    next_p50_s: float
+
+    @property
+    def ratio(self) -> float:
+        """Of the next to the first."""
+        return self.next_p50_s / self.cold_p50_s
+
+
+def run_planner(job: Job, n: int, steps: int = 4) -> Planner:
+    """Ask the torch engine as a 10 Hz planner does, whose pictures change twice a second."""
+    load = Workload(1, n, "adaptive")
+    cold: list[float] = []
+    next_: list[float] = []
+    with _process(job, ["torch"]) as process:
+        for number in range(4 * job.repeats):
+            for step in range(steps + 1):
+                [answer] = process.ask("torch", load, number, step=step)["answers"]
+                if number >= job.repeats:  # those before warm it up
+                    (next_ if step else cold).append(answer["latency_s"])
+    return Planner(n, statistics.median(cold), statistics.median(next_))
+
+
+@dataclass(frozen=True)
+class Deadlines:
+    """Requests that arrive by chance at ``per_s`` on average, each with a deadline.
+
+    ``honoured`` is the share that was answered in time with all its draws.
+    """
+
+    requests: int
+    n: int
+    per_s: float
+    deadline_ms: int
+    honoured: float
+    latency_p50_s: float
+    latency_p99_s: float
+
+
+def run_deadlines(job: Job, n: int, per_s: float, deadline_ms: int, requests: int = 500) -> Deadlines:
+    """Ask the torch engine at a steady load, by a Poisson process."""
+    load = Workload(requests, n, "adaptive", deadline_ms=deadline_ms)
+    arrivals_s = np.random.default_rng(0).exponential(1 / per_s, requests).cumsum().tolist()
+    with _process(job, ["torch"]) as process:
+        for number in range(3):
+            process.ask("torch", Workload(16, n, "adaptive"), number)
+        answers = process.ask("torch", load, 3, arrivals_s=arrivals_s)["answers"]
+    latencies = [answer["latency_s"] for answer in answers]
+    in_time = [
+        answer["latency_s"] * 1000 <= deadline_ms
+        and len(answer["responses"]) == n
+        and all(response["valid"] for response in answer["responses"])
+        for answer in answers
+    ]
+    p50, p99 = (float(np.percentile(latencies, share)) for share in (50, 99))
+    return Deadlines(requests, n, per_s, deadline_ms, statistics.mean(in_time), p50, p99)
 
 
 def _together(names: Sequence[str]) -> list[list[str]]:
@@ -122,7 +185,16 @@ class _Process:
         reply: dict[str, Any] = json.loads(line)
         return reply
 
-    def ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
+    def ask(
+        self, contender: str, load: Workload, number: int, *, step: int = 0, arrivals_s: Sequence[float] = ()
+    ) -> dict[str, Any]:
+        question = {
+            "contender": contender,
+            "workload": asdict(load),
+            "number": number,
+            "step": step,
+            "arrivals_s": list(arrivals_s),
+        }
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(question) + "\n")
         self._process.stdin.flush()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from model.bench.scenes import fresh
+from model.bench.scenes import fresh, moved
 from model.driving.scene import Scene
 from model.engines.engine import Controls, PlanRequest, Thinking
 
@@ -19,14 +19,21 @@ class Workload:
     n: int
     thinking: Thinking
     temperature: float = 1.0
+    deadline_ms: int | None = None
 
-    def requests(self, scenes: Sequence[Scene], number: int) -> list[PlanRequest]:
-        """Requests for scenes that no cache knows; ``number`` tells one round from another."""
-        controls = Controls(thinking=self.thinking, n=self.n, temperature=self.temperature)
+    def requests(self, scenes: Sequence[Scene], number: int, step: int = 0) -> list[PlanRequest]:
+        """Requests for scenes that no cache knows; ``number`` tells one round from another.
+
+        With the next ``step`` a planner asks again a tenth of a second later: the same pictures and seed, a
+        history that has moved on.
+        """
+        controls = Controls(
+            thinking=self.thinking, n=self.n, temperature=self.temperature, deadline_ms=self.deadline_ms
+        )
         return [
             PlanRequest(
-                f"{number}-{place}",
-                fresh(scenes[(number + place) % len(scenes)], 1000 * number + place),
+                f"{number}-{place}-{step}",
+                moved(fresh(scenes[(number + place) % len(scenes)], 1000 * number + place), step),
                 controls=_seeded(controls, 1000 * number + place),
             )
             for place in range(self.scenes)

@@ -37,6 +37,9 @@ def engine(
     temperature: Annotated[float, typer.Option(help="Of all draws.", min=0.0, max=2.0)] = 1.0,
     repeats: Annotated[int, typer.Option(help="Measured rounds.", min=1)] = 5,
     shortcuts: Annotated[bool, typer.Option(help="Also our shortcuts, one after the other.")] = True,
+    deadline_ms: Annotated[
+        int, typer.Option(help="Of 500 requests at 70 % of what our engine can do; 0 leaves them out.", min=0)
+    ] = 1000,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     vllm_python: Annotated[
         Path, typer.Option(help="The interpreter that has vLLM; `make vllm` makes this one.")
@@ -48,7 +51,7 @@ def engine(
     """Our engine, transformers and vLLM on the same checkpoint, scenes and controls."""
     with told(), tempfile.TemporaryDirectory() as folder:
         from model.bench.report import BenchReport
-        from model.bench.run import Job, run
+        from model.bench.run import Job, run, run_deadlines, run_planner
         from model.bench.workload import Workload
         from model.engines.engine import Controls
 
@@ -81,7 +84,10 @@ def engine(
             for chosen in _ladder():
                 ladder = tuple(load for load in loads if load.n > 1 and load.thinking == "adaptive")
                 steps += run(Job((chosen,), ladder, checkpoint, scenes, repeats, device), tell)
-        report = BenchReport(tuple(rows), tuple(steps), tuple(_rooflines(rows, checkpoint, device)))
+        planners = [run_planner(job, _whole(n)) for n in draws.split(",") if "torch" in names]
+        rooflines = _rooflines(rows, checkpoint, device)
+        deadlines = [run_deadlines(job, *_knee(rows, deadline_ms))] if deadline_ms else []
+        report = BenchReport(tuple(rows), tuple(steps), tuple(rooflines), tuple(planners), tuple(deadlines))
         typer.echo(json.dumps(report.to_json()) if as_json else str(report))
 
 
@@ -89,6 +95,15 @@ def _whole(text: str) -> int:
     if not text.isdecimal() or not int(text):
         raise ValueError(f"{text!r} is no positive number")
     return int(text)
+
+
+def _knee(rows: list[Row], deadline_ms: int) -> tuple[int, float, int]:
+    """Draws, requests per second and deadline: beyond this load queues begin to grow."""
+    ours = [row for row in rows if row.engine == "torch" and row.thinking == "adaptive"]
+    if not ours:
+        raise ValueError("deadlines need adaptive rows of the torch engine; --deadline-ms 0 leaves them out")
+    busiest = max(ours, key=lambda row: (row.n, row.scenes))
+    return busiest.n, 0.7 * busiest.plans_per_s, deadline_ms
 
 
 def _ladder() -> list[str]:

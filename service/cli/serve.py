@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
 from service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, told
 
 
@@ -13,15 +14,17 @@ def serve(
     checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; 0 takes a free one.")] = 8000,
-    rows: Annotated[int, typer.Option(help="Draws decoded at once.", min=1)] = 64,
+    rows: Rows = 64,
+    engine: EngineName = "torch",
+    device: Device = "cpu",
+    vllm_arguments: VllmArguments = "{}",
 ) -> None:
     """Serve a checkpoint over HTTP; the inspector page is at /."""
     import uvicorn
 
-    from model.engines.torch.engine import TorchEngine, TorchSettings
     from service.app import create_app
     from service.settings import Settings
 
     with told():
-        engine = TorchEngine(checkpoint, TorchSettings(rows=rows))
-        uvicorn.run(create_app(engine, Settings()), host=host, port=port, log_config=None)
+        made = make_engine(checkpoint, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
+        uvicorn.run(create_app(made, Settings()), host=host, port=port, log_config=None)

@@ -20,6 +20,7 @@ from model.engines.engine import (
     RequestError,
 )
 from model.engines.requests import begin, branch_of, read
+from model.engines.torch.answers import Answers
 from model.engines.torch.habits import CONTEXT, Habits
 from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
@@ -59,7 +60,8 @@ class Shortcuts:
         shared_rows: draws that have written the same tokens are one row.
         shared_prompts: a scene's prompt is worked out and held once for all its draws.
         speculate: a revised plan is fed as far as it may repeat the first one, and, while few rows run, any
-            response as far as others usually went on; what is fed ahead is checked.
+            response as the last one to the same pictures did, or as others usually went on; what is fed
+            ahead is checked.
     """
 
     jump: bool = True
@@ -124,7 +126,7 @@ class Decoder:
         self._paused: dict[str, list[Row]] = {}
         self._runner, self._shortcuts, self._chunk = runner, shortcuts, prompt_chunk
         self._schedule = Schedule(runner.rows)
-        self._habits = Habits()
+        self._habits, self._answers = Habits(), Answers()
         self._beginnings: list[_Beginning] = []
         self._prompts: list[Prompt] = []
         self._rows: list[Row] = []
@@ -289,16 +291,21 @@ class Decoder:
         if not self._shortcuts.jump and len(row.pending) > 1:
             return Feed(row.prompt, row.held, row.pending[:1], ())
         tokens, wanted, cursor = list(row.pending), list[tuple[int, Ids]](), row.cursor
-        copied = iter(row.proposal() if self._shortcuts.speculate else ())
         context = [token.id for token in row.tokens[-CONTEXT:]]
         may_guess = self._shortcuts.speculate and len(self._rows) <= _GUESS_ROWS
+        copied = iter(row.proposal() if self._shortcuts.speculate else [])
+        answer = self._answers.last(row.prompt.shown, row.draws[0]) if may_guess else ()
+        last = iter(answer[len(row.tokens) :])
         while not cursor.done:
             ids = cursor.allowed().ids
             if len(ids) > 1:
                 wanted.append((len(tokens) - 1, ids))
-            token = next(copied, None)
+            token, before = next(copied, None), next(last, None)
             if token is None and may_guess and len(tokens) < len(row.pending) + _GUESS_TOKENS:
-                token = int(ids[0]) if len(ids) == 1 else self._habits.usual(context)
+                if len(ids) == 1:
+                    token = int(ids[0])
+                else:
+                    token = before if before in ids else self._habits.usual(context)
             if token is None or token not in ids:
                 break
             tokens.append(token)
@@ -384,6 +391,8 @@ class Decoder:
                 continue
             if row.passes_before_ending:
                 self._pace.saw_ending(row.passes - row.passes_before_ending)
+            assert row.prompt is not None
+            self._answers.keep(row.prompt.shown, row.draws, [token.id for token in row.tokens])
             self._free_row(row)
             events += self._answer(row.request, draws)
         return events

@@ -55,6 +55,13 @@ class TorchSettings:
     device: str = "cpu"
     shortcuts: Shortcuts = field(default_factory=Shortcuts)
 
+    @classmethod
+    def on(cls, device: str, rows: int) -> TorchSettings:
+        """What a device does best: on a GPU everything is in bfloat16."""
+        if device == "cpu":
+            return cls(rows=rows)
+        return cls(rows=rows, dtype=torch.bfloat16, products=None, device=device)
+
 
 class TorchEngine:
     """`model.engines.engine.Engine` over a checkpoint folder; see there for the contract."""

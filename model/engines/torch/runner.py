@@ -34,6 +34,7 @@ class Prompt:
         held: how many of them are in the row.
         last_token: still to be fed.
         position_offset: see `model.network.inputs.Prompt`.
+        shown: tells its format and pictures from others.
     """
 
     row: int
@@ -42,6 +43,7 @@ class Prompt:
     held: int
     last_token: int
     position_offset: int
+    shown: bytes
 
     @property
     def ready(self) -> bool:
@@ -161,7 +163,8 @@ class Runner:
                 begun.append(each)
                 continue
             tokens = [each.kept[key] if key in each.kept else made[key] for key in each.keys]
-            begun.append(self._begin_prompt(scene, format, row, torch.cat(tokens)))
+            shown = format.encode() + b"".join(each.keys)
+            begun.append(self._begin_prompt(scene, format, row, torch.cat(tokens), shown))
             row += 1
         for key, vision_tokens in made.items():
             self._clips.keep(key, vision_tokens)
@@ -252,7 +255,9 @@ class Runner:
         tokens = loaded.model.vision(pixels, grid, self._tower)
         return dict(zip(patches, tokens.view(len(patches), -1, tokens.shape[-1]).unbind(), strict=True))
 
-    def _begin_prompt(self, scene: Scene, format: str, row: int, vision_tokens: Tensor) -> Prompt:
+    def _begin_prompt(
+        self, scene: Scene, format: str, row: int, vision_tokens: Tensor, shown: bytes
+    ) -> Prompt:
         loaded = self.loaded
         route = scene.route if loaded.settings.with_route else None
         prompt = loaded.inputs.prompt(format, route=route is not None)
@@ -266,6 +271,7 @@ class Runner:
             0,
             int(prompt.ids[-1]),
             prompt.position_offset,
+            shown,
         )
         is_video = prompt.ids == loaded.model.config.video_token_id
         self._begin_with_head(begun, format, int(is_video.argmax()))

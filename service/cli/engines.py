@@ -1,0 +1,51 @@
+"""Which engine a command runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from model.engines.engine import Engine
+
+EngineName = Annotated[
+    Literal["torch", "vllm"],
+    typer.Option("--engine", help="torch is built in; vllm for large ones."),
+]
+Device = Annotated[Literal["cpu", "cuda"], typer.Option(help="Where the torch engine runs.")]
+VllmArguments = Annotated[
+    str, typer.Option(help='More of vLLM\'s engine arguments as JSON, such as {"tensor_parallel_size": 2}.')
+]
+Rows = Annotated[int, typer.Option(help="Draws decoded at once.", min=1)]
+
+
+def make_engine(
+    checkpoint: Path,
+    rows: int,
+    *,
+    name: Literal["torch", "vllm"] = "torch",
+    device: Literal["cpu", "cuda"] = "cpu",
+    vllm_arguments: str = "{}",
+) -> Engine:
+    """An engine over a checkpoint, not started yet.
+
+    Raises:
+        CheckpointError: the folder is no usable checkpoint.
+        ValueError: ``vllm_arguments`` are no JSON object.
+    """
+    if name == "vllm":
+        from model.engines.vllm.engine import VllmEngine, VllmSettings
+
+        try:
+            arguments: Any = json.loads(vllm_arguments)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"--vllm-arguments are no JSON: {error}") from error
+        if not isinstance(arguments, dict):
+            raise ValueError("--vllm-arguments must be a JSON object")
+        return VllmEngine(checkpoint, VllmSettings(rows=rows, arguments=arguments))
+    from model.engines.torch.engine import TorchEngine, TorchSettings
+
+    return TorchEngine(checkpoint, TorchSettings.on(device, rows))

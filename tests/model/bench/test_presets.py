@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from model.bench.presets import PRESETS, Preset, write_random
+from model.bench.roofline import work_of_plan
+from model.engines.engine import Controls, DrawFinished, PlanRequest
+from model.engines.torch.engine import TorchEngine, TorchSettings
+from model.network.checkpoint import read_config
+from tests.checkpoints import noisy_scene
+
+
+def small(preset: Preset) -> Preset:
+    """The same layout, windowed vision blocks included, in a size for tests."""
+    return Preset(
+        text=preset.text
+        | {"vocab_size": 1, "hidden_size": 256, "intermediate_size": 128, "num_hidden_layers": 2},
+        vision=preset.vision
+        | {"depth": 2, "hidden_size": 128, "intermediate_size": 64, "num_heads": 4, "out_hidden_size": 256}
+        | {"fullatt_block_indexes": [1]},
+        image_width=112,
+        image_height=56,
+    )
+
+
+def test_a_preset_plans_with_random_weights(untrained_checkpoint: Path, tmp_path: Path) -> None:
+    preset = small(PRESETS["cf-vla-3b"])
+    preset = replace(preset, text=preset.text | {"num_attention_heads": 2, "num_key_value_heads": 1})
+    write_random(preset, untrained_checkpoint, tmp_path / "small")
+
+    async def plan() -> int:
+        engine = TorchEngine(tmp_path / "small", TorchSettings(rows=4))
+        await engine.start()
+        try:
+            request = PlanRequest("a", noisy_scene(), controls=Controls(n=2, thinking="never"))
+            return sum([isinstance(event, DrawFinished) async for event in engine.submit(request)])
+        finally:
+            await engine.stop()
+
+    assert asyncio.run(plan()) == 2
+
+
+def test_work_grows_with_what_is_done(untrained_checkpoint: Path) -> None:
+    config = read_config(untrained_checkpoint)
+    few = work_of_plan(config, 100, 200, 50, 10, torch.float32)
+    assert work_of_plan(config, 100, 200, 100, 10, torch.float32).flops > few.flops
+    assert work_of_plan(config, 100, 200, 50, 20, torch.float32).bytes > few.bytes
+    assert work_of_plan(config, 100, 200, 50, 10, torch.bfloat16).bytes == few.bytes / 2

@@ -1,0 +1,89 @@
+"""Real engines in real processes, on a small untrained checkpoint."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from model.bench.memory import peak_bytes
+from model.bench.report import BenchReport, Roofline
+from model.bench.roofline import Machine, Work
+from model.bench.run import Job, Row, can_do, run
+from model.bench.workload import Workload
+from model.bundled import SCENES
+
+
+def job(checkpoint: Path, *contenders: str, loads: tuple[Workload, ...]) -> Job:
+    return Job(contenders, loads, checkpoint, SCENES, repeats=1)
+
+
+def test_engines_run_side_by_side(untrained_checkpoint: Path) -> None:
+    loads = (Workload(2, 2, "adaptive"), Workload(1, 1, "never"))
+    told: list[str] = []
+    rows = run(job(untrained_checkpoint, "torch", "transformers", loads=loads), told.append)
+    assert [(row.engine, row.scenes, row.n, row.thinking) for row in rows] == [
+        ("torch", 2, 2, "adaptive"),
+        ("transformers", 2, 2, "adaptive"),
+        ("torch", 1, 1, "never"),
+    ]
+    ours, theirs, direct = rows
+    assert ours.valid_share == direct.valid_share == 1.0
+    assert theirs.valid_share < 1.0, "an untrained model writes no plans of itself"
+    assert direct.passes_per_response < 0.5 * direct.tokens_per_response
+    assert ours.counts["fan_out_row_passes"] >= ours.counts["row_passes"] > 0
+    assert all(row.peak_bytes > 50 << 20 and row.latency_p95_s >= row.latency_p50_s > 0 for row in rows)
+    assert any("round 1 of 1" in line for line in told)
+
+
+def test_shortcuts_are_switched_by_name(untrained_checkpoint: Path) -> None:
+    names = ("torch+none", "torch+jump")
+    none, jump = run(job(untrained_checkpoint, *names, loads=(Workload(1, 2, "never"),)), lambda _: None)
+    assert none.passes_per_response == none.tokens_per_response
+    assert jump.passes_per_response < jump.tokens_per_response
+
+
+def test_a_contender_that_cannot_start_says_so(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="torch ended early"):
+        run(job(tmp_path, "torch", loads=(Workload(1, 1, "never"),)), lambda _: None)
+
+
+def test_only_engines_that_know_the_format_are_told_what_to_think() -> None:
+    always = Workload(1, 1, "always")
+    assert [can_do(name, always) for name in ("torch", "vllm-grammar", "vllm", "transformers")] == [
+        True,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_memory_of_this_process_is_known() -> None:
+    assert peak_bytes() > 20 << 20
+    assert peak_bytes(os.getpid()) > 20 << 20
+
+
+def row(engine: str, latency_s: float, plans_per_s: float) -> Row:
+    return Row(
+        engine, 1, 6, "adaptive", 1.0, latency_s, latency_s, plans_per_s, (1, 2), 9, 20, 100, 1.0, 1 << 20
+    )
+
+
+def test_reports_say_how_much_slower_the_others_are() -> None:
+    machine = Machine(1e10, 1e12, "bfloat16", "cpu")
+    work = Work(2e9, 1e8)
+    roofline = Roofline(machine, 1, 6, work, work.seconds(machine), 0.1)
+    report = BenchReport((row("torch", 0.1, 10.0), row("vllm", 0.4, 5.0)), (), (roofline,))
+    [ratio] = report.ratios()
+    assert ratio["latency_p50"] == pytest.approx(4.0)
+    assert ratio["plans_per_s"] == pytest.approx(2.0)
+    assert roofline.least_s == pytest.approx(0.01)
+    made = json.loads(json.dumps(report.to_json()))
+    assert made["roofline"]["plans"][0]["share"] == pytest.approx(0.1)
+    assert {"engine", "scenes", "n", "thinking", "latency_p50_s", "latency_p95_s", "plans_per_s"} <= set(
+        made["rows"][0]
+    )
+    assert "vllm" in str(report)
+    assert "10%" in str(report)
