@@ -36,15 +36,23 @@ class Response:
         Raises:
             FormatError: the format does not allow it here.
         """
-        after, section = self.cursor.advance(token), self.cursor.section
-        self.tokens.append(Token(token, section))
-        self.cursor = after
-        if after.section == section:
-            return []
-        text = vocabulary.decode([token.id for token in self.tokens if token.section == section])
-        return [FinishedSection(section, text)]
+        before, self.cursor = self.cursor.section, self.cursor.advance(token)
+        self.tokens.append(Token(token, before))
+        return self._finished(before, self.cursor.section, vocabulary)
 
     def append_forced(self, vocabulary: Vocabulary) -> list[FinishedSection]:
         """Write the run that is forced from here; returns the sections that it finishes."""
-        run, _ = self.cursor.forced()
-        return [finished for token, _ in run for finished in self.append(token, vocabulary)]
+        run, self.cursor = self.cursor.forced()
+        finished: list[FinishedSection] = []
+        sections = [*(token.section for token in run[1:]), self.cursor.section]
+        for token, then in zip(run, sections[: len(run)], strict=True):
+            self.tokens.append(token)
+            finished += self._finished(token.section, then, vocabulary)
+        return finished
+
+    def _finished(self, section: str, then: str, vocabulary: Vocabulary) -> list[FinishedSection]:
+        """``section``, when the next token belongs to another."""
+        if section == then:
+            return []
+        text = vocabulary.decode([token.id for token in self.tokens if token.section == section])
+        return [FinishedSection(section, text)]

@@ -285,11 +285,16 @@ class Cursor:
         run: list[Token] = []
         cursor = self
         while not cursor.done:
-            ids = cursor.allowed().ids
-            if len(ids) != 1:
+            if isinstance(cursor.active, Run):
+                ids, position = cursor.active
+                run += [Token(token, cursor.section) for token in ids[position:]]
+                cursor = cursor.compiled._enter(cursor.rest)
+                continue
+            allowed = cursor.allowed().ids
+            if len(allowed) != 1:
                 break
-            run.append(Token(int(ids[0]), cursor.section))
-            cursor = cursor.advance(int(ids[0]))
+            run.append(Token(int(allowed[0]), cursor.section))
+            cursor = cursor.advance(int(allowed[0]))
         return run, cursor
 
     def advance(self, token: int) -> Cursor:

@@ -31,7 +31,7 @@ class PromptPart(NamedTuple):
 
 
 class PromptPass:
-    """The next tokens of some prompts, packed one after the other."""
+    """The next tokens of some prompts, packed one after the other, padding behind them."""
 
     def __init__(self, prompts: KvRows, parts: Sequence[PromptPart]) -> None:
         self._prompts, self._parts = prompts, parts
@@ -43,9 +43,10 @@ class PromptPass:
     def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
         """Store ``key`` and ``value`` [t, g, d]; what ``query`` [t, h, d], scaled, sees: [t, h x d]."""
         counts = [part.fed for part in self._parts]
-        fed = (torch.split(each, counts) for each in (query, key, value))
+        fed = (torch.split(each[: sum(counts)], counts) for each in (query, key, value))
         every = zip(self._parts, self._masks, *fed, strict=True)
-        return torch.cat([self._attend(layer, *each) for each in every])
+        attended = torch.cat([self._attend(layer, *each) for each in every])
+        return functional.pad(attended, (0, 0, 0, len(query) - sum(counts)))
 
     def _attend(
         self, layer: int, part: PromptPart, mask: Tensor | None, query: Tensor, key: Tensor, value: Tensor

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 
@@ -32,6 +32,10 @@ def fast_products() -> torch.dtype | None:
     # Known from torch 2.12 on; before, nothing is known.
     capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     return torch.bfloat16 if capabilities.get("amx_bf16") or capabilities.get("avx512_bf16") else None
+
+
+_WARM_TOKENS: Final = 1024
+"""Passes with more tokens are rare, and large enough not to notice how their kernels are made."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +155,7 @@ class TorchEngine:
         reason: Exception = EngineError("the engine was stopped")
         try:
             with torch.inference_mode():
+                runner.warm_up(_WARM_TOKENS)
                 while self._obey(decoder):
                     for request_id, event in decoder.step():
                         self._tell(request_id, event)

@@ -6,6 +6,7 @@ arithmetic when a step feeds a handful of tokens, and more in padding when it fe
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -67,6 +68,14 @@ class PackedDecoder:
         self._final_norm = text_model.norm.weight
         self._products = products or self._final_norm.dtype
         self._layers = [_joined(layer, self._head_dim**-0.5, self._products) for layer in text_model.layers]
+
+    def warm_up(self, sizes: Iterable[int]) -> None:
+        """Multiply matrices of passes of so many tokens once: libraries keep the kernels that they make."""
+        layer = self._layers[0]
+        for size in sizes:
+            projections = ((layer.qkv, layer.qkv_bias), (layer.out, None))
+            for weight, bias in (*projections, (layer.gate_up, None), (layer.down, None)):
+                functional.linear(weight.new_zeros(size, weight.shape[1]), weight, bias)
 
     def rotation(self, position_ids: Tensor) -> Rotation:
         """The rotary embedding of positions int64 [3, t]."""

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from model.driving.scene import Scene
 from model.engines.torch.attention import DrawPass, Fed, PromptPart, PromptPass
@@ -144,6 +145,10 @@ class Runner:
         self._rotation = self._decoder.rotation(every_place.expand(3, -1))
         self._heads: dict[str, tuple[Tensor, Tensor]] = {}
 
+    def warm_up(self, tokens: int) -> None:
+        """Make the kernels of passes with up to so many tokens."""
+        self._decoder.warm_up(sorted({pass_size(count) for count in range(1, tokens + 1)}))
+
     def begin_prompts(self, scenes: Sequence[tuple[Scene, str]], first_row: int) -> list[Prompt | Exception]:
         """Prompts of scenes in formats, from ``first_row`` on, their pictures encoded all at once.
 
@@ -182,7 +187,11 @@ class Runner:
         )
         embeddings = torch.cat([prompt.embeddings[span] for prompt, span in spans])
         rotations = zip(*([part[span] for part in prompt.rotation] for prompt, span in spans), strict=True)
-        self._decoder(embeddings, Rotation(*(torch.cat(part) for part in rotations)), attention, None)
+        cosines, sines = (torch.cat(part) for part in rotations)
+        padding = pass_size(len(embeddings)) - len(embeddings)
+        embeddings = functional.pad(embeddings, (0, 0, 0, padding))
+        rotation = Rotation(*(functional.pad(part, (0, 0, 0, 0, 0, padding)) for part in (cosines, sines)))
+        self._decoder(embeddings, rotation, attention, None)
         for prompt, span in spans:
             prompt.held = span.stop
 
