@@ -149,14 +149,26 @@ class Deadlines:
     latency_p99_s: float
 
 
-def run_deadlines(job: Job, n: int, per_s: float, deadline_ms: int, requests: int = 500) -> Deadlines:
-    """Ask the torch engine at a steady load, by a Poisson process."""
+def run_deadlines(job: Job, n: int, deadline_ms: int, requests: int = 500) -> Deadlines:
+    """Ask the torch engine at the knee of its load curve, by a Poisson process.
+
+    The knee is the largest load at which the median latency is at most twice that of a scene alone, found by
+    a hundred requests at each of a few loads.
+    """
     load = Workload(requests, n, "adaptive", deadline_ms=deadline_ms)
-    arrivals_s = np.random.default_rng(0).exponential(1 / per_s, requests).cumsum().tolist()
     with _process(job, ["torch"]) as process:
         for number in range(3):
             process.ask("torch", Workload(16, n, "adaptive"), number)
-        answers = process.ask("torch", load, 3, arrivals_s=arrivals_s)["answers"]
+        alone_s = _median([process.ask("torch", Workload(1, n, "adaptive"), 3 + k) for k in range(20)])
+        per_s = 1 / alone_s
+        for number, share in enumerate((0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0), start=23):
+            reply = process.ask(
+                "torch", Workload(100, n, "adaptive"), number, arrivals_s=_arrivals(share / alone_s, 100)
+            )
+            if _median([reply]) > 2 * alone_s:
+                break
+            per_s = share / alone_s
+        answers = process.ask("torch", load, 30, arrivals_s=_arrivals(per_s, requests))["answers"]
     latencies = [answer["latency_s"] for answer in answers]
     in_time = [
         answer["latency_s"] * 1000 <= deadline_ms
@@ -166,6 +178,16 @@ def run_deadlines(job: Job, n: int, per_s: float, deadline_ms: int, requests: in
     ]
     p50, p99 = (float(np.percentile(latencies, share)) for share in (50, 99))
     return Deadlines(requests, n, per_s, deadline_ms, statistics.mean(in_time), p50, p99)
+
+
+def _arrivals(per_s: float, count: int) -> list[float]:
+    arrivals_s: list[float] = np.random.default_rng(0).exponential(1 / per_s, count).cumsum().tolist()
+    return arrivals_s
+
+
+def _median(replies: Sequence[Mapping[str, Any]]) -> float:
+    latencies: list[float] = [answer["latency_s"] for reply in replies for answer in reply["answers"]]
+    return statistics.median(latencies)
 
 
 def _together(names: Sequence[str]) -> list[list[str]]:

@@ -38,7 +38,7 @@ def engine(
     repeats: Annotated[int, typer.Option(help="Measured rounds.", min=1)] = 5,
     shortcuts: Annotated[bool, typer.Option(help="Also our shortcuts, one after the other.")] = True,
     deadline_ms: Annotated[
-        int, typer.Option(help="Of 500 requests at 70 % of what our engine can do; 0 leaves them out.", min=0)
+        int, typer.Option(help="Of 500 requests at the knee of our load curve; 0 leaves them out.", min=0)
     ] = 1000,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     vllm_python: Annotated[
@@ -86,7 +86,9 @@ def engine(
                 steps += run(Job((chosen,), ladder, checkpoint, scenes, repeats, device), tell)
         planners = [run_planner(job, _whole(n)) for n in draws.split(",") if "torch" in names]
         rooflines = _rooflines(rows, checkpoint, device)
-        deadlines = [run_deadlines(job, *_knee(rows, deadline_ms))] if deadline_ms else []
+        deadlines = []
+        if deadline_ms and "torch" in names:
+            deadlines.append(run_deadlines(job, max(map(_whole, draws.split(","))), deadline_ms))
         report = BenchReport(tuple(rows), tuple(steps), tuple(rooflines), tuple(planners), tuple(deadlines))
         typer.echo(json.dumps(report.to_json()) if as_json else str(report))
 
@@ -95,15 +97,6 @@ def _whole(text: str) -> int:
     if not text.isdecimal() or not int(text):
         raise ValueError(f"{text!r} is no positive number")
     return int(text)
-
-
-def _knee(rows: list[Row], deadline_ms: int) -> tuple[int, float, int]:
-    """Draws, requests per second and deadline: beyond this load queues begin to grow."""
-    ours = [row for row in rows if row.engine == "torch" and row.thinking == "adaptive"]
-    if not ours:
-        raise ValueError("deadlines need adaptive rows of the torch engine; --deadline-ms 0 leaves them out")
-    busiest = max(ours, key=lambda row: (row.n, row.scenes))
-    return busiest.n, 0.7 * busiest.plans_per_s, deadline_ms
 
 
 def _ladder() -> list[str]:

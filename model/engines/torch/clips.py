@@ -1,4 +1,4 @@
-"""Vision tokens of pictures that were seen lately: a planner's next request shows most of them again."""
+"""What was worked out for pictures that were seen lately: a planner's next request shows most again."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Pictures = tuple[bytes, ...]
 
 
 class ClipCache:
-    """Vision tokens by the pictures they were made of, the least recently used forgotten first.
+    """Tensors by the pictures they were made of, the least recently used forgotten first.
 
     Args:
         max_bytes: of tensors kept; 0 keeps nothing.

@@ -34,6 +34,8 @@ Ids = npt.NDArray[np.int64]
 _GUESS_ROWS: Final = 12
 """Tokens fed ahead cost next to nothing while so few rows run, and as much as others when many do."""
 _GUESS_TOKENS: Final = 32
+_REPEAT_TOKENS: Final = 64
+"""Fed ahead at most, as others usually went on and as the last answer to the same pictures did."""
 _ALONE: Final = 4
 """So many times as many tokens of prompts go through in a step while no draw waits for it."""
 _HABITUAL: Final = 64
@@ -301,7 +303,10 @@ class Decoder:
             if len(ids) > 1:
                 wanted.append((len(tokens) - 1, ids))
             token, before = next(copied, None), next(last, None)
-            if token is None and may_guess and len(tokens) < len(row.pending) + _GUESS_TOKENS:
+            if token is None and may_guess:
+                limit = _GUESS_TOKENS if before is None else _REPEAT_TOKENS
+                if len(tokens) >= len(row.pending) + limit:
+                    break
                 if len(ids) == 1:
                     token = int(ids[0])
                 else:

@@ -34,6 +34,7 @@ def fast_products() -> torch.dtype | None:
     return torch.bfloat16 if capabilities.get("amx_bf16") or capabilities.get("avx512_bf16") else None
 
 
+_THREAD: Final = "looktwice-engine"
 _WARM_TOKENS: Final = 1024
 """Passes with more tokens are rare, and large enough not to notice how their kernels are made."""
 
@@ -44,7 +45,7 @@ class TorchSettings:
 
     Attributes:
         rows: draws decoded at once; more wait.
-        clip_bytes: of vision tokens kept for pictures that come again.
+        clip_bytes: of vision tokens kept for pictures that come again, and as many of keys and values.
         dtype: of weights, keys and values.
         products: what matrix products are worked out in; by default bfloat16 on CPUs that have units for
             it (AMX, AVX-512 BF16) and the weights' own type elsewhere.
@@ -72,7 +73,7 @@ class TorchEngine:
 
     def __init__(self, checkpoint: Path, settings: TorchSettings = TorchSettings()) -> None:
         self._settings = settings
-        self._worker = Worker("looktwice-engine")
+        self._worker: Worker | None = Worker(_THREAD)
         loading = self._worker.submit(lambda: load(checkpoint, settings.dtype, settings.device))
         self._loaded = loading.result()
         self._decoding: Future[None] | None = None
@@ -94,16 +95,18 @@ class TorchEngine:
         """Start the decoding thread and plan once for a grey scene in every format."""
         if self._decoding is not None:
             raise EngineError("the engine runs already")
+        self._worker = self._worker or Worker(_THREAD)
         self._decoding = self._worker.submit(self._run)
         await warm_up(self)
 
     async def stop(self) -> None:
         """Cancel everything and end the thread; running requests get an `EngineError`."""
-        if self._decoding is None:
-            return
-        self._commands.put(None)
-        await asyncio.wrap_future(self._decoding)
-        self._decoding = None
+        if self._decoding is not None:
+            self._commands.put(None)
+            await asyncio.wrap_future(self._decoding)
+        worker, self._worker, self._decoding = self._worker, None, None
+        if worker is not None:
+            await asyncio.to_thread(worker.close)
 
     async def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
         """Queue a request and iterate over its events; see `Engine.submit`."""

@@ -6,7 +6,7 @@ import torch
 
 
 class KvRows:
-    """Preallocated keys and values, [layers, rows, heads, length, head_dim].
+    """Preallocated keys and values, [layers, rows, heads, length, head_dim] each.
 
     Live rows come first, so that a pass over all of them reads views instead of gathering copies.
     """
@@ -22,13 +22,11 @@ class KvRows:
         dtype: torch.dtype,
         device: torch.device,
     ) -> None:
-        shape = (layers, rows, heads, length, head_dim)
         # Zeros, not garbage: masked positions are multiplied by zero weights, and 0 x NaN would be NaN.
-        self.keys = torch.zeros(shape, dtype=dtype, device=device)
-        self.values = torch.zeros(shape, dtype=dtype, device=device)
+        self.both = torch.zeros((2, layers, rows, heads, length, head_dim), dtype=dtype, device=device)
+        self.keys, self.values = self.both.unbind()
         self.rows, self.heads, self.length, self.head_dim = rows, heads, length, head_dim
 
     def copy(self, source: int, target: int, length: int) -> None:
         """Make row ``target`` hold what row ``source`` holds in its first ``length`` places."""
-        for memory in (self.keys, self.values):
-            memory[:, target, :, :length] = memory[:, source, :, :length]
+        self.both[:, :, target, :, :length] = self.both[:, :, source, :, :length]

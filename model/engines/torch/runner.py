@@ -36,6 +36,7 @@ class Prompt:
         last_token: still to be fed.
         position_offset: see `model.network.inputs.Prompt`.
         shown: tells its format and pictures from others.
+        pictured: tokens up to the end of the pictures.
     """
 
     row: int
@@ -45,6 +46,7 @@ class Prompt:
     last_token: int
     position_offset: int
     shown: bytes
+    pictured: int
 
     @property
     def ready(self) -> bool:
@@ -96,7 +98,7 @@ class Runner:
     Args:
         loaded: its weights must not change while the runner is used.
         rows: draws that can run at once, each with a prompt of its own if need be.
-        clip_bytes: of vision tokens kept for pictures that come again.
+        clip_bytes: of vision tokens kept for pictures that come again, and as many of keys and values.
         products: what matrix products are worked out in; None for the weights' own type.
 
     Attributes:
@@ -123,7 +125,7 @@ class Runner:
         self._products = products
         self._decoder = PackedDecoder(model.model.language_model, products)
         self._head = AllowedHead(model.lm_head.weight)
-        self._clips = ClipCache(clip_bytes)
+        self._clips, self._pictures = ClipCache(clip_bytes), ClipCache(clip_bytes)
         tower = model.model.visual
         self._tower = tower if products is None else copy.deepcopy(tower).to(products)
         kept = [
@@ -143,7 +145,7 @@ class Runner:
         self._draws = KvRows(rows=rows, length=length, **sizes)
         every_place = torch.arange(max(kept) + 1 + length, device=loaded.model.device)
         self._rotation = self._decoder.rotation(every_place.expand(3, -1))
-        self._heads: dict[str, tuple[Tensor, Tensor]] = {}
+        self._heads: dict[str, Tensor] = {}
 
     def warm_up(self, tokens: int) -> None:
         """Make the kernels of passes with up to so many tokens."""
@@ -194,6 +196,8 @@ class Runner:
         self._decoder(embeddings, rotation, attention, None)
         for prompt, span in spans:
             prompt.held = span.stop
+            if span.start < prompt.pictured <= span.stop:
+                self._pictures.keep(prompt.shown, self._held(prompt, prompt.pictured).clone())
 
     def copy_row(self, source: int, target: int, length: int) -> None:
         """Make a draw's row hold what another holds in its first ``length`` places."""
@@ -273,6 +277,7 @@ class Runner:
         embedded = loaded.model.embed_prompt(prompt, vision_tokens, scene.history, route)
         rotation = self._decoder.rotation(embedded.position_ids)
         kept = len(prompt.ids) - 1
+        clips = np.flatnonzero(prompt.ids == loaded.model.config.video_token_id)
         begun = Prompt(
             row,
             embedded.embeddings[:kept],
@@ -281,18 +286,27 @@ class Runner:
             int(prompt.ids[-1]),
             prompt.position_offset,
             shown,
+            int(clips[-1]) + 1,
         )
-        is_video = prompt.ids == loaded.model.config.video_token_id
-        self._begin_with_head(begun, format, int(is_video.argmax()))
+        self._begin_with_shared(begun, format, int(clips[0]))
         return begun
 
-    def _begin_with_head(self, prompt: Prompt, format: str, count: int) -> None:
-        memory = (self._prompts.keys, self._prompts.values)
-        if format not in self._heads:
+    def _begin_with_shared(self, prompt: Prompt, format: str, count: int) -> None:
+        """Fill a prompt's row with what is known already.
+
+        That is all up to the end of its pictures where these were seen lately, or else the ``count`` tokens
+        that all prompts of a format begin with.
+        """
+        kept = self._pictures.find(prompt.shown)
+        if kept is None:
+            kept = self._heads.get(format)
+        if kept is None:
             self.feed_prompts([(prompt, count)])
-            keys, values = (part[:, prompt.row, :, :count].clone() for part in memory)
-            self._heads[format] = (keys, values)
+            self._heads[format] = self._held(prompt, count).clone()
             return
-        for part, kept in zip(memory, self._heads[format], strict=True):
-            part[:, prompt.row, :, :count] = kept
-        prompt.held = count
+        prompt.held = kept.shape[-2]
+        self._held(prompt, prompt.held).copy_(kept)
+
+    def _held(self, prompt: Prompt, count: int) -> Tensor:
+        """A prompt's first keys and values, [2, layers, heads, count, head_dim]."""
+        return self._prompts.both[:, :, prompt.row, :, :count]

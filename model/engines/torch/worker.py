@@ -12,15 +12,16 @@ T = TypeVar("T")
 
 
 class Worker:
-    """Carries out one job after the other on one thread, which ends with the process.
+    """Carries out one job after the other on one thread.
 
     All of an engine's torch is done there: where two threads each bring a team of OpenMP threads, there are
     more of these than cores, none of them waits actively any more, and every operation takes twice as long.
     """
 
     def __init__(self, name: str) -> None:
-        self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        threading.Thread(target=self._run, name=name, daemon=True).start()
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
 
     def submit(self, job: Callable[[], T]) -> Future[T]:
         """Queue ``job``; the future holds its result or its exception."""
@@ -35,6 +36,11 @@ class Worker:
         self._jobs.put(carry_out)
         return future
 
+    def close(self) -> None:
+        """End the thread, once its jobs are done. An interpreter that ends before it may crash in torch."""
+        self._jobs.put(None)
+        self._thread.join()
+
     def _run(self) -> None:
-        while True:
-            self._jobs.get()()
+        while (job := self._jobs.get()) is not None:
+            job()

@@ -41,8 +41,8 @@ def test_engines_run_side_by_side(untrained_checkpoint: Path) -> None:
 def test_shortcuts_are_switched_by_name(untrained_checkpoint: Path) -> None:
     names = ("torch+none", "torch+jump")
     none, jump = run(job(untrained_checkpoint, *names, loads=(Workload(1, 2, "never"),)), lambda _: None)
-    assert none.passes_per_response == none.tokens_per_response
-    assert jump.passes_per_response < jump.tokens_per_response
+    assert none.passes_per_response > 0.95 * none.tokens_per_response
+    assert jump.passes_per_response < 0.5 * jump.tokens_per_response
 
 
 def test_a_contender_that_cannot_start_says_so(tmp_path: Path) -> None:
