@@ -21,11 +21,6 @@ bench = typer.Typer(help="Measure speed, as ratios within one run.", no_args_is_
 _ENGINES = "torch,transformers,vllm,vllm-grammar"
 
 
-@bench.callback()
-def _group() -> None:
-    """Keep `engine` a command of its own."""
-
-
 @bench.command()
 def engine(
     scenes: ScenePath = DEFAULT_SCENES,
@@ -91,6 +86,27 @@ def engine(
             deadlines.append(run_deadlines(job, max(map(_whole, draws.split(","))), deadline_ms))
         report = BenchReport(tuple(rows), tuple(steps), tuple(rooflines), tuple(planners), tuple(deadlines))
         typer.echo(json.dumps(report.to_json()) if as_json else str(report))
+
+
+@bench.command()
+def precision(
+    scenes: ScenePath = DEFAULT_SCENES,
+    checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
+    n: Annotated[int, typer.Option(help="Draws a scene.", min=1, max=64)] = 6,
+    as_json: Json = False,
+) -> None:
+    """How often rounding in float32 and bfloat16 changes a response, and how close the decision was."""
+    with told():
+        from model.bench.precision import measure
+        from model.driving.scene_store import read_scenes
+
+        found = measure(checkpoint, [each.scene for each in read_scenes(scenes, dense=False)], n)
+        if as_json:
+            typer.echo(json.dumps([vars(each) for each in found]))
+            return
+        for each in found:
+            largest = f", largest margin {max(each.margins):.1e}" if each.margins else ""
+            typer.echo(f"{each.name}: {each.different} of {each.responses} responses differ{largest}")
 
 
 def _whole(text: str) -> int:

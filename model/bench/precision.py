@@ -1,0 +1,103 @@
+"""How often rounding changes a response, and how close the decisions were where it did."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from model.driving.scene import Scene
+from model.engines.engine import Controls, DrawFinished, PlanRequest
+from model.engines.torch.decoder import Decoder
+from model.engines.torch.runner import Feed, Prompt, Runner
+from model.engines.torch.sampler import probabilities, uniform
+from model.formats.text import parse
+from model.network.checkpoint import load
+
+_AT_ONCE = 8
+"""Scenes that are decoded together, as in service."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Responses in one type against those in float64.
+
+    Attributes:
+        name: ``float32``, or ``bfloat16`` products.
+        responses: how many.
+        different: how many of them are not the same, token by token.
+        margins: for each of these, how far the random number of the decision where they part lay from
+            the next border between two tokens, in probability.
+    """
+
+    name: str
+    responses: int
+    different: int
+    margins: tuple[float, ...]
+
+
+Responses = dict[tuple[str, int], tuple[int, ...]]
+
+
+def measure(checkpoint: Path, scenes: Sequence[Scene], n: int) -> list[Precision]:
+    """Decode ``scenes`` with ``n`` draws each in float64, in float32, and with products in bfloat16.
+
+    Without thinking: a response's tokens are then told by its text.
+    """
+    requests = [
+        PlanRequest(scene.scene_id, scene, controls=Controls(thinking="never", n=n, seed=seed))
+        for seed, scene in enumerate(scenes)
+    ]
+    with torch.inference_mode():
+        exact = Runner(load(checkpoint, torch.float64), _AT_ONCE * n)
+        expected = _decode(exact, requests)
+        found = []
+        for name, products in (("float32", None), ("bfloat16", torch.bfloat16)):
+            runner = Runner(load(checkpoint), _AT_ONCE * n, products=products)
+            responses = _decode(runner, requests)
+            margins = tuple(_margins(exact, requests, expected, responses))
+            found.append(Precision(name, len(expected), len(margins), margins))
+    return found
+
+
+def _decode(runner: Runner, requests: Sequence[PlanRequest]) -> Responses:
+    decoder = Decoder(runner)
+    for request in requests:
+        decoder.add(request)
+    formats = {request.request_id: request.format for request in requests}
+    responses: Responses = {}
+    while not decoder.idle:
+        for name, event in decoder.step():
+            if isinstance(event, DrawFinished):
+                format = runner.formats[formats[name]]
+                tokens = format.render(parse(format.format, event.draw.text))
+                responses[name, event.draw.index] = tuple(token.id for token in tokens)
+    return responses
+
+
+def _margins(
+    exact: Runner, requests: Sequence[PlanRequest], expected: Responses, found: Responses
+) -> Iterator[float]:
+    for request in requests:
+        for draw in range(request.controls.n):
+            mine, other = expected[request.request_id, draw], found[request.request_id, draw]
+            if mine != other:
+                part = next(k for k, (a, b) in enumerate(zip(mine, other, strict=False)) if a != b)
+                yield _margin(exact, request, draw, mine[:part])
+
+
+def _margin(exact: Runner, request: PlanRequest, draw: int, written: Sequence[int]) -> float:
+    """How far a draw's random number lies from a border, at the decision behind ``written``."""
+    cursor = exact.formats[request.format].start()
+    for token in written:
+        cursor = cursor.advance(token)
+    [prompt] = exact.begin_prompts([(request.scene, request.format)], 0)
+    assert isinstance(prompt, Prompt)
+    exact.feed_prompts([(prompt, exact.prompt_tokens)])
+    feed = Feed(prompt, 0, [prompt.last_token, *written], [(len(written), cursor.allowed().ids)])
+    [[logits]] = exact.feed([feed])
+    borders = np.cumsum(probabilities(logits, request.controls.temperature))[:-1]
+    return float(np.abs(borders - uniform(request.controls.seed, draw, len(written))).min())

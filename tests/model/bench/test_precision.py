@@ -1,0 +1,16 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from model.bench.precision import measure
+from tests.checkpoints import noisy_scene
+
+
+def test_rounding_changes_close_decisions_only(untrained_checkpoint: Path) -> None:
+    single, half = measure(untrained_checkpoint, [noisy_scene(k) for k in range(4)], n=3)
+    assert (single.name, half.name) == ("float32", "bfloat16")
+    assert single.responses == half.responses == 12
+    assert single.different == len(single.margins)
+    assert all(margin < 1e-3 for margin in single.margins)
+    assert half.different >= single.different
+    assert all(margin < 0.1 for margin in half.margins)

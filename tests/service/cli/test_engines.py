@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from model.engines.torch.engine import TorchSettings
+from service.cli.commands import app
+from service.cli.engines import make_engine
+
+RUNNER = CliRunner()
+
+
+def test_the_torch_engine_is_made_unless_said_otherwise(untrained_checkpoint: Path) -> None:
+    assert make_engine(untrained_checkpoint, 4).card.engine == "torch"
+    assert make_engine(untrained_checkpoint, 4, name="vllm").card.engine == "vllm"
+
+
+def test_a_gpu_works_in_bfloat16_throughout() -> None:
+    settings = TorchSettings.on("cuda", 8)
+    assert (settings.rows, settings.dtype, settings.products) == (8, torch.bfloat16, None)
+    assert TorchSettings.on("cpu", 8) == TorchSettings(rows=8)
+
+
+@pytest.mark.parametrize(("arguments", "message"), [("{", "no JSON"), ("[1]", "a JSON object")])
+def test_vllm_arguments_must_be_an_object(untrained_checkpoint: Path, arguments: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_engine(untrained_checkpoint, 4, name="vllm", vllm_arguments=arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--engines", "torch,hf"], "unknown engine hf"),
+        (["--at-once", "1,0"], "'0' is no positive number"),
+        (["--draws", "65"], "n must lie in 1..64"),
+        (["--thinking", "sometimes"], "thinking must be"),
+        (["--preset", "cf-vla-3b"], "say --random-weights"),
+        (["--preset", "gpt"], "unknown preset 'gpt'"),
+    ],
+)
+def test_the_bench_refuses_what_it_cannot_measure(arguments: list[str], message: str) -> None:
+    result = RUNNER.invoke(app, ["bench", "engine", *arguments])
+    assert result.exit_code == 2
+    assert message in result.stderr
