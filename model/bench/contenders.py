@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from model.engines.engine import Draw, DrawFinished, Engine, PlanRequest
 from model.formats.cf_vla import FORMATS
@@ -26,7 +27,6 @@ class Response:
     tokens: int
     passes: int
     valid: bool
-    branch: str | None = None
 
 
 @dataclass(frozen=True)
@@ -37,24 +37,24 @@ class Answer:
     responses: tuple[Response, ...]
 
 
-class Contender(Protocol):
-    """Something that answers requests."""
+class Contender(ABC):
+    """Something that answers requests; by default nothing has to be started, and nothing is known."""
 
     async def start(self) -> None:
         """Load and warm up."""
-        ...
+        return
 
+    @abstractmethod
     async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
         """Answer requests that arrive at once."""
-        ...
 
     def counts(self) -> dict[str, int]:
         """What decoding took so far, where that is known."""
-        ...
+        return {}
 
     async def stop(self) -> None:
         """Free everything."""
-        ...
+        return
 
 
 async def _each(
@@ -68,7 +68,7 @@ async def _each(
     return list(await asyncio.gather(*map(timed, requests)))
 
 
-class EngineContender:
+class EngineContender(Contender):
     """An engine behind our interface."""
 
     def __init__(self, engine: Engine) -> None:
@@ -98,20 +98,20 @@ class EngineContender:
 
 
 def _counted(draw: Draw) -> Response:
-    return Response(sum(draw.tokens.values()), draw.passes, valid=True, branch=draw.branch)
+    return Response(sum(draw.tokens.values()), draw.passes, valid=True)
 
 
-class PlainVllm:
-    """vLLM without a grammar: whatever the model writes, up to its end-of-message token."""
+class PlainVllm(Contender):
+    """vLLM without a grammar: whatever the model writes, up to its end-of-message token.
+
+    The engine is started and stopped by whoever made it.
+    """
 
     def __init__(self, checkpoint: Path, engine: Any, max_tokens: int) -> None:
         from model.network.checkpoint import read_parts
 
         self._engine, self._max_tokens = engine, max_tokens
         self._vocabulary = read_parts(checkpoint).vocabulary
-
-    async def start(self) -> None:
-        """The engine is started by whoever made it."""
 
     async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
         """Answer requests that arrive at once."""
@@ -138,15 +138,8 @@ class PlainVllm:
 
         return await _each(requests, respond)
 
-    def counts(self) -> dict[str, int]:
-        """Not known."""
-        return {}
 
-    async def stop(self) -> None:
-        """The engine is stopped by whoever made it."""
-
-
-class Transformers:
+class Transformers(Contender):
     """`generate` over one batch of all requests' draws; pictures are encoded once a scene."""
 
     def __init__(self, checkpoint: Path, *, dtype: Any, device: str, max_tokens: int) -> None:
@@ -154,9 +147,6 @@ class Transformers:
 
         self._loaded = load(checkpoint, dtype, device)
         self._max_tokens = max_tokens
-
-    async def start(self) -> None:
-        """It is loaded already."""
 
     async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
         """Answer requests as one batch, on this thread: torch gets slower where a second one uses it."""
@@ -196,21 +186,12 @@ class Transformers:
             Answer(latency_s, tuple(responses[first : first + n])) for first in range(0, len(responses), n)
         ]
 
-    def counts(self) -> dict[str, int]:
-        """Not known."""
-        return {}
-
-    async def stop(self) -> None:
-        """Nothing runs."""
-
 
 def _read(ids: list[int], format: str, vocabulary: Vocabulary, steps: int | None = None) -> Response:
     """A response written without a grammar; it took a pass for each token."""
     try:
-        values = parse(FORMATS[format], vocabulary.decode(ids))
+        parse(FORMATS[format], vocabulary.decode(ids))
+        valid = True
     except FormatError:
-        return Response(len(ids), steps or len(ids), valid=False)
-    branch = values.get("branch")
-    return Response(
-        len(ids), steps or len(ids), valid=True, branch=branch if isinstance(branch, str) else None
-    )
+        valid = False
+    return Response(len(ids), steps or len(ids), valid)

@@ -64,9 +64,9 @@ class BenchReport:
     def to_json(self) -> dict[str, Any]:
         """For scripts; ``rows`` and ``roofline`` are a contract."""
         return {
-            "rows": [row.to_json() for row in self.rows],
+            "rows": [asdict(row) for row in self.rows],
             "ratios": self.ratios(),
-            "shortcuts": [row.to_json() for row in self.shortcuts],
+            "shortcuts": [asdict(row) for row in self.shortcuts],
             "planner": [asdict(each) | {"ratio": each.ratio} for each in self.planners],
             "deadlines": [asdict(each) for each in self.deadlines],
             "roofline": {

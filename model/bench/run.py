@@ -64,10 +64,6 @@ class Row:
     peak_bytes: int
     counts: Mapping[str, float] = field(default_factory=dict)
 
-    def to_json(self) -> dict[str, Any]:
-        """For scripts."""
-        return asdict(self)
-
 
 def can_do(contender: str, workload: Workload) -> bool:
     """Without a grammar nothing decides the branch but the model."""

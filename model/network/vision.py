@@ -22,6 +22,12 @@ def attends_to_whole_pictures(vision_config: Any) -> bool:
     return set(range(vision_config.depth)) <= set(vision_config.fullatt_block_indexes)
 
 
+def normalised(patches: Tensor) -> Tensor:
+    """uint8 patches [p, n] as the normalised float32 patches that the tower was made for."""
+    scale, shift = (torch.from_numpy(part).to(patches.device) for part in normalisation(patches.shape[-1]))
+    return patches.float() * scale + shift
+
+
 def encode_pictures(visual: Any, patches: Tensor, rows: int, columns: int) -> Tensor:
     """Vision tokens [k x rows x columns / merge^2, out] of k equal pictures (time slices).
 

@@ -17,9 +17,8 @@ from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 from model.driving.trajectory import FloatArray
 from model.network.encoders import HistoryEncoder, RouteEncoder
 from model.network.inputs import ModelInputs, Prompt, rotary_positions
-from model.network.patches import normalisation
 from model.network.settings import CONFIG_KEY, VlaSettings
-from model.network.vision import attends_to_whole_pictures, encode_pictures
+from model.network.vision import attends_to_whole_pictures, encode_pictures, normalised
 from model.network.vocabulary import (
     END_OF_TEXT,
     HISTORY,
@@ -84,10 +83,7 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
             _, rows, columns = grids.pop()
             return encode_pictures(visual, patches, rows, columns)
         if patches.dtype == torch.uint8:
-            scale, shift = (
-                torch.from_numpy(part).to(patches.device) for part in normalisation(patches.shape[1])
-            )
-            patches = patches.float() * scale + shift
+            patches = normalised(patches)
         features: Tensor = visual(patches.to(visual.dtype), grid_thw, return_dict=True).pooler_output
         return features
 

@@ -60,9 +60,8 @@ def engine(
             for mode in modes
         )
         for load in loads:
-            Controls(
-                thinking=load.thinking, n=load.n, temperature=load.temperature
-            )  # checked before the work
+            # Refused before the work begins.
+            Controls(thinking=load.thinking, n=load.n, temperature=load.temperature)
         names = tuple(engines.split(","))
         if unknown := set(names) - set(_ENGINES.split(",")):
             raise ValueError(f"unknown engine {', '.join(sorted(unknown))}; known are {_ENGINES}")
@@ -142,7 +141,7 @@ def _rooflines(rows: list[Row], checkpoint: Path, device: str) -> list[Roofline]
     from model.network.checkpoint import read_config, read_parts
 
     dtype = torch.bfloat16 if device != "cpu" else fast_products() or torch.float32
-    machine, parts = measure(device, dtype), read_parts(checkpoint)
+    machine, parts, config = measure(device, dtype), read_parts(checkpoint), read_config(checkpoint)
     prompt = len(parts.inputs.prompt("cf_vla", route=parts.settings.with_route).ids)
     slices, grid_rows, columns = parts.settings.grid
     patches = len(parts.settings.cameras) * slices * grid_rows * columns
@@ -150,9 +149,7 @@ def _rooflines(rows: list[Row], checkpoint: Path, device: str) -> list[Roofline]
     for row in rows:
         if row.engine != "torch" or row.thinking != "adaptive":
             continue
-        work = work_of_plan(
-            read_config(checkpoint), prompt, patches, row.counts["tokens"], row.counts["passes"], dtype
-        )
+        work = work_of_plan(config, prompt, patches, row.counts["tokens"], row.counts["passes"], dtype)
         least_s, measured_s = work.seconds(machine), 1 / row.plans_per_s
         found.append(Roofline(machine, row.scenes, row.n, work, least_s, measured_s))
     return found

@@ -22,6 +22,7 @@ from model.engines.engine import (
 from model.engines.requests import begin, branch_of, read
 from model.engines.torch.answers import Answers
 from model.engines.torch.habits import CONTEXT, Habits
+from model.engines.torch.head import Ids
 from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
 from model.engines.torch.runner import Feed, Prompt, Runner
@@ -29,7 +30,6 @@ from model.engines.torch.schedule import Schedule, urgency
 from model.formats.pieces import ACTION, BRANCH, THINKING
 
 Logits = npt.NDArray[np.float64]
-Ids = npt.NDArray[np.int64]
 
 _GUESS_ROWS: Final = 12
 """Tokens fed ahead cost next to nothing while so few rows run, and as much as others when many do."""
@@ -180,7 +180,7 @@ class Decoder:
         self._paused[request.id] = rows
 
     def step(self) -> list[StepEvent]:
-        """Admit what fits, bring a prompt on, feed all rows once, and return what happened."""
+        """Admit what fits, bring prompts on, feed all rows once, and return what happened."""
         began_s = self._clock()
         for request in self._schedule.make_room():
             self._pause(request)

@@ -26,8 +26,8 @@ from vllm.multimodal.processing import (
 
 from model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS
 from model.network.encoders import HistoryEncoder, RouteEncoder
-from model.network.patches import normalisation
 from model.network.settings import VlaSettings
+from model.network.vision import normalised
 from model.network.vocabulary import HISTORY, ROUTE, VIDEO_PAD
 
 CLIPS: Final = "video"
@@ -176,8 +176,6 @@ class LookTwiceForVllm(Qwen2_5_VLForConditionalGeneration):
 
     def _clip_tokens(self, patches: Tensor, grids: Tensor) -> tuple[Tensor, ...]:
         """Vision tokens of clips, from uint8 patches [clips, p, 1176]."""
-        device = self.visual.device
-        scale, shift = (torch.from_numpy(part).to(device) for part in normalisation(patches.shape[-1]))
-        values = patches.to(device).float() * scale + shift
-        tokens = self.visual(values.flatten(0, 1).to(self.visual.dtype), grid_thw=grids.tolist())
+        values = normalised(patches.flatten(0, 1).to(self.visual.device))
+        tokens = self.visual(values.to(self.visual.dtype), grid_thw=grids.tolist())
         return tuple(tokens.view(len(patches), -1, tokens.shape[-1]))
