@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
@@ -74,7 +74,7 @@ class Clip:
     """Four encoded pictures (JPEG, PNG or WebP) of one camera at 2 Hz, oldest first."""
 
     camera: str
-    images: tuple[bytes, ...]
+    images: tuple[bytes, ...] = field(repr=False)
 
     def __post_init__(self) -> None:
         if self.camera not in CAMERAS:

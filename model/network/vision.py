@@ -80,7 +80,8 @@ def _rotation(visual: Any, rows: int, columns: int, x: Tensor) -> tuple[Tensor, 
     config = visual.config
     quarter = config.hidden_size // config.num_heads // 4
     theta = (getattr(config, "rope_parameters", None) or {}).get("rope_theta", 10000.0)
-    frequency = theta ** (-torch.arange(quarter, device=x.device, dtype=torch.float32) / quarter)
+    exact = torch.promote_types(x.dtype, torch.float32)
+    frequency = theta ** (-torch.arange(quarter, device=x.device, dtype=exact) / quarter)
     row, column = torch.meshgrid(
         torch.arange(rows, device=x.device), torch.arange(columns, device=x.device), indexing="ij"
     )

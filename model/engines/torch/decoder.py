@@ -20,26 +20,17 @@ from model.engines.engine import (
     RequestError,
 )
 from model.engines.requests import begin, branch_of, read
-from model.engines.torch.answers import Answers
-from model.engines.torch.habits import CONTEXT, Habits
-from model.engines.torch.head import Ids
+from model.engines.torch.ahead import GUESS_ROWS, Ahead
 from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
-from model.engines.torch.runner import Feed, Prompt, Runner
-from model.engines.torch.schedule import Schedule, urgency
+from model.engines.torch.runner import ROWS_A_PROMPT, Feed, Prompt, Runner
+from model.engines.torch.schedule import Memory, Schedule, urgency
 from model.formats.pieces import ACTION, BRANCH, THINKING
 
 Logits = npt.NDArray[np.float64]
 
-_GUESS_ROWS: Final = 12
-"""Tokens fed ahead cost next to nothing while so few rows run, and as much as others when many do."""
-_GUESS_TOKENS: Final = 32
-_REPEAT_TOKENS: Final = 64
-"""Fed ahead at most, as others usually went on and as the last answer to the same pictures did."""
 _ALONE: Final = 4
 """So many times as many tokens of prompts go through in a step while no draw waits for it."""
-_HABITUAL: Final = 64
-"""Decisions between more tokens than this (codes, free words) are no matter of habit."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +53,8 @@ class Shortcuts:
         shared_rows: draws that have written the same tokens are one row.
         shared_prompts: a scene's prompt is worked out and held once for all its draws.
         speculate: a revised plan is fed as far as it may repeat the first one, and, while few rows run, any
-            response as the last one to the same pictures did, or as others usually went on; what is fed
-            ahead is checked.
+            response as the last one to the same pictures did, or as others went on; what is fed ahead is
+            checked.
     """
 
     jump: bool = True
@@ -127,8 +118,9 @@ class Decoder:
         self._drafts: dict[tuple[str, int], Draw] = {}
         self._paused: dict[str, list[Row]] = {}
         self._runner, self._shortcuts, self._chunk = runner, shortcuts, prompt_chunk
-        self._schedule = Schedule(runner.rows)
-        self._habits, self._answers = Habits(), Answers()
+        rows_a_prompt = ROWS_A_PROMPT if shortcuts.shared_prompts else 1
+        self._schedule = Schedule(runner.rows, runner.prompts, rows_a_prompt)
+        self._ahead = Ahead()
         self._beginnings: list[_Beginning] = []
         self._prompts: list[Prompt] = []
         self._rows: list[Row] = []
@@ -186,8 +178,10 @@ class Decoder:
             self._pause(request)
         for request in self._schedule.admit():
             rows = self._paused.pop(request.id, None) or self._first_rows(request)
-            groups = [rows] if self._shortcuts.shared_prompts else [[row] for row in rows]
-            self._beginnings += [_Beginning(request, group) for group in groups]
+            groups: dict[int, list[Row]] = {}
+            for row in rows:
+                groups.setdefault(row.draws[0] // self._schedule.draws_a_prompt(request), []).append(row)
+            self._beginnings += [_Beginning(request, group) for group in groups.values()]
         events = self._bring_prompts_on()
         if not self._rows:
             return events
@@ -223,8 +217,9 @@ class Decoder:
         ]
         assert len(draws) == len(set(draws)), "a draw runs twice"
         assert len(self._rows) <= self._runner.rows
+        assert len(self._prompts) <= self._runner.prompts
         if not self._rows and not self._beginnings and self.idle:
-            assert self._schedule.free_rows == self._runner.rows
+            assert self._schedule.free == Memory(self._runner.rows, self._runner.prompts)
         for row in self._rows:
             assert row.draws
             assert row.pending or row.cursor.done, "a row has nothing to feed"
@@ -281,41 +276,17 @@ class Decoder:
     def _first_rows(self, request: Request) -> list[Row]:
         """The rows that a request begins with."""
         every = tuple(range(request.controls.n))
-        shared = self._shortcuts.shared_rows and self._shortcuts.shared_prompts
-        return [
-            Row(request.start, request, draws)
-            for draws in ([every] if shared else [(draw,) for draw in every])
-        ]
+        size = self._schedule.draws_a_prompt(request) if self._shortcuts.shared_rows else 1
+        return [Row(request.start, request, every[first : first + size]) for first in every[::size]]
 
     def _feed_of(self, row: Row) -> Feed:
         """A row's pending tokens and what is proposed behind them, with the decisions among both."""
         assert row.prompt is not None
         if not self._shortcuts.jump and len(row.pending) > 1:
             return Feed(row.prompt, row.held, row.pending[:1], ())
-        tokens, wanted, cursor = list(row.pending), list[tuple[int, Ids]](), row.cursor
-        context = [token.id for token in row.tokens[-CONTEXT:]]
-        may_guess = self._shortcuts.speculate and len(self._rows) <= _GUESS_ROWS
-        copied = iter(row.proposal() if self._shortcuts.speculate else [])
-        answer = self._answers.last(row.prompt.shown, row.draws[0]) if may_guess else ()
-        last = iter(answer[len(row.tokens) :])
-        while not cursor.done:
-            ids = cursor.allowed().ids
-            if len(ids) > 1:
-                wanted.append((len(tokens) - 1, ids))
-            token, before = next(copied, None), next(last, None)
-            if token is None and may_guess:
-                limit = _GUESS_TOKENS if before is None else _REPEAT_TOKENS
-                if len(tokens) >= len(row.pending) + limit:
-                    break
-                if len(ids) == 1:
-                    token = int(ids[0])
-                else:
-                    token = before if before in ids else self._habits.usual(context)
-            if token is None or token not in ids:
-                break
-            tokens.append(token)
-            context.append(token)
-            cursor = cursor.advance(token)
+        speculate = self._shortcuts.speculate
+        guess = speculate and len(self._rows) <= GUESS_ROWS
+        tokens, wanted = self._ahead.feed(row, copy=speculate, guess=guess)
         return Feed(row.prompt, row.held, tokens, wanted)
 
     def _apply(self, row: Row, feed: Feed, found: list[Logits]) -> list[StepEvent]:
@@ -342,10 +313,7 @@ class Decoder:
         """
         time_for = self._pace.time_for(row.request.deadline_s, self._clock())
         chosen = sorted(row.choices(logits, time_for), key=lambda choice: choice[0] != proposed)
-        if len(logits) <= _HABITUAL:
-            context = [token.id for token in row.tokens[-CONTEXT:]]
-            for token, draws in chosen:
-                self._habits.saw(context, token, len(draws))
+        self._ahead.saw(row, len(logits), chosen)
         parts = [(row.part(draws), token) for token, draws in chosen[1:]]
         if row.request.drafts and row.cursor.allowed().choice == BRANCH:
             direct = next(
@@ -357,7 +325,7 @@ class Decoder:
         vocabulary = self._runner.loaded.vocabulary
         events = row.write((token,), vocabulary)
         for part, token in parts:
-            self._runner.copy_row(self._rows.index(row), len(self._rows), row.held)
+            self._runner.copy_row(self._rows.index(row), len(self._rows))
             self._rows.append(part)
             events += part.write((token,), vocabulary)
         return [(row.request.id, event) for event in events]
@@ -396,8 +364,7 @@ class Decoder:
                 continue
             if row.passes_before_ending:
                 self._pace.saw_ending(row.passes - row.passes_before_ending)
-            assert row.prompt is not None
-            self._answers.keep(row.prompt.shown, row.draws, [token.id for token in row.tokens])
+            self._ahead.finished(row)
             self._free_row(row)
             events += self._answer(row.request, draws)
         return events
@@ -444,7 +411,7 @@ class Decoder:
         """Give up a row, and its prompt if it was the last to use it; the last row moves into its place."""
         index, last = self._rows.index(row), self._rows.pop()
         if last is not row:
-            self._runner.copy_row(len(self._rows), index, last.held)
+            self._runner.copy_row(len(self._rows), index)
             self._rows[index] = last
         assert row.prompt is not None
         if all(other.prompt is not row.prompt for other in self._rows):

@@ -34,6 +34,8 @@ def fast_products() -> torch.dtype | None:
     return torch.bfloat16 if capabilities.get("amx_bf16") or capabilities.get("avx512_bf16") else None
 
 
+_DRAWS_A_SCENE: Final = 6
+"""That most requests ask for."""
 _THREAD: Final = "looktwice-engine"
 _WARM_TOKENS: Final = 1024
 """Passes with more tokens are rare, and large enough not to notice how their kernels are made."""
@@ -45,6 +47,8 @@ class TorchSettings:
 
     Attributes:
         rows: draws decoded at once; more wait.
+        prompts: scenes decoded at once, each with memory for all its draws; as many as rows by default,
+            which costs nothing on a CPU, where memory is taken as it is used.
         clip_bytes: of vision tokens kept for pictures that come again, and as many of keys and values.
         dtype: of weights, keys and values.
         products: what matrix products are worked out in; by default bfloat16 on CPUs that have units for
@@ -54,6 +58,7 @@ class TorchSettings:
     """
 
     rows: int = 96
+    prompts: int | None = None
     clip_bytes: int = 256 << 20
     dtype: torch.dtype = torch.float32
     products: torch.dtype | None = field(default_factory=fast_products)
@@ -65,7 +70,8 @@ class TorchSettings:
         """What a device does best: on a GPU everything is in bfloat16."""
         if device == "cpu":
             return cls(rows=rows)
-        return cls(rows=rows, dtype=torch.bfloat16, products=None, device=device)
+        prompts = max(1, rows // _DRAWS_A_SCENE)
+        return cls(rows=rows, prompts=prompts, dtype=torch.bfloat16, products=None, device=device)
 
 
 class TorchEngine:
@@ -150,6 +156,7 @@ class TorchEngine:
         runner = Runner(
             self._loaded,
             settings.rows,
+            prompts=settings.prompts,
             clip_bytes=settings.clip_bytes,
             products=settings.products,
         )

@@ -1,4 +1,4 @@
-"""What responses usually go on with, learned while they are decoded. No torch."""
+"""What responses go on with, learned while they are decoded. No torch."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Final
 
-CONTEXT: Final = 12
-"""Tokens before a decision that it is remembered by: a meta-action's times and its track's name."""
-_MOST: Final = 20_000
+CONTEXTS: Final = (16, 12, 8, 4)
+"""Tokens before a decision that it is remembered by, the most telling first: where the same sixteen came
+before, what followed them says most; the last four, which are nearly always known, hold a track's name."""
+_MOST: Final = 50_000
 """Contexts that are remembered; the longest unused ones are forgotten first."""
-_SHARE: Final = 0.5
-_SEEN: Final = 2
 
 
 class Habits:
@@ -26,18 +25,32 @@ class Habits:
 
     def saw(self, context: Sequence[int], token: int, times: int) -> None:
         """``token`` was chosen behind ``context``, so many times."""
-        key = tuple(context[-CONTEXT:])
-        counts = self._followed.setdefault(key, {})
-        counts[token] = counts.get(token, 0) + times
-        self._followed.move_to_end(key)
-        if len(self._followed) > _MOST:
+        for length in CONTEXTS:
+            key = tuple(context[-length:])
+            counts = self._followed.setdefault(key, {})
+            counts[token] = counts.get(token, 0) + times
+            self._followed.move_to_end(key)
+        while len(self._followed) > _MOST:
             self._followed.popitem(last=False)
 
-    def usual(self, context: Sequence[int]) -> int | None:
-        """What usually follows ``context``; None where nothing does more often than not."""
-        counts = self._followed.get(tuple(context[-CONTEXT:]))
-        if not counts:
+    def likely(self, context: Sequence[int], number: float | None) -> int | None:
+        """The token behind ``context`` that a random number in [0, 1) selects; None where nothing is known.
+
+        The sampler selects with the same number in the same order of ids, so as far as habits are like the
+        model's probabilities the two select the same token, however undecided both are. Without a number it
+        is the most frequent token.
+        """
+        for length in CONTEXTS:
+            counts = self._followed.get(tuple(context[-length:]))
+            if counts:
+                break
+        else:
             return None
-        token = max(counts, key=lambda each: counts[each])
-        often, seen = counts[token], sum(counts.values())
-        return token if often >= _SEEN and often > _SHARE * seen else None
+        if number is None:
+            return max(counts, key=lambda token: counts[token])
+        left = number * sum(counts.values())
+        for token in sorted(counts):
+            left -= counts[token]
+            if left < 0:
+                return token
+        return max(counts)

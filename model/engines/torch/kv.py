@@ -1,14 +1,19 @@
-"""Keys and values in rows: one row a prompt or a draw, the live rows always the first ones."""
+"""Keys and values in rows: one row a prompt and what is written behind it, the live rows always the first."""
 
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 
 class KvRows:
     """Preallocated keys and values, [layers, rows, heads, length, head_dim] each.
 
-    Live rows come first, so that a pass over all of them reads views instead of gathering copies.
+    Live rows come first, so that a pass over all of them reads views instead of gathering copies. Memory
+    that no pass has reached yet is not touched, and on a CPU not taken from the system either.
+
+    Attributes:
+        flat: the same memory as [2, layers, rows x heads x length, head_dim].
     """
 
     def __init__(
@@ -22,11 +27,27 @@ class KvRows:
         dtype: torch.dtype,
         device: torch.device,
     ) -> None:
-        # Zeros, not garbage: masked positions are multiplied by zero weights, and 0 x NaN would be NaN.
-        self.both = torch.zeros((2, layers, rows, heads, length, head_dim), dtype=dtype, device=device)
-        self.keys, self.values = self.both.unbind()
+        self._both = torch.empty((2, layers, rows, heads, length, head_dim), dtype=dtype, device=device)
+        self.flat = self._both.view(2, layers, -1, head_dim)
+        self._reached = [0] * rows
         self.rows, self.heads, self.length, self.head_dim = rows, heads, length, head_dim
+
+    def reach(self, rows: int, length: int) -> Tensor:
+        """The first places of the first rows, [2, layers, rows, heads, length, head_dim].
+
+        What was never written is zero and not garbage: masked places are multiplied by weights of zero, and
+        0 x NaN would be NaN.
+        """
+        for row in range(rows):
+            if self._reached[row] < length:
+                self._both[:, :, row, :, self._reached[row] : length] = 0
+                self._reached[row] = length
+        return self._both[:, :, :rows, :, :length]
+
+    def row(self, row: int, length: int) -> Tensor:
+        """The first places of one row, [2, layers, heads, length, head_dim]."""
+        return self.reach(row + 1, length)[:, :, row]
 
     def copy(self, source: int, target: int, length: int) -> None:
         """Make row ``target`` hold what row ``source`` holds in its first ``length`` places."""
-        self.both[:, :, target, :, :length] = self.both[:, :, source, :, :length]
+        self.row(target, length).copy_(self.row(source, length))

@@ -6,12 +6,22 @@ arithmetic when a step feeds a handful of tokens, and more in padding when it fe
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 from torch.nn import functional
+
+
+def pass_size(count: int) -> int:
+    """Tokens that a pass with ``count`` of them is padded to: one of few sizes, at most a quarter too large.
+
+    For every new size of a product in bfloat16 a CPU's library makes a kernel first, which takes as long
+    as using it forty times.
+    """
+    step = 1 << max(0, (count - 1).bit_length() - 3) if count else 1
+    return -(-count // step) * step
 
 
 class Attention(Protocol):
@@ -38,14 +48,34 @@ class Rotation(NamedTuple):
         return turned.addcmul_(x, self.cosines)
 
 
+class _Product:
+    """``x @ weight.T + bias``.
+
+    On a CPU in bfloat16 the weight is laid out once as its matrix units read it (oneDNN's own layout, as
+    `torch.compile` does when it freezes weights), and not in every call.
+    """
+
+    def __init__(self, weight: Tensor, bias: Tensor | None = None) -> None:
+        self.width = weight.shape[1]
+        self._weight, self._bias = weight, bias
+        self._laid_out = weight.device.type == "cpu" and weight.dtype == torch.bfloat16
+        if self._laid_out:
+            self._weight = torch.ops.mkldnn._reorder_linear_weight(weight)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        if self._laid_out:
+            made: Tensor = torch.ops.mkldnn._linear_pointwise.default(
+                x, self._weight, self._bias, "none", [], ""
+            )
+            return made
+        return functional.linear(x, self._weight, self._bias)
+
+
 class _Layer(NamedTuple):
-    norm_in: Tensor
-    qkv: Tensor
-    qkv_bias: Tensor
-    out: Tensor
-    norm_mlp: Tensor
-    gate_up: Tensor
-    down: Tensor
+    qkv: _Product
+    out: _Product
+    gate_up: _Product
+    down: _Product
 
 
 class PackedDecoder:
@@ -62,20 +92,18 @@ class PackedDecoder:
         if set(config.layer_types) != {"full_attention"}:
             raise ValueError("the torch engine runs decoders with full attention in every layer only")
         self._rotary = text_model.rotary_emb
-        self._epsilon = config.rms_norm_eps
         self.heads, self._groups = config.num_attention_heads, config.num_key_value_heads
         self._head_dim = config.hidden_size // config.num_attention_heads
-        self._final_norm = text_model.norm.weight
+        self._final_norm = text_model.norm.weight.detach()
+        self._epsilon = self._final_norm.new_tensor(config.rms_norm_eps)
         self._products = products or self._final_norm.dtype
         self._layers = [_joined(layer, self._head_dim**-0.5, self._products) for layer in text_model.layers]
 
-    def warm_up(self, sizes: Iterable[int]) -> None:
+    def warm_up(self, sizes: Sequence[int]) -> None:
         """Multiply matrices of passes of so many tokens once: libraries keep the kernels that they make."""
-        layer = self._layers[0]
-        for size in sizes:
-            projections = ((layer.qkv, layer.qkv_bias), (layer.out, None))
-            for weight, bias in (*projections, (layer.gate_up, None), (layer.down, None)):
-                functional.linear(weight.new_zeros(size, weight.shape[1]), weight, bias)
+        for product in self._layers[0]:
+            for size in sizes:
+                product(torch.zeros(size, product.width, dtype=self._products))
 
     def rotation(self, position_ids: Tensor) -> Rotation:
         """The rotary embedding of positions int64 [3, t]."""
@@ -96,8 +124,7 @@ class PackedDecoder:
         x = embeddings
         turned, last = self.heads + self._groups, len(self._layers) - 1
         for index, layer in enumerate(self._layers):
-            normed = self._norm(x, layer.norm_in).to(self._products)
-            qkv = functional.linear(normed, layer.qkv, layer.qkv_bias).view(len(x), -1, self._head_dim)
+            qkv = layer.qkv(self._scaled(x).to(self._products)).view(len(x), -1, self._head_dim)
             looking = rotation(qkv[:, :turned])
             query, key, value = looking[:, : self.heads], looking[:, self.heads :], qkv[:, turned:]
             attended = attention.attend(index, query, key, value)
@@ -106,14 +133,15 @@ class PackedDecoder:
                 if wanted is None:
                     return x[:0]
                 x, attended = x.index_select(0, wanted), attended.index_select(0, wanted)
-            x = x + functional.linear(attended, layer.out)
-            normed = self._norm(x, layer.norm_mlp).to(self._products)
-            gate, up = functional.linear(normed, layer.gate_up).chunk(2, dim=-1)
-            x += functional.linear(functional.silu(gate).mul_(up), layer.down)
-        return self._norm(x, self._final_norm)
+            x = x + layer.out(attended)
+            gate, up = layer.gate_up(self._scaled(x).to(self._products)).chunk(2, dim=-1)
+            x += layer.down(functional.silu(gate).mul_(up))
+        return self._scaled(x).mul_(self._final_norm)
 
-    def _norm(self, x: Tensor, weight: Tensor) -> Tensor:
-        return functional.rms_norm(x, (x.shape[-1],), weight, self._epsilon)
+    def _scaled(self, x: Tensor) -> Tensor:
+        """RMS norm without its weights, which are in the products behind it: half as many operations."""
+        length = torch.linalg.vector_norm(x, dim=-1, keepdim=True)
+        return x * torch.addcmul(self._epsilon, length, length, value=1 / x.shape[-1]).rsqrt_()
 
 
 def _joined(layer: Any, query_scale: float, products: torch.dtype) -> _Layer:
@@ -122,12 +150,11 @@ def _joined(layer: Any, query_scale: float, products: torch.dtype) -> _Layer:
     scales = (query_scale, 1.0, 1.0)
     weights = [part.weight.detach() * scale for part, scale in zip(projections, scales, strict=True)]
     biases = [part.bias.detach() * scale for part, scale in zip(projections, scales, strict=True)]
+    norm_in, norm_mlp = layer.input_layernorm.weight.detach(), layer.post_attention_layernorm.weight.detach()
+    gate_up = torch.cat([mlp.gate_proj.weight.detach(), mlp.up_proj.weight.detach()])
     return _Layer(
-        norm_in=layer.input_layernorm.weight.detach(),
-        qkv=torch.cat(weights).to(products),
-        qkv_bias=torch.cat(biases).to(products),
-        out=attention.o_proj.weight.detach().to(products),
-        norm_mlp=layer.post_attention_layernorm.weight.detach(),
-        gate_up=torch.cat([mlp.gate_proj.weight.detach(), mlp.up_proj.weight.detach()]).to(products),
-        down=mlp.down_proj.weight.detach().to(products),
+        qkv=_Product((torch.cat(weights) * norm_in).to(products), torch.cat(biases).to(products)),
+        out=_Product(attention.o_proj.weight.detach().to(products)),
+        gate_up=_Product((gate_up * norm_mlp).to(products)),
+        down=_Product(mlp.down_proj.weight.detach().to(products)),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,14 +14,18 @@ from torch import Tensor
 from torch.nn import functional
 
 from model.driving.scene import Scene
-from model.engines.torch.attention import DrawPass, Fed, PromptPart, PromptPass
+from model.engines.torch.attention import DrawPass, PromptPart, PromptPass
 from model.engines.torch.clips import ClipCache, digest
 from model.engines.torch.head import AllowedHead, Ids
 from model.engines.torch.kv import KvRows
-from model.engines.torch.packed import PackedDecoder, Rotation
+from model.engines.torch.packed import PackedDecoder, Rotation, pass_size
+from model.engines.torch.places import Fed, Places
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat
 from model.network.checkpoint import Loaded
+
+ROWS_A_PROMPT: Final = 12
+"""Rows of draws, drafts among them, that one prompt's memory has room for."""
 
 
 @dataclass(eq=False)
@@ -37,6 +41,7 @@ class Prompt:
         position_offset: see `model.network.inputs.Prompt`.
         shown: tells its format and pictures from others.
         pictured: tokens up to the end of the pictures.
+        end: of the places that draws have written to behind it.
     """
 
     row: int
@@ -47,6 +52,7 @@ class Prompt:
     position_offset: int
     shown: bytes
     pictured: int
+    end: int = 0
 
     @property
     def ready(self) -> bool:
@@ -78,16 +84,6 @@ class _Opened(NamedTuple):
     patches: dict[bytes, npt.NDArray[np.uint8]]
 
 
-def pass_size(count: int) -> int:
-    """Tokens that a pass with ``count`` of them is padded to: one of few sizes, at most a quarter too large.
-
-    For every new size of a product in bfloat16 a CPU's library makes a kernel first, which takes as long
-    as using it forty times.
-    """
-    step = 1 << max(0, (count - 1).bit_length() - 3) if count else 1
-    return -(-count // step) * step
-
-
 def _padded(values: npt.NDArray[np.int64], size: int, device: torch.device) -> Tensor:
     return torch.from_numpy(np.pad(values, (0, size - len(values)))).to(device)
 
@@ -97,7 +93,9 @@ class Runner:
 
     Args:
         loaded: its weights must not change while the runner is used.
-        rows: draws that can run at once, each with a prompt of its own if need be.
+        rows: draws that can run at once.
+        prompts: that can be held at once, each with what up to `ROWS_A_PROMPT` rows write behind it; by
+            default as many as rows.
         clip_bytes: of vision tokens kept for pictures that come again, and as many of keys and values.
         products: what matrix products are worked out in; None for the weights' own type.
 
@@ -110,11 +108,12 @@ class Runner:
         loaded: Loaded,
         rows: int,
         *,
+        prompts: int | None = None,
         clip_bytes: int = 0,
         products: torch.dtype | None = None,
     ) -> None:
         self.loaded = loaded
-        self.rows = rows
+        self.rows, self.prompts = rows, prompts or rows
         self.formats = {
             name: CompiledFormat(FORMATS[name], loaded.vocabulary) for name in loaded.card.formats
         }
@@ -141,8 +140,8 @@ class Runner:
             "device": loaded.model.device,
         }
         self.prompt_tokens = max(kept)
-        self._prompts = KvRows(rows=rows, length=self.prompt_tokens, **sizes)
-        self._draws = KvRows(rows=rows, length=length, **sizes)
+        self._memory = KvRows(rows=self.prompts, length=self.prompt_tokens + ROWS_A_PROMPT * length, **sizes)
+        self._places = Places(rows, length)
         every_place = torch.arange(max(kept) + 1 + length, device=loaded.model.device)
         self._rotation = self._decoder.rotation(every_place.expand(3, -1))
         self._heads: dict[str, Tensor] = {}
@@ -184,7 +183,7 @@ class Runner:
             for prompt, count in parts
         ]
         attention = PromptPass(
-            self._prompts,
+            self._memory,
             [PromptPart(prompt.row, span.start, span.stop - span.start) for prompt, span in spans],
         )
         embeddings = torch.cat([prompt.embeddings[span] for prompt, span in spans])
@@ -199,13 +198,13 @@ class Runner:
             if span.start < prompt.pictured <= span.stop:
                 self._pictures.keep(prompt.shown, self._held(prompt, prompt.pictured).clone())
 
-    def copy_row(self, source: int, target: int, length: int) -> None:
-        """Make a draw's row hold what another holds in its first ``length`` places."""
-        self._draws.copy(source, target, length)
+    def copy_row(self, source: int, target: int) -> None:
+        """Make a draw's row hold what another holds, behind the same prompt."""
+        self._places.copy(source, target)
 
     def move_prompt(self, prompt: Prompt, row: int) -> None:
-        """Put a prompt into another row."""
-        self._prompts.copy(prompt.row, row, prompt.held)
+        """Put a prompt, and all that is written behind it, into another row."""
+        self._memory.copy(prompt.row, row, max(prompt.held, prompt.end))
         prompt.row = row
 
     def feed(self, feeds: Sequence[Feed]) -> list[list[npt.NDArray[np.float64]]]:
@@ -220,10 +219,12 @@ class Runner:
                 for feed, count in zip(feeds, counts, strict=True)
             ]
         )
-        lengths = [0] * self.rows
-        for feed in feeds:
-            lengths[feed.prompt.row] = feed.prompt.held
+        prompts = {feed.prompt.row: feed.prompt for feed in feeds}
+        lengths = [len(prompts[row].embeddings) if row in prompts else 0 for row in range(self.prompts)]
         fed = [Fed(feed.prompt.row, feed.held, count) for feed, count in zip(feeds, counts, strict=True)]
+        written = self._places.write(fed, lengths)
+        for prompt in prompts.values():
+            prompt.end = max(prompt.end, written.seen.shape[1])
         starts = np.cumsum(counts) - counts
         asked = [
             (row, int(starts[row]) + place, ids)
@@ -231,7 +232,7 @@ class Runner:
             for place, ids in feed.wanted
         ]
         size = pass_size(len(ids))
-        attention = DrawPass(self._decoder.heads, self._prompts, self._draws, fed, lengths, size)
+        attention = DrawPass(self._decoder.heads, self._memory, written, size)
         embeddings = self.loaded.model.get_input_embeddings()(_padded(ids, size, device))
         rotation = self._rotation.at(_padded(places, size, device))
         at = _padded(np.array([place for _, place, _ in asked], np.int64), pass_size(len(asked)), device)
@@ -309,4 +310,4 @@ class Runner:
 
     def _held(self, prompt: Prompt, count: int) -> Tensor:
         """A prompt's first keys and values, [2, layers, heads, count, head_dim]."""
-        return self._prompts.both[:, :, prompt.row, :, :count]
+        return self._memory.row(prompt.row, count)

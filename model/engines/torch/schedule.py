@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Iterable
+from typing import Final, NamedTuple
 
 from model.engines.torch.rows import Request
 
@@ -15,18 +16,31 @@ def urgency(request: Request) -> tuple[float, int]:
     return min(request.deadline_s, request.submitted_s + PATIENCE_S), request.arrival
 
 
+class Memory(NamedTuple):
+    """What requests run in: rows of draws, and prompts."""
+
+    rows: int
+    prompts: int
+
+    def within(self, other: Memory) -> bool:
+        """Whether ``other`` is as much in both."""
+        return self.rows <= other.rows and self.prompts <= other.prompts
+
+
 class Schedule:
     """Requests between arrival and their last draw.
 
-    A request is admitted when as many rows are free as it may ever use, so none runs out of memory on its
-    way. It gives way, whole, to one that has a deadline and is more urgent, and comes back in its turn.
+    A request is admitted when as much memory is free as it may ever use, so none runs out of it on its way.
+    It gives way, whole, to one that has a deadline and is more urgent, and comes back in its turn.
 
     Args:
         rows: draws that can run at once.
+        prompts: that can be held at once.
+        rows_a_prompt: that one prompt has room for; 1 to give every draw a prompt of its own.
     """
 
-    def __init__(self, rows: int) -> None:
-        self._rows = rows
+    def __init__(self, rows: int, prompts: int, rows_a_prompt: int) -> None:
+        self._rows, self._prompts, self._rows_a_prompt = rows, prompts, rows_a_prompt
         self._waiting: list[Request] = []
         self._admitted: dict[str, Request] = {}
 
@@ -39,17 +53,29 @@ class Schedule:
         return not self._waiting and not self._admitted
 
     @property
-    def free_rows(self) -> int:
-        """Rows that no admitted request may claim."""
-        return self._rows - sum(map(self.rows_of, self._admitted.values()))
+    def free(self) -> Memory:
+        """What no admitted request may claim."""
+        return self._left(self._admitted.values())
 
-    def rows_of(self, request: Request) -> int:
-        """How many rows a request may come to use: every draw one, and one for its draft."""
-        return request.controls.n * (2 if request.drafts else 1)
+    def memory_of(self, request: Request) -> Memory:
+        """What a request may come to use: a row for every draw, and one for its draft."""
+        rows_a_draw = 2 if request.drafts else 1
+        return Memory(
+            request.controls.n * rows_a_draw, -(-request.controls.n // self.draws_a_prompt(request))
+        )
+
+    def draws_a_prompt(self, request: Request) -> int:
+        """How many draws of a request share a prompt."""
+        return max(1, self._rows_a_prompt // (2 if request.drafts else 1))
 
     def fits(self, request: Request) -> bool:
         """Whether a request could run if it were alone."""
-        return self.rows_of(request) <= self._rows
+        return self.memory_of(request).within(Memory(self._rows, self._prompts))
+
+    def _left(self, running: Iterable[Request]) -> Memory:
+        taken = [self.memory_of(request) for request in running]
+        rows, prompts = sum(each.rows for each in taken), sum(each.prompts for each in taken)
+        return Memory(self._rows - rows, self._prompts - prompts)
 
     def add(self, request: Request) -> None:
         """Queue a request that `fits`."""
@@ -64,14 +90,11 @@ class Schedule:
         if not self._waiting or self._waiting[0].controls.deadline_ms is None:
             return []
         first, victims = self._waiting[0], list[Request]()
-        rows = self.free_rows
-        for request in sorted(self._admitted.values(), key=urgency, reverse=True):
-            if rows >= self.rows_of(first):
-                break
-            if urgency(request) < urgency(first):
+        running = sorted(self._admitted.values(), key=urgency)
+        while running and not self.memory_of(first).within(self._left(running)):
+            if urgency(running[-1]) < urgency(first):
                 return []
-            victims.append(request)
-            rows += self.rows_of(request)
+            victims.append(running.pop())
         for request in victims:
             self._waiting.append(self._admitted.pop(request.id))
         return victims
@@ -82,7 +105,7 @@ class Schedule:
         self._waiting.sort(key=urgency)
         while self._waiting:
             request = self._waiting[0]
-            if self.rows_of(request) > self.free_rows:
+            if not self.memory_of(request).within(self.free):
                 break
             self._admitted[request.id] = self._waiting.pop(0)
             admitted.append(request)

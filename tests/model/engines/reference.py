@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 from transformers import DynamicCache
 
 from model.engines.engine import Draw, PlanRequest
@@ -19,8 +19,25 @@ from model.formats.text import parse
 from model.network.checkpoint import Loaded
 
 
+class _ExactRotary(nn.Module):
+    """Rotary embedding in float64; in float32 cosines differ by a bit with where they lie in memory."""
+
+    def __init__(self, theirs: Any) -> None:
+        super().__init__()
+        self._theirs = theirs
+
+    def forward(self, x: Tensor, position_ids: Tensor) -> tuple[Tensor, Tensor]:
+        angles = position_ids.expand(3, -1, -1)[..., None] * self._theirs.inv_freq.double()
+        cosines, sines = (
+            self._theirs.recomposition_frequencies(each) for each in (angles.cos(), angles.sin())
+        )
+        return cosines, sines
+
+
 def exactly(loaded: Loaded) -> Loaded:
-    """``loaded`` with norms that do not round to float32 on the way."""
+    """``loaded``, in float64, with nothing that rounds to float32 on the way."""
+    text: Any = loaded.model.model.language_model
+    text.rotary_emb = _ExactRotary(text.rotary_emb)
     for module in list(loaded.model.modules()):
         for name, child in list(module.named_children()):
             theirs: Any = child

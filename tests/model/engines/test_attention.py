@@ -1,28 +1,58 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
-from model.engines.torch.attention import attention_with_sums, plain_attention_with_sums
-from model.engines.torch.runner import pass_size
+from model.engines.torch.attention import DrawPass
+from model.engines.torch.kv import KvRows
+from model.engines.torch.packed import pass_size
+from model.engines.torch.places import Fed, Places
+
+PROMPTS = (5, 3, 9)
+HEADS, GROUPS, WIDTH = 4, 2, 8
 
 
-@pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_the_fused_kernel_and_plain_operations_agree(dtype: torch.dtype, masked: bool) -> None:
-    generator = torch.Generator().manual_seed(0)
-    query = torch.randn(3, 2, 5, 16, dtype=dtype, generator=generator)
-    keys, values = (torch.randn(3, 2, 40, 16, dtype=dtype, generator=generator)[:, :, :9] for _ in range(2))
-    mask = None
-    if masked:
-        seen = torch.rand(3, 1, 5, 9, generator=generator) < 0.6
-        seen[..., 0] = True
-        mask = torch.zeros(3, 1, 5, 9, dtype=dtype).masked_fill_(~seen, float("-inf"))
-    fused, plain = (
-        attend(query, keys, values, mask) for attend in (attention_with_sums, plain_attention_with_sums)
-    )
-    for one, other in zip(fused, plain, strict=True):
-        torch.testing.assert_close(one, other)
+@pytest.mark.parametrize("seed", range(20))
+def test_each_token_sees_its_prompt_and_what_its_draw_has_written(seed: int) -> None:
+    """Passes over draws that part and write by chance, against attention worked out draw by draw."""
+    random = np.random.default_rng(seed)
+    torch.manual_seed(seed)
+    sizes = {"layers": 2, "heads": GROUPS, "head_dim": WIDTH, "dtype": torch.float64}
+    memory = KvRows(rows=4, length=200, device=torch.device("cpu"), **sizes)  # type: ignore[arg-type]
+    prompts = [torch.randn(2, 2, GROUPS, length, WIDTH, dtype=torch.float64) for length in PROMPTS]
+    for row, prompt in enumerate(prompts):
+        memory.row(row, prompt.shape[-2]).copy_(prompt)
+    places, prompt_of = Places(8, 40), [0, 2, 2, 1]
+    # Keys and values that each draw has written, [2, groups, t, width], in the layer looked at.
+    written = [torch.empty(2, GROUPS, 0, WIDTH, dtype=torch.float64) for _ in prompt_of]
+    for step in range(6):
+        if step == 3:  # the second draw parts in two
+            places.copy(1, 4)
+            prompt_of.append(2)
+            written.append(written[1])
+        counts = [int(random.integers(1, 9)) for _ in prompt_of]
+        fed = [Fed(p, w.shape[2], count) for p, w, count in zip(prompt_of, written, counts, strict=True)]
+        total = sum(counts)
+        size = pass_size(total) + 1
+        query = torch.randn(size, HEADS, WIDTH, dtype=torch.float64)
+        key, value = (torch.randn(size, GROUPS, WIDTH, dtype=torch.float64) for _ in range(2))
+        attention = DrawPass(HEADS, memory, places.write(fed, PROMPTS), size)
+        seen = attention.attend(1, query, key, value)
+        start = 0
+        for row, count in enumerate(counts):
+            new = torch.stack([key, value])[:, start : start + count].transpose(1, 2)
+            everything = torch.cat([prompts[prompt_of[row]][:, 1], written[row], new], dim=2)
+            before = everything.shape[2] - count
+            for place in range(count):
+                keys, values = everything[:, :, : before + place + 1].repeat_interleave(HEADS // GROUPS, 1)
+                asked = query[start + place][:, None]
+                expected = torch.softmax(asked @ keys.transpose(1, 2), -1) @ values
+                torch.testing.assert_close(seen[start + place].view(HEADS, 1, WIDTH), expected)
+            # Of what was fed, a row may keep a part only.
+            kept = before - PROMPTS[prompt_of[row]] + int(random.integers(0, count + 1))
+            written[row] = everything[:, :, PROMPTS[prompt_of[row]] :][:, :, :kept]
+            start += count
 
 
 def test_passes_have_few_sizes_and_little_padding() -> None:

@@ -1,29 +1,30 @@
 from __future__ import annotations
 
-from model.engines.torch.habits import CONTEXT, Habits
+from model.engines.torch.habits import CONTEXTS, Habits
 
 
-def test_what_came_more_often_than_not_is_usual() -> None:
+def test_a_random_number_selects_by_how_often_tokens_followed() -> None:
     habits = Habits()
-    habits.saw([1, 2], 3, 1)
-    assert habits.usual([1, 2]) is None, "once is no habit"
-    habits.saw([1, 2], 3, 1)
-    assert habits.usual([1, 2]) == 3
-    habits.saw([1, 2], 4, 2)
-    assert habits.usual([1, 2]) is None, "half is not more often than not"
-    assert habits.usual([2, 1]) is None
+    assert habits.likely([1, 2], 0.5) is None
+    habits.saw([1, 2], 9, 3)
+    habits.saw([1, 2], 4, 1)
+    assert [habits.likely([1, 2], number) for number in (0.0, 0.24, 0.26, 0.99)] == [4, 4, 9, 9]
+    assert habits.likely([1, 2], None) == 9
+    assert habits.likely([2, 1], 0.5) is None
 
 
-def test_only_the_latest_tokens_matter() -> None:
+def test_the_longest_context_that_is_known_counts() -> None:
     habits = Habits()
-    end = list(range(CONTEXT))
-    habits.saw([98, *end], 7, 2)
-    assert habits.usual([99, *end]) == 7
+    end = list(range(min(CONTEXTS)))
+    habits.saw([98, *end], 7, 1)
+    habits.saw([99, *end], 8, 1)
+    assert habits.likely([98, *end], 0.9) == 7
+    assert habits.likely([97, *end], 0.9) == 8, "of the last tokens, which are known, both came as often"
 
 
 def test_it_forgets_what_was_longest_unused() -> None:
     habits = Habits()
-    for number in range(20_001):
+    for number in range(50_001):
         habits.saw([number], 5, 2)
-    assert habits.usual([0]) is None
-    assert habits.usual([1]) == 5
+    assert habits.likely([0], None) is None
+    assert habits.likely([1], None) == 5

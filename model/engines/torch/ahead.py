@@ -1,0 +1,89 @@
+"""What is fed behind a row's pending tokens, to be checked in the same pass. No torch.
+
+A wrong guess costs its share of the pass, a right one saves a pass. Nothing that is chosen depends on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from model.engines.torch.answers import Answers
+from model.engines.torch.habits import CONTEXTS, Habits
+from model.engines.torch.rows import Row
+from model.engines.torch.sampler import uniform
+
+Ids = npt.NDArray[np.int64]
+
+GUESS_ROWS: Final = 12
+"""Tokens fed ahead cost next to nothing while so few rows run, and as much as others when many do."""
+_GUESSES: Final = 4
+"""Decisions guessed from habits, one behind the other, at most: two of three are right."""
+_REPEAT_TOKENS: Final = 64
+"""Fed ahead at most as the last answer to the same pictures went on."""
+_HABITUAL: Final = 64
+"""Decisions between more tokens than this (codes, free words) are no matter of habit."""
+_CONTEXT: Final = max(CONTEXTS)
+
+
+class Ahead:
+    """Guesses how rows go on, from what they and others have written."""
+
+    def __init__(self) -> None:
+        self._habits, self._answers = Habits(), Answers()
+
+    def feed(self, row: Row, *, copy: bool, guess: bool) -> tuple[list[int], list[tuple[int, Ids]]]:
+        """A row's pending tokens and what may come behind them, and the decisions among both.
+
+        Args:
+            row: whose prompt is there.
+            copy: whether a revised plan is taken from the first one.
+            guess: whether more is taken from the last answer to the same pictures, and from habits.
+
+        Returns:
+            tokens: to be fed.
+            decisions: places among the tokens, and the ids that are allowed behind them.
+        """
+        assert row.prompt is not None
+        tokens, decisions, cursor = list(row.pending), list[tuple[int, Ids]](), row.cursor
+        written, controls = len(row.tokens), row.request.controls
+        context = [token.id for token in row.tokens[-_CONTEXT:]]
+        copied = iter(row.proposal() if copy else [])
+        answer = self._answers.last(row.prompt.shown, row.draws[0]) if guess else ()
+        repeated, guesses = iter(answer[written:]), 0
+        while not cursor.done:
+            ids = cursor.allowed().ids
+            if len(ids) > 1:
+                decisions.append((len(tokens) - 1, ids))
+            token, before = next(copied, None), next(repeated, None)
+            if token is None and guess:
+                ahead = len(tokens) - len(row.pending)
+                if len(ids) == 1:
+                    token = int(ids[0])
+                elif before in ids:
+                    token = before if ahead < _REPEAT_TOKENS else None
+                elif len(ids) <= _HABITUAL and guesses < _GUESSES:
+                    guesses += 1
+                    number = uniform(controls.seed, row.draws[0], written + ahead)
+                    token = self._habits.likely(context, number if controls.temperature else None)
+            if token is None or token not in ids:
+                break
+            tokens.append(token)
+            context.append(token)
+            cursor = cursor.advance(token)
+        return tokens, decisions
+
+    def saw(self, row: Row, alternatives: int, chosen: Sequence[tuple[int, tuple[int, ...]]]) -> None:
+        """Draws of a row are about to write tokens, chosen among so many."""
+        if alternatives <= _HABITUAL:
+            context = [token.id for token in row.tokens[-_CONTEXT:]]
+            for token, draws in chosen:
+                self._habits.saw(context, token, len(draws))
+
+    def finished(self, row: Row) -> None:
+        """A row has written its whole response."""
+        assert row.prompt is not None
+        self._answers.keep(row.prompt.shown, row.draws, [token.id for token in row.tokens])
