@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
@@ -99,6 +101,42 @@ class PlanResult:
     timing: wire.Timing
 
 
+@dataclass(frozen=True, eq=False)
+class LookedAt:
+    """One of the n looks at a given plan.
+
+    Attributes:
+        index: 0..n-1.
+        decision: ``keep`` or ``revise``.
+        thinking, revised_plan: the second look; None where none was taken.
+        plan_iou: of the given and the revised plan; 1 where it is kept.
+        changes: the stretches in which they differ.
+        trajectory: float32 [64, 4]: x, y, z in m and heading in rad at 10 Hz, ego frame, first row at +0.1 s.
+        tokens: tokens per section.
+    """
+
+    index: int
+    decision: str
+    thinking: str | None
+    revised_plan: Plan | None
+    plan_iou: float
+    changes: tuple[wire.PlanChange, ...]
+    trajectory: FloatArray
+    tokens: dict[str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class ReflectResult:
+    """What came back for a given plan; ``think_probability`` is that of a second look at it."""
+
+    request_id: str
+    model: wire.ModelName
+    plan: Plan
+    think_probability: float
+    draws: tuple[LookedAt, ...]
+    timing: wire.Timing
+
+
 def unreachable(error: httpx.HTTPError) -> PlannerUnreachable:
     """The typed error for a request that got no answer."""
     kind = PlannerTimeout if isinstance(error, httpx.TimeoutException) else PlannerUnreachable
@@ -138,11 +176,41 @@ def _problem(response: httpx.Response) -> PlannerError:
 def plan_result(response: httpx.Response) -> PlanResult:
     """The typed result of POST /v1/plan; raises `PlannerError`."""
     answered = read(response, wire.PlanResponse)
-    try:
+    with _contract(response):
         draws = tuple(_draw(draw) for draw in answered.draws)
+    return PlanResult(answered.request_id, answered.model, draws, answered.timing)
+
+
+def reflect_result(response: httpx.Response) -> ReflectResult:
+    """The typed result of POST /v1/reflect; raises `PlannerError`."""
+    answered = read(response, wire.ReflectResponse)
+    with _contract(response):
+        plan = parse_plan(answered.plan.text)
+        draws = tuple(_looked_at(draw) for draw in answered.draws)
+    return ReflectResult(
+        answered.request_id, answered.model, plan, answered.think_probability, draws, answered.timing
+    )
+
+
+@contextmanager
+def _contract(response: httpx.Response) -> Iterator[None]:
+    try:
+        yield
     except (PlanError, GeometryError) as error:
         raise BadAnswer(f"{response.url} answered with something else than a plan: {error}") from error
-    return PlanResult(answered.request_id, answered.model, draws, answered.timing)
+
+
+def _looked_at(draw: wire.Reflection) -> LookedAt:
+    return LookedAt(
+        index=draw.index,
+        decision=draw.decision,
+        thinking=draw.thinking,
+        revised_plan=None if draw.revised_plan is None else parse_plan(draw.revised_plan.text),
+        plan_iou=draw.plan_iou,
+        changes=tuple(draw.changes),
+        trajectory=check_trajectory(np.asarray(draw.trajectory, np.float32)),
+        tokens=draw.tokens,
+    )
 
 
 def _draw(draw: wire.Draw) -> PlannedDraw:

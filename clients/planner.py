@@ -17,22 +17,26 @@ from types import TracebackType
 from typing import Self, cast
 
 import httpx
+from pydantic import BaseModel
 
 from clients import wire
 from clients.answers import (
     BUSY_STATUSES,
     BadAnswer,
+    LookedAt,
     PlannedDraw,
     PlannerError,
     PlannerProblem,
     PlannerTimeout,
     PlannerUnreachable,
     PlanResult,
+    ReflectResult,
     RequestRefused,
     ServiceBusy,
     ServiceFailed,
     plan_result,
     read,
+    reflect_result,
     retry_after_s,
     unreachable,
 )
@@ -42,6 +46,7 @@ from model.driving.scene import Scene
 __all__ = [
     "AsyncPlannerClient",
     "BadAnswer",
+    "LookedAt",
     "Patience",
     "PlanResult",
     "PlannedDraw",
@@ -50,10 +55,12 @@ __all__ = [
     "PlannerProblem",
     "PlannerTimeout",
     "PlannerUnreachable",
+    "ReflectResult",
     "RequestRefused",
     "ServiceBusy",
     "ServiceFailed",
     "plan_request",
+    "reflect_request",
 ]
 
 
@@ -104,8 +111,33 @@ class PlannerClient:
             PlannerError: see its subclasses.
         """
         asked = plan_request(scene, controls, prefill=prefill, format=format)
-        answered = self._send(_plan_call(self._http, asked, request_id), controls.deadline_ms)
+        answered = self._send(_call(self._http, "/v1/plan", asked, request_id), controls.deadline_ms)
         return plan_result(answered)
+
+    def reflect(
+        self,
+        scene: Scene,
+        plan: Plan,
+        controls: wire.ReflectControls = wire.ReflectControls(),
+        *,
+        format: str = "cf_vla",
+        request_id: str | None = None,
+    ) -> ReflectResult:
+        """Have ``plan``, from whatever planner, looked at.
+
+        Args:
+            scene: what the car sees.
+            plan: to keep or to revise.
+            controls: draws, thinking, sampling, deadline.
+            format: a response format the model writes.
+            request_id: shows up in the service's log; made there when None.
+
+        Raises:
+            PlannerError: see its subclasses.
+        """
+        asked = reflect_request(scene, plan, controls, format=format)
+        answered = self._send(_call(self._http, "/v1/reflect", asked, request_id), controls.deadline_ms)
+        return reflect_result(answered)
 
     def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""
@@ -159,8 +191,22 @@ class AsyncPlannerClient:
     ) -> PlanResult:
         """Plan for ``scene``; see `PlannerClient.plan`."""
         asked = plan_request(scene, controls, prefill=prefill, format=format)
-        answered = await self._send(_plan_call(self._http, asked, request_id), controls.deadline_ms)
+        answered = await self._send(_call(self._http, "/v1/plan", asked, request_id), controls.deadline_ms)
         return plan_result(answered)
+
+    async def reflect(
+        self,
+        scene: Scene,
+        plan: Plan,
+        controls: wire.ReflectControls = wire.ReflectControls(),
+        *,
+        format: str = "cf_vla",
+        request_id: str | None = None,
+    ) -> ReflectResult:
+        """Have ``plan`` looked at; see `PlannerClient.reflect`."""
+        asked = reflect_request(scene, plan, controls, format=format)
+        call = _call(self._http, "/v1/reflect", asked, request_id)
+        return reflect_result(await self._send(call, controls.deadline_ms))
 
     async def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""
@@ -202,21 +248,32 @@ def plan_request(
     """The body of POST /v1/plan for ``scene``."""
     if prefill is not None:
         controls = controls.model_copy(update={"prefill": str(prefill)})
-    return wire.PlanRequest(
-        scene=wire.Scene(
-            scene_id=scene.scene_id,
-            clips=[
-                wire.Clip(
-                    camera=cast(wire.Camera, clip.camera),
-                    images=[base64.b64encode(image).decode() for image in clip.images],
-                )
-                for clip in scene.clips
-            ],
-            history=scene.history.tolist(),
-            route=None if scene.route is None else scene.route.tolist(),
-        ),
-        controls=controls,
-        format=format,
+    return wire.PlanRequest(scene=_scene(scene), controls=controls, format=format)
+
+
+def reflect_request(
+    scene: Scene,
+    plan: Plan,
+    controls: wire.ReflectControls = wire.ReflectControls(),
+    *,
+    format: str = "cf_vla",
+) -> wire.ReflectRequest:
+    """The body of POST /v1/reflect for ``plan`` in ``scene``."""
+    return wire.ReflectRequest(scene=_scene(scene), plan=str(plan), controls=controls, format=format)
+
+
+def _scene(scene: Scene) -> wire.Scene:
+    return wire.Scene(
+        scene_id=scene.scene_id,
+        clips=[
+            wire.Clip(
+                camera=cast(wire.Camera, clip.camera),
+                images=[base64.b64encode(image).decode() for image in clip.images],
+            )
+            for clip in scene.clips
+        ],
+        history=scene.history.tolist(),
+        route=None if scene.route is None else scene.route.tolist(),
     )
 
 
@@ -239,10 +296,10 @@ class _Attempts:
         return wait_s
 
 
-def _plan_call(
-    http: httpx.Client | httpx.AsyncClient, asked: wire.PlanRequest, request_id: str | None
+def _call(
+    http: httpx.Client | httpx.AsyncClient, path: str, asked: BaseModel, request_id: str | None
 ) -> httpx.Request:
     headers = {"Content-Type": "application/json"}
     if request_id is not None:
         headers[wire.REQUEST_ID_HEADER] = request_id
-    return http.build_request("POST", "/v1/plan", content=asked.model_dump_json(), headers=headers)
+    return http.build_request("POST", path, content=asked.model_dump_json(), headers=headers)

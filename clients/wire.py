@@ -22,6 +22,7 @@ Camera = Literal[
 ]
 Thinking = Literal["adaptive", "always", "never"]
 Branch = Literal["Action:", "Thinking:"]
+Group = Literal["longitudinal", "lateral", "lane"]
 
 PROBLEM_MEDIA_TYPE: Final = "application/problem+json"
 REQUEST_ID_HEADER: Final = "X-Request-ID"
@@ -113,8 +114,8 @@ PlanGiven = Annotated[
 """A plan as bullet text or as tracks; the discriminator keeps errors to the form that was meant."""
 
 
-class Controls(Asked):
-    """What the caller decides about decoding."""
+class ReflectControls(Asked):
+    """What the caller decides about decoding behind a given plan."""
 
     thinking: Thinking = Field(
         default="adaptive", description="Who decides on a second look: the model, always think, never think."
@@ -123,10 +124,6 @@ class Controls(Asked):
         default=None,
         description="With adaptive: think exactly when the think probability exceeds it; "
         "null samples the branch.",
-    )
-    prefill: PlanGiven | None = Field(
-        default=None,
-        description="The first plan, given instead of written by the model: bullet text, or tracks.",
     )
     n: int = Field(default=6, ge=1, le=64, description="Draws.")
     temperature: float = Field(default=1.0, ge=0, le=2, description="0 takes the likeliest allowed token.")
@@ -139,6 +136,15 @@ class Controls(Asked):
         ge=1,
         le=600_000,
         description="Milliseconds until the answer must be there; null for none.",
+    )
+
+
+class Controls(ReflectControls):
+    """What the caller decides about decoding."""
+
+    prefill: PlanGiven | None = Field(
+        default=None,
+        description="The first plan, given instead of written by the model: bullet text, or tracks.",
     )
 
 
@@ -198,6 +204,59 @@ class PlanResponse(Answered):
     request_id: str
     model: ModelName
     draws: list[Draw]
+    timing: Timing
+
+
+class ReflectRequest(Asked):
+    """Body of POST /v1/reflect."""
+
+    scene: Scene
+    plan: PlanGiven = Field(description="The plan to be looked at, from any planner: bullet text, or tracks.")
+    controls: ReflectControls = ReflectControls()
+    format: str = Field(
+        default="cf_vla",
+        max_length=40,
+        description="Response format; GET /v1/models lists what the model writes.",
+    )
+
+
+class PlanChange(Answered):
+    """A stretch of one track in which the revised plan says something else than the given one."""
+
+    group: Group
+    start_s: float
+    end_s: float
+    proposed: str | None = Field(description="The word of the given plan; null where it has no such track.")
+    revised: str | None = Field(description="The word of the revised plan; null where it has none.")
+
+
+class Reflection(Answered):
+    """One of the n looks at the given plan."""
+
+    index: int = Field(ge=0, description="0..n-1.")
+    decision: Literal["keep", "revise"] = Field(
+        description="keep where the model would drive by the given plan, revise where it says otherwise."
+    )
+    thinking: str | None = Field(description="The reasoning; null without a second look.")
+    revised_plan: Plan | None = Field(description="The plan after reasoning; null without a second look.")
+    plan_iou: float = Field(
+        ge=0, le=1, description="Intersection over union of given and revised plan, in bins of 0.1 s."
+    )
+    changes: list[PlanChange] = Field(description="Where they do not, track by track; empty when kept.")
+    trajectory: Trajectory
+    tokens: dict[str, int] = Field(description="Tokens per section of the response.")
+
+
+class ReflectResponse(Answered):
+    """Answer of POST /v1/reflect."""
+
+    request_id: str
+    model: ModelName
+    plan: Plan = Field(description="The given plan, as the model read it.")
+    think_probability: Probability = Field(
+        description="Probability of a second look behind the given plan, the same for all draws."
+    )
+    draws: list[Reflection]
     timing: Timing
 
 
@@ -273,6 +332,8 @@ class Fault(Answered):
 
     pointer: str = Field(description="JSON pointer (RFC 6901) into the body.")
     detail: str
+    line: int | None = Field(default=None, description="Of a text in the body, from 1.")
+    column: int | None = Field(default=None, description="In that line, from 1.")
 
 
 class Problem(Answered):

@@ -41,6 +41,7 @@ _KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], Kind]]] = (
     (("scene", "clips"), INVALID_CLIP),
     (("scene", "history"), INVALID_HISTORY),
     (("scene", "route"), INVALID_ROUTE),
+    (("plan",), INVALID_PLAN),
     (("controls", "prefill"), INVALID_PLAN),
     (("controls",), INVALID_CONTROLS),
 )

@@ -1,4 +1,4 @@
-"""The example request of the API description; it can be sent as it is."""
+"""The example requests of the API description; they can be sent as they are."""
 
 from __future__ import annotations
 
@@ -24,3 +24,10 @@ def example_request(cameras: tuple[str, ...]) -> dict[str, Any]:
         },
         "controls": {"thinking": "adaptive", "n": 2, "seed": 7},
     }
+
+
+def example_reflection(cameras: tuple[str, ...]) -> dict[str, Any]:
+    """The same scene with a plan to be looked at."""
+    asked = example_request(cameras)
+    plan = "- longitudinal\n  - 0.0s-2.1s: Keep Speed\n  - 2.1s-6.4s: Accelerate\n"
+    return {"scene": asked["scene"], "plan": plan, "controls": asked["controls"]}

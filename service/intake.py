@@ -41,8 +41,10 @@ MAX_TURN_RAD: Final = 0.5
 """Between history rows: 290 degrees a second. More is a heading in degrees."""
 
 
-def engine_request(asked: wire.PlanRequest, card: ModelCard, engine_id: str) -> PlanRequest:
-    """The engine's request for what was ``asked``.
+def engine_request(
+    asked: wire.PlanRequest | wire.ReflectRequest, card: ModelCard, engine_id: str
+) -> PlanRequest:
+    """The engine's request for what was ``asked``; a plan to be reflected upon is the first one.
 
     Args:
         asked: a request whose shapes the schema has checked.
@@ -57,7 +59,12 @@ def engine_request(asked: wire.PlanRequest, card: ModelCard, engine_id: str) -> 
     cameras = [clip.camera for clip in asked.scene.clips]
     if missing := [camera for camera in card.cameras if camera not in cameras]:
         raise at(MISSING_CAMERA, "/scene/clips", f"{card.name} also needs {', '.join(missing)}")
-    controls = _controls(asked.controls)
+    if isinstance(asked, wire.ReflectRequest):
+        controls = _controls(asked.controls, _plan(asked.plan, "/plan"))
+    else:
+        given = asked.controls.prefill
+        prefill = None if given is None else _plan(given, "/controls/prefill")
+        controls = _controls(asked.controls, prefill)
     return PlanRequest(engine_id, _scene(asked.scene), asked.format, controls)
 
 
@@ -113,27 +120,30 @@ def _limit(values: np.ndarray[tuple[int, ...], np.dtype[np.floating]], largest: 
         raise at(INVALID_HISTORY, f"/scene/history/{worst + 1}", f"the ego {problem}")
 
 
-def _controls(asked: wire.Controls) -> Controls:
+def _controls(asked: wire.ReflectControls, prefill: Plan | None) -> Controls:
     try:
         return Controls(
             thinking=asked.thinking,
             think_threshold=asked.think_threshold,
-            prefill=None if asked.prefill is None else _plan(asked.prefill),
+            prefill=prefill,
             n=asked.n,
             temperature=asked.temperature,
             top_p=asked.top_p,
             seed=asked.seed,
             deadline_ms=asked.deadline_ms,
         )
-    except PlanError as error:
-        raise at(INVALID_PLAN, "/controls/prefill", str(error)) from None
     except RequestError as error:
         raise at(INVALID_CONTROLS, "/controls", str(error)) from None
 
 
-def _plan(asked: wire.PlanGiven) -> Plan:
-    if isinstance(asked, str):
-        return parse_plan(asked)
+def _plan(asked: wire.PlanGiven, pointer: str) -> Plan:
+    try:
+        return parse_plan(asked) if isinstance(asked, str) else _plan_of_tracks(asked)
+    except PlanError as error:
+        raise at(INVALID_PLAN, pointer, str(error), error.line, error.column) from None
+
+
+def _plan_of_tracks(asked: wire.Tracks) -> Plan:
     tracks = {
         group: tuple(MetaAction(_tick(action.start_s), _tick(action.end_s), action.word) for action in track)
         for group in GROUPS

@@ -6,6 +6,7 @@ from typing import Final
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
+from model.driving.plan import plan_iou
 from model.engines.engine import Draw, ModelCard, Thinking
 
 LATENCY_BUCKETS_S: Final = (
@@ -57,8 +58,15 @@ class Metrics:
         )
         self._branches = Counter(
             "looktwice_branches",
-            "Draws by the branch they took and by who decided.",
-            ["branch", "thinking"],
+            "Draws by the branch they took, by who decided, and by what was asked for.",
+            ["branch", "thinking", "endpoint"],
+            registry=registry,
+        )
+        self._revised_iou = Histogram(
+            "looktwice_revised_plan_iou",
+            "Share of a first plan that its revision keeps.",
+            ["endpoint"],
+            buckets=PROBABILITY_BUCKETS,
             registry=registry,
         )
         self._think_probability = Histogram(
@@ -77,9 +85,11 @@ class Metrics:
         """Show which weights answer."""
         self._model.labels(card.name, card.revision, card.engine).set(1)
 
-    def draw_finished(self, draw: Draw, thinking: Thinking) -> None:
+    def draw_finished(self, draw: Draw, thinking: Thinking, endpoint: str) -> None:
         """Count one draw."""
-        self._branches.labels(BRANCH_LABELS[draw.branch], thinking).inc()
+        self._branches.labels(BRANCH_LABELS[draw.branch], thinking, endpoint).inc()
+        if draw.plan is not None and draw.revised_plan is not None:
+            self._revised_iou.labels(endpoint).observe(plan_iou(draw.plan, draw.revised_plan))
         if draw.think_probability is not None:
             self._think_probability.observe(draw.think_probability)
         for section, tokens in draw.tokens.items():

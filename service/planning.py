@@ -12,7 +12,7 @@ import structlog
 
 import clients.wire as wire
 from model.driving.images import ImageError
-from model.driving.plan import GROUPS, Plan, PlanError
+from model.driving.plan import Plan, PlanError, plan_changes, plan_iou
 from model.driving.scene import SceneError
 from model.engines.engine import (
     Draw,
@@ -57,6 +57,42 @@ async def answer(
         ProblemError: the request cannot be served; the engine failed.
         CallerLeft: nobody waits for the answer.
     """
+    draws, timing = await _decode(asked, engine, metrics, request_id, caller_leaves)
+    return wire.PlanResponse(
+        request_id=request_id, model=_model(engine), draws=[_draw(draw) for draw in draws], timing=timing()
+    )
+
+
+async def reflect(
+    asked: wire.ReflectRequest,
+    engine: Engine,
+    metrics: Metrics,
+    request_id: str,
+    caller_leaves: Callable[[], Awaitable[None]],
+) -> wire.ReflectResponse:
+    """Look at a given plan; see `answer`."""
+    draws, timing = await _decode(asked, engine, metrics, request_id, caller_leaves)
+    first = draws[0]
+    if first.plan is None or first.think_probability is None:
+        raise ProblemError(REFUSED, f"responses in the format {asked.format} hold no plan to reflect upon")
+    return wire.ReflectResponse(
+        request_id=request_id,
+        model=_model(engine),
+        plan=wire_plan(first.plan),
+        think_probability=first.think_probability,
+        draws=[_reflection(first.plan, draw) for draw in draws],
+        timing=timing(),
+    )
+
+
+async def _decode(
+    asked: wire.PlanRequest | wire.ReflectRequest,
+    engine: Engine,
+    metrics: Metrics,
+    request_id: str,
+    caller_leaves: Callable[[], Awaitable[None]],
+) -> tuple[list[Draw], Callable[[], wire.Timing]]:
+    """The draws of a request, and what tells the time that it has taken when the answer is made."""
     began = time.perf_counter()
     engine_id = f"{request_id}/{secrets.token_hex(4)}"
     # On a thread: megabytes of base64 must not hold up the answers of others.
@@ -65,19 +101,22 @@ async def answer(
     with metrics.plans_in_flight.track_inprogress():
         draws = await _while_wanted(_draws(engine, request), caller_leaves)
     finished = time.perf_counter()
+    endpoint = "reflect" if isinstance(asked, wire.ReflectRequest) else "plan"
     for draw in draws:
-        metrics.draw_finished(draw, request.controls.thinking)
-    card = engine.card
-    return wire.PlanResponse(
-        request_id=request_id,
-        model=wire.ModelName(name=card.name, revision=card.revision),
-        draws=[_draw(draw) for draw in draws],
-        timing=wire.Timing(
+        metrics.draw_finished(draw, request.controls.thinking, endpoint)
+
+    def timing() -> wire.Timing:
+        return wire.Timing(
             total_ms=_ms(time.perf_counter() - began),
             checks_ms=_ms(checked - began),
             engine_ms=_ms(finished - checked),
-        ),
-    )
+        )
+
+    return draws, timing
+
+
+def _model(engine: Engine) -> wire.ModelName:
+    return wire.ModelName(name=engine.card.name, revision=engine.card.revision)
 
 
 def model_card(card: ModelCard) -> wire.ModelCard:
@@ -129,26 +168,53 @@ async def _while_wanted(
 def _draw(draw: Draw) -> wire.Draw:
     return wire.Draw(
         index=draw.index,
-        plan=_plan(draw.plan),
+        plan=None if draw.plan is None else wire_plan(draw.plan),
         branch=draw.branch,
         think_probability=draw.think_probability,
         thinking=draw.thinking,
-        revised_plan=_plan(draw.revised_plan),
-        trajectory=draw.trajectory.astype(float).round(_DECIMALS).tolist(),
+        revised_plan=None if draw.revised_plan is None else wire_plan(draw.revised_plan),
+        trajectory=_trajectory(draw),
         tokens=dict(draw.tokens),
     )
 
 
-def _plan(plan: Plan | None) -> wire.Plan | None:
-    if plan is None:
-        return None
+def _reflection(given: Plan, draw: Draw) -> wire.Reflection:
+    revised = draw.revised_plan or given
+    changes = [
+        wire.PlanChange(
+            group=change.group,
+            start_s=change.start / 10,
+            end_s=change.end / 10,
+            proposed=change.before,
+            revised=change.after,
+        )
+        for change in plan_changes(given, revised)
+    ]
+    return wire.Reflection(
+        index=draw.index,
+        decision="revise" if changes else "keep",
+        thinking=draw.thinking,
+        revised_plan=None if draw.revised_plan is None else wire_plan(draw.revised_plan),
+        plan_iou=plan_iou(given, revised),
+        changes=changes,
+        trajectory=_trajectory(draw),
+        tokens=dict(draw.tokens),
+    )
+
+
+def _trajectory(draw: Draw) -> list[list[float]]:
+    rows: list[list[float]] = draw.trajectory.astype(float).round(_DECIMALS).tolist()
+    return rows
+
+
+def wire_plan(plan: Plan) -> wire.Plan:
+    """A plan for the wire."""
     tracks = {
         group: [
             wire.MetaAction(start_s=action.start / 10, end_s=action.end / 10, word=action.word)
             for action in track
         ]
-        for group in GROUPS
-        if (track := plan.track(group)) is not None
+        for group, track in plan.tracks()
     }
     return wire.Plan(text=str(plan), tracks=wire.Tracks(**tracks))
 

@@ -69,6 +69,9 @@ class ProblemError(Exception):
         self.kind, self.detail, self.errors = kind, detail, tuple(errors)
 
 
-def at(kind: Kind, pointer: str, detail: str) -> ProblemError:
-    """A problem with one known place in the body."""
-    return ProblemError(kind, f"{pointer}: {detail}", [Fault(pointer=pointer, detail=detail)])
+def at(
+    kind: Kind, pointer: str, detail: str, line: int | None = None, column: int | None = None
+) -> ProblemError:
+    """A problem with one known place in the body; ``line`` and ``column`` are those of a text there."""
+    fault = Fault(pointer=pointer, detail=detail, line=line, column=column)
+    return ProblemError(kind, f"{pointer}: {detail}", [fault])

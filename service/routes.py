@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import prometheus_client
 from fastapi import APIRouter, Body, Request
@@ -14,11 +15,11 @@ from starlette.responses import Response
 import clients.wire as wire
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.engines.engine import Engine
-from service.examples import example_request
+from service.examples import example_reflection, example_request
 from service.lifecycle import Lifecycle
 from service.metrics import Metrics
 from service.openapi import Responses, problems
-from service.planning import CallerLeft, answer, model_card
+from service.planning import CallerLeft, answer, model_card, reflect
 from service.problems import (
     BODY_TOO_LARGE,
     ENGINE_FAILED,
@@ -51,6 +52,14 @@ METRICS_TEXT: Responses = {200: {"description": "Prometheus text", "content": {"
 EXAMPLES: dict[str, Example] = {"straight on": {"value": example_request((FRONT_WIDE, FRONT_TELE))}}
 
 
+REFLECT_EXAMPLES: dict[str, Example] = {
+    "is it right to go on?": {"value": example_reflection((FRONT_WIDE, FRONT_TELE))}
+}
+
+_Asked = TypeVar("_Asked")
+_Work = Callable[[_Asked, Engine, Metrics, str, Callable[[], Awaitable[None]]], Awaitable[Any]]
+
+
 @dataclass(frozen=True)
 class Parts:
     """What the endpoints work with."""
@@ -71,34 +80,43 @@ def make_router(parts: Parts) -> APIRouter:
 
 
 def _add_planning(router: APIRouter, parts: Parts) -> None:
-    @router.post(
-        "/v1/plan",
-        tags=["planning"],
-        response_model=wire.PlanResponse,
-        responses=problems(
-            *(INVALID_JSON, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE, INVALID_REQUEST, UNKNOWN_FIELD),
-            *(INVALID_CLIP, UNKNOWN_CAMERA, MISSING_CAMERA, INVALID_IMAGE, INVALID_HISTORY, INVALID_ROUTE),
-            *(INVALID_CONTROLS, INVALID_PLAN, UNKNOWN_FORMAT, REFUSED, NOT_READY, ENGINE_FAILED),
-        ),
+    refusals = problems(
+        *(INVALID_JSON, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE, INVALID_REQUEST, UNKNOWN_FIELD),
+        *(INVALID_CLIP, UNKNOWN_CAMERA, MISSING_CAMERA, INVALID_IMAGE, INVALID_HISTORY, INVALID_ROUTE),
+        *(INVALID_CONTROLS, INVALID_PLAN, UNKNOWN_FORMAT, REFUSED, NOT_READY, ENGINE_FAILED),
     )
+
+    @router.post("/v1/plan", tags=["planning"], response_model=wire.PlanResponse, responses=refusals)
     async def plan(request: Request, asked: wire.PlanRequest = Body(openapi_examples=EXAMPLES)) -> Any:
         """One scene: per draw a plan, the branch, a second look where one was taken, a trajectory."""
-        parts.lifecycle.check_ready()
+        return await _while_connected(request, parts, asked, answer)
 
-        async def caller_leaves() -> None:
-            while (await request.receive())["type"] != "http.disconnect":
-                pass
-
-        try:
-            return await answer(asked, parts.engine, parts.metrics, request.state.request_id, caller_leaves)
-        except CallerLeft:
-            return Response(status_code=CALLER_LEFT_STATUS)
+    @router.post("/v1/reflect", tags=["planning"], response_model=wire.ReflectResponse, responses=refusals)
+    async def look_at(
+        request: Request, asked: wire.ReflectRequest = Body(openapi_examples=REFLECT_EXAMPLES)
+    ) -> Any:
+        """A second look at a given plan: keep it or revise it, why, and the trajectory that follows."""
+        return await _while_connected(request, parts, asked, reflect)
 
     @router.get("/v1/models", tags=["planning"], responses=problems(NOT_READY, ENGINE_FAILED))
     async def models() -> wire.ModelList:
         """The models that answer here."""
         parts.lifecycle.check_ready()
         return wire.ModelList(models=[model_card(parts.engine.card)])
+
+
+async def _while_connected(request: Request, parts: Parts, asked: _Asked, work: _Work[_Asked]) -> Any:
+    """What ``work`` makes of a request, or nothing once its caller has left."""
+    parts.lifecycle.check_ready()
+
+    async def caller_leaves() -> None:
+        while (await request.receive())["type"] != "http.disconnect":
+            pass
+
+    try:
+        return await work(asked, parts.engine, parts.metrics, request.state.request_id, caller_leaves)
+    except CallerLeft:
+        return Response(status_code=CALLER_LEFT_STATUS)
 
 
 def _add_probes(router: APIRouter, parts: Parts) -> None:

@@ -19,8 +19,14 @@ from tests.model.network.motions import made_up_motions
 CODEC_SIZE = 16
 
 
-def write_untrained(folder: Path) -> Path:
-    """Write the checkpoint and return its folder."""
+def write_untrained(folder: Path, *, narrow: bool = False) -> Path:
+    """Write the checkpoint and return its folder.
+
+    Args:
+        folder: to write to.
+        narrow: a quarter of the width, and prone to end tracks and texts, for tests of many thousand
+            responses.
+    """
     histories, futures = made_up_motions(400)
     codec = TrajectoryCodec.fit(histories, futures, size=CODEC_SIZE)
     vocabulary = Vocabulary(build_nano_tokenizer(nano_corpus(), CODEC_SIZE))
@@ -28,10 +34,20 @@ def write_untrained(folder: Path) -> Path:
     config.text_config.num_hidden_layers = 2
     config.text_config.layer_types = config.text_config.layer_types[:2]
     config.vision_config.depth = 1
+    if narrow:
+        text, vision = config.text_config, config.vision_config
+        text.hidden_size, text.intermediate_size = text.hidden_size // 4, text.intermediate_size // 4
+        text.rope_parameters["mrope_section"] = [each // 4 for each in text.rope_parameters["mrope_section"]]
+        vision.hidden_size, vision.intermediate_size = vision.hidden_size // 4, vision.intermediate_size // 4
+        vision.out_hidden_size = text.hidden_size
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = LookTwiceVla(config)
         write_code_embeddings(model, codec, vocabulary)
+        if narrow:
+            embeddings = model.get_input_embeddings().weight.detach()
+            for text in ("6", "\n"):
+                embeddings[vocabulary.encode(text)[0]] *= 6
     save(folder, model, vocabulary, codec)
     return folder
 

@@ -17,7 +17,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -178,6 +178,29 @@ def plan_iou(one: Plan, other: Plan) -> float:
 _GROUP_LINE: Final = re.compile(r"- (?P<group>\w+)")
 _SEGMENT_LINE: Final = re.compile(r"  - (?P<start>[^\s:]*?)s-(?P<end>[^\s:]*?)s: (?P<word>.*)")
 _TIME: Final = re.compile(r"(?:0|[1-9][0-9]{0,3})\.[0-9]")
+
+
+class PlanChange(NamedTuple):
+    """Ticks ``start`` <= t < ``end`` of one track in which plans differ; None where a plan has no track."""
+
+    group: Group
+    start: int
+    end: int
+    before: str | None
+    after: str | None
+
+
+def plan_changes(before: Plan, after: Plan) -> list[PlanChange]:
+    """Where ``after`` says something else than ``before``, track by track, as long stretches as possible."""
+    changes: list[PlanChange] = []
+    for group in GROUPS:
+        pairs = [(before.word_at(group, tick), after.word_at(group, tick)) for tick in range(TICKS)]
+        ends = [*(tick for tick in range(1, TICKS) if pairs[tick] != pairs[tick - 1]), TICKS]
+        for start, end in pairwise([0, *ends]):
+            one, other = pairs[start]
+            if one != other:
+                changes.append(PlanChange(group, start, end, one, other))
+    return changes
 
 
 def parse_plan(text: str, first_line: int = 1) -> Plan:

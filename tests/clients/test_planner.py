@@ -189,3 +189,24 @@ def test_no_answer_in_time() -> None:
     transport = httpx.MockTransport(never)
     with PlannerClient("http://x", transport=transport) as planner, pytest.raises(PlannerTimeout):
         planner.models()
+
+
+def test_a_plan_is_looked_at_over_a_real_connection() -> None:
+    engine = ScriptedEngine()
+    controls = wire.ReflectControls(n=2, thinking="always")
+    with serve(engine, Settings()) as served, PlannerClient(served.url) as planner:
+        result = planner.reflect(scene("a"), PREFILL, controls, request_id="mine")
+        with pytest.raises(RequestRefused):
+            planner.reflect(scene("a"), PREFILL, format="unheard_of")
+    assert (result.request_id, result.plan, len(result.draws)) == ("mine", PREFILL, 2)
+    look = result.draws[1]
+    assert (look.index, look.decision, look.revised_plan, look.thinking) == (
+        1,
+        "revise",
+        SLOW_DOWN,
+        REASONING,
+    )
+    assert 0 <= look.plan_iou < 1
+    assert look.changes[0].proposed == "Wait"
+    assert look.trajectory.shape == (64, 4)
+    assert engine.submitted[0].controls.prefill == PREFILL

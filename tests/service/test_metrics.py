@@ -8,7 +8,7 @@ def test_draws_are_counted_by_branch_and_by_who_decided(served: Served) -> None:
     served.http.post("/v1/plan", json=body(n=3, thinking="always"))
     served.http.post("/v1/plan", json=body(n=2, thinking="never"))
     count = "looktwice_branches_total"
-    assert served.metric(count, branch="think", thinking="always") == 3
+    assert served.metric(count, branch="think", thinking="always", endpoint="plan") == 3
     assert served.metric(count, branch="direct", thinking="never") == 2
     assert served.metric(count, thinking="adaptive") == 0
     assert served.metric("looktwice_think_probability_count") == 5

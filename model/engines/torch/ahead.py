@@ -18,10 +18,9 @@ from model.engines.torch.sampler import uniform
 
 Ids = npt.NDArray[np.int64]
 
-GUESS_ROWS: Final = 12
-"""Tokens fed ahead cost next to nothing while so few rows run, and as much as others when many do."""
-_GUESSES: Final = 4
-"""Decisions guessed from habits, one behind the other, at most: two of three are right."""
+GUESSES: Final = 24
+"""Decisions guessed from habits in a pass, over all its rows: two of three are right, but with many rows one
+that is wrong still holds up the pass, and what is fed costs more than it saves."""
 _REPEAT_TOKENS: Final = 64
 """Fed ahead at most as the last answer to the same pictures went on."""
 _HABITUAL: Final = 64
@@ -35,13 +34,14 @@ class Ahead:
     def __init__(self) -> None:
         self._habits, self._answers = Habits(), Answers()
 
-    def feed(self, row: Row, *, copy: bool, guess: bool) -> tuple[list[int], list[tuple[int, Ids]]]:
+    def feed(self, row: Row, *, copy: bool, guesses: int) -> tuple[list[int], list[tuple[int, Ids]]]:
         """A row's pending tokens and what may come behind them, and the decisions among both.
 
         Args:
             row: whose prompt is there.
             copy: whether a revised plan is taken from the first one.
-            guess: whether more is taken from the last answer to the same pictures, and from habits.
+            guesses: how many decisions at most are taken from habits; unless it is 0, more is also taken
+                from the last answer to the same pictures.
 
         Returns:
             tokens: to be fed.
@@ -52,21 +52,21 @@ class Ahead:
         written, controls = len(row.tokens), row.request.controls
         context = [token.id for token in row.tokens[-_CONTEXT:]]
         copied = iter(row.proposal() if copy else [])
-        answer = self._answers.last(row.prompt.shown, row.draws[0]) if guess else ()
-        repeated, guesses = iter(answer[written:]), 0
+        answer = self._answers.last(row.prompt.shown, row.draws[0]) if guesses else ()
+        repeated, guessed = iter(answer[written:]), 0
         while not cursor.done:
             ids = cursor.allowed().ids
             if len(ids) > 1:
                 decisions.append((len(tokens) - 1, ids))
             token, before = next(copied, None), next(repeated, None)
-            if token is None and guess:
+            if token is None and guesses:
                 ahead = len(tokens) - len(row.pending)
                 if len(ids) == 1:
                     token = int(ids[0])
                 elif before in ids:
                     token = before if ahead < _REPEAT_TOKENS else None
-                elif len(ids) <= _HABITUAL and guesses < _GUESSES:
-                    guesses += 1
+                elif len(ids) <= _HABITUAL and guessed < guesses:
+                    guessed += 1
                     number = uniform(controls.seed, row.draws[0], written + ahead)
                     token = self._habits.likely(context, number if controls.temperature else None)
             if token is None or token not in ids:

@@ -20,7 +20,7 @@ from model.engines.engine import (
     RequestError,
 )
 from model.engines.requests import begin, branch_of, read
-from model.engines.torch.ahead import GUESS_ROWS, Ahead
+from model.engines.torch.ahead import GUESSES, Ahead
 from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
 from model.engines.torch.runner import ROWS_A_PROMPT, Feed, Prompt, Runner
@@ -285,8 +285,8 @@ class Decoder:
         if not self._shortcuts.jump and len(row.pending) > 1:
             return Feed(row.prompt, row.held, row.pending[:1], ())
         speculate = self._shortcuts.speculate
-        guess = speculate and len(self._rows) <= GUESS_ROWS
-        tokens, wanted = self._ahead.feed(row, copy=speculate, guess=guess)
+        guesses = GUESSES // len(self._rows) if speculate else 0
+        tokens, wanted = self._ahead.feed(row, copy=speculate, guesses=guesses)
         return Feed(row.prompt, row.held, tokens, wanted)
 
     def _apply(self, row: Row, feed: Feed, found: list[Logits]) -> list[StepEvent]:

@@ -47,8 +47,9 @@ class TorchSettings:
 
     Attributes:
         rows: draws decoded at once; more wait.
-        prompts: scenes decoded at once, each with memory for all its draws; as many as rows by default,
-            which costs nothing on a CPU, where memory is taken as it is used.
+        prompts: scenes decoded at once, each with memory for the longest responses that its draws could
+            write; by default a sixth of the rows, as most requests ask for six draws. On a CPU memory is
+            taken from the system as it is used.
         clip_bytes: of vision tokens kept for pictures that come again, and as many of keys and values.
         dtype: of weights, keys and values.
         products: what matrix products are worked out in; by default bfloat16 on CPUs that have units for
@@ -70,8 +71,7 @@ class TorchSettings:
         """What a device does best: on a GPU everything is in bfloat16."""
         if device == "cpu":
             return cls(rows=rows)
-        prompts = max(1, rows // _DRAWS_A_SCENE)
-        return cls(rows=rows, prompts=prompts, dtype=torch.bfloat16, products=None, device=device)
+        return cls(rows=rows, dtype=torch.bfloat16, products=None, device=device)
 
 
 class TorchEngine:
@@ -156,7 +156,7 @@ class TorchEngine:
         runner = Runner(
             self._loaded,
             settings.rows,
-            prompts=settings.prompts,
+            prompts=settings.prompts or self._prompts(),
             clip_bytes=settings.clip_bytes,
             products=settings.products,
         )
@@ -173,6 +173,10 @@ class TorchEngine:
             reason = EngineError.because("decoding failed", error)
         for request_id in list(self._listeners):
             self._tell(request_id, Failed(reason))
+
+    def _prompts(self) -> int:
+        settings = self._settings
+        return -(-settings.rows // _DRAWS_A_SCENE) if settings.shortcuts.shared_prompts else settings.rows
 
     def _obey(self, decoder: Decoder) -> bool:
         """Carry out what was asked for; waits only while there is nothing to decode. False ends the loop."""

@@ -18,6 +18,7 @@ from model.driving.plan import (
     PlanError,
     Track,
     parse_plan,
+    plan_changes,
     plan_from_bins,
     plan_iou,
 )
@@ -252,3 +253,19 @@ def test_iou_by_hand() -> None:
     assert plan_iou(one, other) == pytest.approx(32 / 96)
     assert plan_iou(Plan(), other) == 0.0
     assert plan_iou(Plan(), Plan()) == 1.0
+
+
+def test_changes_say_where_plans_differ() -> None:
+    one = parse_plan("- longitudinal\n  - 0.0s-2.0s: Wait\n  - 2.0s-6.4s: Accelerate\n")
+    other = parse_plan(
+        "- longitudinal\n  - 0.0s-3.0s: Wait\n  - 3.0s-6.4s: Accelerate\n- lane\n  - 0.0s-6.4s: Keep Lane\n"
+    )
+    assert plan_changes(one, one) == []
+    assert plan_changes(one, other) == [
+        ("longitudinal", 20, 30, "Accelerate", "Wait"),
+        ("lane", 0, 64, None, "Keep Lane"),
+    ]
+    assert [change[3:] for change in plan_changes(other, one)] == [
+        ("Wait", "Accelerate"),
+        ("Keep Lane", None),
+    ]

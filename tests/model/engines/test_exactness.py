@@ -1,14 +1,15 @@
 """The gate: no shortcut, batch, arrival, cancellation or chunk changes a response. In float64.
 
-`LOOKTWICE_EXACTNESS_MIXES=2000 pytest -s tests/model/engines/test_exactness.py` looks longer, and
-`LOOKTWICE_EXACTNESS_SEED=7` at other mixes.
+`LOOKTWICE_EXACTNESS_MIXES=2000 pytest -s tests/model/engines/test_exactness.py` looks longer,
+`LOOKTWICE_EXACTNESS_SEED=7` at other mixes, and `LOOKTWICE_EXACTNESS_CHECKPOINT=model/bundled/looktwice-nano`
+at a trained network, whose responses are shorter.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +23,17 @@ from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thin
 from model.engines.torch.decoder import Decoder, Failed, Shortcuts
 from model.engines.torch.runner import Runner
 from model.network.checkpoint import Loaded, load
-from tests.checkpoints import noisy_scene
+from tests.checkpoints import noisy_scene, write_untrained
 from tests.model.engines.reference import exactly, reference_draws
 
 pytestmark = pytest.mark.filterwarnings("ignore:Generating overly large repr")
 
 MIXES = int(os.environ.get("LOOKTWICE_EXACTNESS_MIXES", "8"))
+REQUESTS, ROWS = ((1, 4), (10, 20)) if MIXES <= 100 else ((4, 16), (12, 64))
+"""Of a mix; in a longer run many draws share the time of a pass."""
+CHECKPOINT = os.environ.get("LOOKTWICE_EXACTNESS_CHECKPOINT")
+TOGETHER = 6
+"""Mixes whose plain decoding is one batch: a token a pass takes as long for a hundred draws as for ten."""
 SEED = int(os.environ.get("LOOKTWICE_EXACTNESS_SEED", "0"))
 SCENES = [noisy_scene(index, route=index % 2 == 1) for index in range(4)]
 
@@ -41,10 +47,20 @@ class Arrival:
     cancelled: int | None
 
 
+@dataclass(frozen=True)
+class Mix:
+    """Requests, and the decoder that serves them."""
+
+    arrivals: list[Arrival]
+    shortcuts: Shortcuts
+    rows: int
+    chunk: int
+
+
 @st.composite
 def arrivals(draw: st.DrawFn) -> list[Arrival]:
     found = []
-    for index in range(draw(st.integers(1, 4))):
+    for index in range(draw(st.integers(*REQUESTS))):
         format = draw(st.sampled_from(["cf_vla", "cf_vla", "traj_only"]))
         thinking: Thinking = draw(st.sampled_from(["adaptive", "adaptive", "always", "never"]))
         prefill = None
@@ -74,12 +90,19 @@ def arrivals(draw: st.DrawFn) -> list[Arrival]:
     return found
 
 
-shortcuts = st.builds(Shortcuts, **{field.name: st.booleans() for field in fields(Shortcuts)})
+mixes = st.builds(
+    Mix,
+    arrivals(),
+    st.builds(Shortcuts, **{field.name: st.booleans() for field in fields(Shortcuts)}),
+    st.integers(*ROWS),
+    st.sampled_from([7, 64, 256]),
+)
 
 
 @pytest.fixture(scope="module")
-def exact(untrained_checkpoint: Path) -> Loaded:
-    return exactly(load(untrained_checkpoint, dtype=torch.float64))
+def exact(tmp_path_factory: pytest.TempPathFactory) -> Loaded:
+    folder = CHECKPOINT or write_untrained(tmp_path_factory.mktemp("narrow") / "untrained", narrow=True)
+    return exactly(load(Path(folder), dtype=torch.float64))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -111,36 +134,43 @@ def decode(decoder: Decoder, mix: list[Arrival]) -> dict[tuple[str, int], Draw]:
 compared = 0
 
 
-def plainly(exact: Loaded, mix: list[Arrival]) -> dict[tuple[str, int], Draw]:
+def plainly(exact: Loaded, requests: list[PlanRequest]) -> dict[tuple[str, int], Draw]:
     """What the decoder without shortcuts writes for requests that arrive together and stay."""
-    decoder = Decoder(Runner(exact, 30), Shortcuts.none(), clock=lambda: 0.0)
-    return decode(decoder, [Arrival(arrival.request, 0, None) for arrival in mix])
+    rows = sum(2 * request.controls.n for request in requests)
+    decoder = Decoder(Runner(exact, rows, prompts=rows // 2), Shortcuts.none(), clock=lambda: 0.0)
+    return decode(decoder, [Arrival(request, 0, None) for request in requests])
+
+
+def named(mix: int, request: PlanRequest) -> PlanRequest:
+    return replace(request, request_id=f"{mix}.{request.request_id}")
 
 
 @seed(SEED)
 @settings(
-    max_examples=MIXES,
+    max_examples=-(-MIXES // TOGETHER),
     deadline=None,
     derandomize=True,
     suppress_health_check=list(HealthCheck),
     database=None,
 )
-@given(mix=arrivals(), shortcuts=shortcuts, rows=st.integers(10, 20), chunk=st.sampled_from([7, 64, 256]))
-def test_nothing_that_makes_it_fast_changes_a_response(
-    exact: Loaded, mix: list[Arrival], shortcuts: Shortcuts, rows: int, chunk: int
-) -> None:
+@given(together=st.lists(mixes, min_size=TOGETHER, max_size=TOGETHER))
+def test_nothing_that_makes_it_fast_changes_a_response(exact: Loaded, together: list[Mix]) -> None:
     global compared
-    runner = Runner(exact, rows, clip_bytes=1 << 20)
-    fast = decode(Decoder(runner, shortcuts, prompt_chunk=chunk, clock=lambda: 0.0), mix)
-    plain = plainly(exact, mix)
-    assert {arrival.request.request_id for arrival in mix if arrival.cancelled is None} <= {
-        name for name, _ in fast
-    }
-    for key, draw in fast.items():
-        same(draw, plain[key])
-    compared += len(fast)
+    plain = plainly(
+        exact, [named(number, each.request) for number, mix in enumerate(together) for each in mix.arrivals]
+    )
+    for number, mix in enumerate(together):
+        runner = Runner(exact, mix.rows, clip_bytes=1 << 20)
+        decoder = Decoder(runner, mix.shortcuts, prompt_chunk=mix.chunk, clock=lambda: 0.0)
+        fast = decode(decoder, mix.arrivals)
+        assert {each.request.request_id for each in mix.arrivals if each.cancelled is None} <= {
+            name for name, _ in fast
+        }
+        for (name, index), draw in fast.items():
+            same(draw, plain[f"{number}.{name}", index])
+        compared += len(fast)
     if MIXES > 100:
-        print(f"\r{compared} responses compared", end="", flush=True)
+        print(f"{compared} responses compared, no difference", flush=True)
 
 
 @seed(SEED)
@@ -153,7 +183,7 @@ def test_nothing_that_makes_it_fast_changes_a_response(
 )
 @given(mix=arrivals())
 def test_the_decoder_without_shortcuts_is_the_one_of_transformers(exact: Loaded, mix: list[Arrival]) -> None:
-    draws = plainly(exact, mix)
+    draws = plainly(exact, [each.request for each in mix])
     for reference in reference_draws(exact, mix[0].request):
         same(draws[mix[0].request.request_id, reference.index], reference)
 
