@@ -129,7 +129,11 @@ class ReflectControls(Asked):
     temperature: float = Field(default=1.0, ge=0, le=2, description="0 takes the likeliest allowed token.")
     top_p: float = Field(default=1.0, gt=0, le=1, description="Nucleus mass; 1 keeps all allowed tokens.")
     seed: int = Field(
-        default=0, ge=0, le=MAX_SEED, description="The same request and seed give the same draws."
+        default=0,
+        ge=0,
+        le=MAX_SEED,
+        description="The same request and seed give the same draws, "
+        "but for rounding where the engine multiplies in bfloat16.",
     )
     deadline_ms: int | None = Field(
         default=None,

@@ -17,6 +17,7 @@ from PIL import Image
 from clients import wire
 from clients.planner import Patience, PlannerClient
 from model.bundled import CHECKPOINT, SCENES
+from model.driving.plan import parse_plan
 from model.driving.scene import split_of_seed
 from model.driving.scene_store import read_scenes
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
@@ -118,11 +119,26 @@ def test_broken_json_is_a_problem_and_disturbs_nobody(
     assert planner.plan(BUNDLED[0].scene, wire.Controls(n=1)).draws
 
 
-def test_the_readmes_request_is_answered(served: Served[TorchEngine]) -> None:
-    body = (Path(__file__).parents[2] / "docs" / "examples" / "plan-request.json").read_bytes()
-    answer = served.http.post("/v1/plan", content=body, headers={"content-type": "application/json"})
+@pytest.mark.parametrize(("name", "draws"), [("plan", 6), ("reflect", 2)])
+def test_the_readmes_requests_are_answered(served: Served[TorchEngine], name: str, draws: int) -> None:
+    body = (Path(__file__).parents[2] / "docs" / "examples" / f"{name}-request.json").read_bytes()
+    answer = served.http.post(f"/v1/{name}", content=body, headers={"content-type": "application/json"})
     assert answer.status_code == 200
-    assert len(answer.json()["draws"]) == 6
+    assert len(answer.json()["draws"]) == draws
+
+
+def test_a_given_plan_is_looked_at(planner: PlannerClient) -> None:
+    given = parse_plan("- longitudinal\n  - 0.0s-6.4s: Reverse\n")
+    controls = wire.ReflectControls(n=3, thinking="always")
+    result = planner.reflect(BUNDLED[0].scene, given, controls)
+    assert result.plan == given
+    for look in result.draws:
+        assert look.thinking
+        assert look.revised_plan is not None
+        assert (look.decision == "revise") == (look.revised_plan != given) == bool(look.changes)
+    kept = planner.reflect(BUNDLED[0].scene, given, wire.ReflectControls(n=2, thinking="never"))
+    assert [look.decision for look in kept.draws] == ["keep", "keep"]
+    assert kept.think_probability == pytest.approx(result.think_probability, abs=0.05)
 
 
 def test_metrics_count_tokens_by_section(served: Served[TorchEngine], planner: PlannerClient) -> None:
