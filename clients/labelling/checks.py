@@ -1,0 +1,63 @@
+"""What a reflection must be before a model is trained on it, whoever wrote it."""
+
+from __future__ import annotations
+
+import re
+from typing import Final, Literal, NamedTuple
+
+from clients.labelling.direction import agrees
+from clients.labelling.leaks import find_leaks
+from model.driving.plan import Plan
+
+MOST_WORDS: Final = 80
+"""CF-VLA section 8: one short paragraph."""
+
+Check = Literal["form", "length", "leak", "anchor", "direction"]
+
+_MARKUP: Final = re.compile(
+    r"[*`#|<>\[\]{}~\\]|^\s*(?:[-+\u2022]|\d+[.)])\s|__|https?://|"
+    r"\b(?:Meta Actions|Thinking|Action|Reasoning|Reflection|Note):"
+)
+_SENTENCE_END: Final = re.compile(r"[.!?]$")
+_CUE: Final = re.compile(
+    r"\b(?:vehicles?|cars?|vans?|trucks?|bus(?:es)?|motorcycl\w+|cyclists?|bicycles?|leaders?|traffic|queues?|"
+    r"brake lights?|tail lights?|pedestrians?|persons?|people|walkers?|cones?|barriers?|obstacles?|"
+    r"lane (?:lines?|markings?)|markings?|lanes?|curves?|bends?|junctions?|intersections?|crossings?|"
+    r"crosswalks?|kerbs?|shoulder|roads?|gaps?|lights?|signs?|signals?|construction|closure|horizon)\b",
+    re.IGNORECASE,
+)
+
+
+class FailedCheck(NamedTuple):
+    """Why a reflection is not taken; ``detail`` tells its writer what to change."""
+
+    check: Check
+    detail: str
+
+
+def check_reflection(text: str, predicted: Plan, expert: Plan) -> list[FailedCheck]:
+    """What is wrong with a reflection on ``predicted`` that leads to ``expert``; empty where nothing is.
+
+    Args:
+        text: of a teacher.
+        predicted: the model's own plan, which the text looks at.
+        expert: the plan that comes behind the text.
+    """
+    failed: list[FailedCheck] = []
+    if not text.strip():
+        return [FailedCheck("form", "write one short paragraph")]
+    if text != text.strip() or text.splitlines() != [text] or not text.isprintable():
+        failed.append(FailedCheck("form", "write one paragraph without line breaks"))
+    if found := _MARKUP.search(text):
+        failed.append(FailedCheck("form", f"write plain sentences, without {found.group().strip()!r}"))
+    if not _SENTENCE_END.search(text.strip()):
+        failed.append(FailedCheck("form", "end with a full sentence"))
+    if (words := len(text.split())) > MOST_WORDS:
+        failed.append(FailedCheck("length", f"write at most {MOST_WORDS} words; these are {words}"))
+    for leak in find_leaks(text):
+        failed.append(FailedCheck("leak", f"do not say {leak.phrase!r}: it hints at {leak.kind}"))
+    if not _CUE.search(text):
+        failed.append(FailedCheck("anchor", "name what is to be seen on the road that asks for the change"))
+    if not agrees(text, predicted, expert):
+        failed.append(FailedCheck("direction", "the text asks for another change than the plan needs"))
+    return failed

@@ -1,0 +1,143 @@
+"""Which way a reflection wants a plan to change, as far as words tell.
+
+A clause speaks of an action ("accelerate", "ease off", "move left"); it speaks against it where it tells a
+bad consequence of it ("accelerating would …", "too early", "instead of …"). What is spoken against counts for
+the opposite.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final, Literal
+
+from model.driving.plan import TICKS, Plan
+
+Change = Literal["slower", "faster", "left", "right", "straight", "lane_left", "lane_right", "keep_lane"]
+
+_LEVEL: Final = {"Accelerate": 1.0, "Keep Speed": 0.0, "Decelerate": -1.0, "Wait": -1.0, "Reverse": -1.0}
+MIN_TICKS: Final = 5
+"""Half a second, the shortest that the labeller calls an action of its own."""
+
+_SLOWER: Final = (
+    r"slow(?:s|ing|er)?(?: down| sooner| early)?|eas(?:e|es|ing) off|brak(?:e|es|ing)(?! lights?)|"
+    r"decelerat\w+|hold(?:ing)? back|wait(?:s|ing)?|stop(?:s|ping)?|yield(?:s|ing)?|back(?:ing)? off|"
+    r"come to a (?:stop|halt|standstill)|(?:reduce|lower|shed|lose)\w* (?:my |the )?speed|less speed|"
+    r"stay(?:ing)? behind|give way|keep(?:ing)? (?:more |a larger |a safe )?(?:distance|gap)|"
+    r"remain(?:ing)? stopped|stay(?:ing)? (?:put|stopped)|lift(?:ing)? off"
+)
+_FASTER: Final = (
+    r"accelerat\w+|speed(?:s|ing)? up|pick(?:s|ing)? up speed|pull(?:s|ing)? away|get(?:ting)? going|"
+    r"mov(?:e|es|ing) off|set(?:ting)? off|gain(?:s|ing)? speed|increas\w+ (?:my |the )?speed|more speed|"
+    r"mak(?:e|es|ing) progress|driv(?:e|es|ing) on|go(?:ing)? faster|rais\w+ (?:my |the )?speed"
+)
+_LEFT: Final = r"(?:turn|bend|steer|curv)\w*(?: \w+){0,2} left|left(?: hand)? (?:turn|bend|curve)\w*"
+_RIGHT: Final = r"(?:turn|bend|steer|curv)\w*(?: \w+){0,2} right|right(?: hand)? (?:turn|bend|curve)\w*"
+_STRAIGHT: Final = r"straight(?:en\w*)?"
+_LANE: Final = r"(?:lane change|chang\w+(?: \w+){0,2} lanes?|mov\w+(?: \w+){0,3} lane|merg\w+)"
+_LANE_LEFT: Final = rf"{_LANE}(?: \w+){{0,3}} left|left lane change\w*|mov\w+(?: \w+){{0,2}} left|left lane"
+_LANE_RIGHT: Final = (
+    rf"{_LANE}(?: \w+){{0,3}} right|right lane change\w*|mov\w+(?: \w+){{0,2}} right|right lane"
+)
+_KEEP_LANE: Final = r"(?:stay|keep|remain)\w*(?: \w+){0,2} (?:in )?(?:my |this |the |our |its )?(?:\w+ )?lane"
+
+_WORDS: Final[dict[Change, re.Pattern[str]]] = {
+    "slower": re.compile(rf"\b(?:{_SLOWER})\b"),
+    "faster": re.compile(rf"\b(?:{_FASTER})\b"),
+    "left": re.compile(rf"\b(?:{_LEFT})\b"),
+    "right": re.compile(rf"\b(?:{_RIGHT})\b"),
+    "straight": re.compile(rf"\b(?:{_STRAIGHT})\b"),
+    "lane_left": re.compile(rf"\b(?:{_LANE_LEFT})\b"),
+    "lane_right": re.compile(rf"\b(?:{_LANE_RIGHT})\b"),
+    "keep_lane": re.compile(rf"\b(?:{_KEEP_LANE})\b"),
+}
+_OPPOSITES: Final[dict[Change, tuple[Change, ...]]] = {
+    "slower": ("faster",),
+    "faster": ("slower",),
+    "left": ("straight", "right"),
+    "right": ("straight", "left"),
+    "straight": ("left", "right"),
+    "lane_left": ("keep_lane", "lane_right"),
+    "lane_right": ("keep_lane", "lane_left"),
+    "keep_lane": ("lane_left", "lane_right"),
+}
+_CLAUSES: Final = re.compile(
+    r"[.;:!?,]|\b(?:so(?! (?:long|much|far|early|late|fast|hard|soon))|but|therefore|thus|instead(?! of)|"
+    r"which is why|rather than|instead of|while)\b"
+)
+_AGAINST: Final = re.compile(
+    r"\b(?:if|would|could|might|risks?|too|not|no|never|without|avoid\w*|premature\w*|needless\w*|unnecessar\w+|"
+    r"wrong\w*|leaves? (?:no|little)|instead of|rather than|my plan|i plan\w*|the plan|planned|keeps? me)\b"
+)
+
+
+def wanted_changes(before: Plan, after: Plan) -> list[frozenset[Change]]:
+    """What ``after`` does otherwise than ``before``, track by track: the changes that a text may name.
+
+    Tracks that differ for less than half a second are left out, and those whose change has no direction.
+    """
+    found: list[frozenset[Change]] = []
+    levels = [
+        sum(_LEVEL[plan.word_at("longitudinal", tick) or "Keep Speed"] for tick in range(TICKS))
+        for plan in (before, after)
+    ]
+    if abs(levels[1] - levels[0]) >= MIN_TICKS:
+        found.append(frozenset({"slower" if levels[1] < levels[0] else "faster"}))
+    lateral = _more(
+        before, after, "lateral", {"Left Turn": "left", "Right Turn": "right", "Straight": "straight"}
+    )
+    if lateral:
+        found.append(lateral)
+    lane = _more(
+        before,
+        after,
+        "lane",
+        {"Left Lane Change": "lane_left", "Right Lane Change": "lane_right", "Keep Lane": "keep_lane"},
+    )
+    if lane:
+        found.append(lane)
+    return found
+
+
+def told_changes(text: str) -> dict[Change, int]:
+    """How often a text speaks for each change, less how often it speaks against it."""
+    told = dict.fromkeys(_WORDS, 0)
+    plain = " ".join(text.casefold().replace("-", " ").split())
+    start = 0
+    for end in [*_CLAUSES.finditer(plain), None]:
+        clause = plain[start : end.start() if end else len(plain)]
+        against = bool(_AGAINST.search(clause)) or plain[:start].endswith(("rather than", "instead of"))
+        for change, pattern in _WORDS.items():
+            count = len(pattern.findall(clause))
+            told[change] += -count if against else count
+        start = end.end() if end else len(plain)
+    return told
+
+
+def agrees(text: str, before: Plan, after: Plan) -> bool:
+    """Whether a text speaks for one of the changes from ``before`` to ``after``, and against none of them.
+
+    Speaking against the opposite of a change is speaking for it.
+    """
+    told = told_changes(text)
+    spoken = False
+    for changes in wanted_changes(before, after):
+        score = sum(told[change] for change in changes)
+        others = {other for change in changes for other in _OPPOSITES[change]} - changes
+        score -= sum(told[other] for other in others)
+        if score < 0:
+            return False
+        spoken |= score > 0
+    return spoken or not wanted_changes(before, after)
+
+
+def _more(before: Plan, after: Plan, group: str, names: dict[str, Change]) -> frozenset[Change]:
+    """The words of a track that ``after`` says for longer."""
+    more: set[Change] = set()
+    for word, change in names.items():
+        ticks = [
+            sum(plan.word_at(group, tick) == word for tick in range(TICKS))  # type: ignore[arg-type]
+            for plan in (before, after)
+        ]
+        if ticks[1] - ticks[0] >= MIN_TICKS:
+            more.add(change)
+    return frozenset(more)

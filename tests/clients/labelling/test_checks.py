@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import pytest
+
+from clients.labelling.checks import MOST_WORDS, check_reflection
+from clients.labelling.direction import agrees, wanted_changes
+from model.driving.plan import Plan, track_from_words
+
+
+def plan(longitudinal: str = "Keep Speed", lateral: str = "Straight", lane: str = "Keep Lane") -> Plan:
+    """A plan of words; ``A|B`` changes from A to B after 3 s."""
+    tracks = {}
+    for group, words in (("longitudinal", longitudinal), ("lateral", lateral), ("lane", lane)):
+        first, _, second = words.partition("|")
+        tracks[group] = track_from_words([first] * 30 + [second or first] * 34)
+    return Plan(**tracks)
+
+
+FAST, SLOW = plan("Keep Speed|Accelerate"), plan("Keep Speed|Decelerate")
+GOOD = (
+    "The van ahead in my lane is close and its brake lights are on. Accelerating from 3.0s would close the "
+    "gap, so I should ease off now and keep a safe distance."
+)
+
+
+def test_a_grounded_reflection_passes() -> None:
+    assert check_reflection(GOOD, FAST, SLOW) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "check"),
+    [
+        ("", "form"),
+        ("  " + GOOD, "form"),
+        (GOOD.replace(". ", ".\n"), "form"),
+        (GOOD.replace(". ", ".\u2028"), "form"),
+        ("- " + GOOD, "form"),
+        ("1. " + GOOD, "form"),
+        ("**Slow down.** " + GOOD, "form"),
+        ("Reasoning: " + GOOD, "form"),
+        (GOOD[:-1], "form"),
+        (GOOD + " It is so." * 20, "length"),
+        (GOOD.replace("The van", "As the expert knows, the van"), "leak"),
+        ("Accelerating is too risky here, so I should ease off now.", "anchor"),
+        ("The lane ahead is clear, so I should speed up.", "direction"),
+    ],
+)
+def test_what_is_wrong_is_named(text: str, check: str) -> None:
+    assert check in {failed.check for failed in check_reflection(text, FAST, SLOW)}
+
+
+def test_the_limit_is_eighty_words() -> None:
+    filler = GOOD + " It is so." * ((MOST_WORDS - len(GOOD.split())) // 3)
+    while len(filler.split()) < MOST_WORDS:
+        filler = "Well " + filler
+    assert len(filler.split()) == MOST_WORDS
+    assert check_reflection(filler, FAST, SLOW) == []
+    assert [failed.check for failed in check_reflection("Well " + filler, FAST, SLOW)] == ["length"]
+
+
+@pytest.mark.parametrize(
+    ("text", "before", "after"),
+    [
+        ("The car ahead brakes, so slow down.", FAST, SLOW),
+        ("With a queue ahead, accelerating would be unsafe.", FAST, SLOW),
+        ("The road is clear; braking for so long is unnecessary, pick up speed instead.", SLOW, FAST),
+        ("The junction is free and waiting on would block the traffic, so pull away.", plan("Wait"), FAST),
+        ("The road bends left, so turn left.", plan(), plan(lateral="Left Turn")),
+        ("The road runs straight, so turning right is wrong.", plan(lateral="Right Turn"), plan()),
+        ("Cones close my lane, so change to the left lane.", plan(), plan(lane="Left Lane Change")),
+        ("A car is beside me, so stay in this lane.", plan(lane="Right Lane Change"), plan()),
+        ("All looks fine on this road.", plan(), plan()),
+    ],
+)
+def test_texts_that_go_the_way_of_the_plan_agree(text: str, before: Plan, after: Plan) -> None:
+    assert agrees(text, before, after)
+
+
+@pytest.mark.parametrize(
+    ("text", "before", "after"),
+    [
+        ("The road is clear, so accelerate.", FAST, SLOW),
+        ("A car brakes ahead, so slow down.", SLOW, FAST),
+        ("The road bends right, so turn right.", plan(), plan(lateral="Left Turn")),
+        ("The road is wide and empty.", FAST, SLOW),
+        ("Cones close the right, so stay in this lane.", plan(), plan(lane="Left Lane Change")),
+        ("Change to the right lane, it is free.", plan(), plan(lane="Left Lane Change")),
+        (
+            "A van is ahead, so slow down and stay in this lane.",
+            FAST,
+            plan("Decelerate", lane="Left Lane Change"),
+        ),
+    ],
+)
+def test_texts_that_go_another_way_do_not(text: str, before: Plan, after: Plan) -> None:
+    assert not agrees(text, before, after)
+
+
+def test_short_differences_ask_for_nothing() -> None:
+    nearly = Plan(longitudinal=track_from_words(["Keep Speed"] * 60 + ["Decelerate"] * 4))
+    assert wanted_changes(Plan(longitudinal=track_from_words(["Keep Speed"] * 64)), nearly) == []
+    assert wanted_changes(FAST, SLOW) == [{"slower"}]
+    both = wanted_changes(plan(lane="Left Lane Change"), plan("Accelerate", lane="Right Lane Change"))
+    assert both == [{"faster"}, {"lane_right"}]
