@@ -32,8 +32,11 @@ MAX_SEED: Final = 2**53 - 1
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Milliseconds = Annotated[float, Field(ge=0)]
+Nearby = Annotated[float, Field(ge=-100_000, le=100_000, allow_inf_nan=False)]
+Length = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
 Pose = Annotated[list[Finite], Field(min_length=4, max_length=4, description="x, y, z in m, heading in rad")]
 Point = Annotated[list[Finite], Field(min_length=2, max_length=2, description="x, y in m")]
+NearbyPoint = Annotated[list[Nearby], Field(min_length=2, max_length=2, description="x, y in m")]
 History = Annotated[
     list[Pose],
     Field(
@@ -264,6 +267,60 @@ class ReflectResponse(Answered):
     timing: Timing
 
 
+class Agent(Answered):
+    """Another road user or obstacle of a labelled scene, as an oriented box over past and future."""
+
+    agent_id: int
+    kind: str = Field(description="vehicle, pedestrian, cone or barrier.")
+    length_m: Length
+    width_m: Length
+    poses: list[Annotated[list[Nearby], Field(min_length=3, max_length=3)] | None] = Field(
+        min_length=80,
+        max_length=80,
+        description="80 poses (x, y in m, heading in rad) at 10 Hz, row 15 is now; null where absent.",
+    )
+
+
+class Annotations(Asked):
+    """What is known about a scene besides what its cameras show; as GET /v1/scenes/ID gives it."""
+
+    agents: list[Agent] = Field(max_length=500, description="Who and what is around.")
+    lane_lines: list[Annotated[list[NearbyPoint], Field(min_length=2, max_length=2000)]] = Field(
+        max_length=500, description="Centre lines of the lanes around."
+    )
+
+
+class LabelRequest(Asked):
+    """Body of POST /v1/label."""
+
+    scene: Scene
+    predicted_plan: PlanGiven = Field(description="The plan that a model made.")
+    expert_plan: PlanGiven = Field(
+        description="The better plan, which the answer leads to without naming it."
+    )
+    annotations: Annotations | None = Field(
+        default=None, description="The built-in teacher needs them; others look at the pictures."
+    )
+    seed: int = Field(default=0, ge=0, le=MAX_SEED, description="Another one, other words.")
+
+
+class TeacherName(Answered):
+    """Who wrote a reflection."""
+
+    name: str
+    revision: str = Field(description="Changes when it would write something else.")
+
+
+class LabelResponse(Answered):
+    """Answer of POST /v1/label: a reflection that passed all checks."""
+
+    request_id: str
+    reflection: str = Field(description="One paragraph of at most 80 words.")
+    teacher: TeacherName
+    attempts: int = Field(ge=1, description="How often the teacher was asked.")
+    failed_checks: list[str] = Field(description="What was wrong with its earlier answers.")
+
+
 class ModelCard(Answered):
     """What a loaded checkpoint is."""
 
@@ -283,18 +340,6 @@ class ModelList(Answered):
     """Answer of GET /v1/models."""
 
     models: list[ModelCard]
-
-
-class Agent(Answered):
-    """Another road user or obstacle of a labelled scene, as an oriented box over past and future."""
-
-    agent_id: int
-    kind: str = Field(description="vehicle, pedestrian, cone or barrier.")
-    length_m: float
-    width_m: float
-    poses: list[Annotated[list[float], Field(min_length=3, max_length=3)] | None] = Field(
-        description="80 poses (x, y in m, heading in rad) at 10 Hz, row 15 is now; null where absent."
-    )
 
 
 class LabelledScene(Answered):

@@ -8,6 +8,8 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
+from clients.labelling.teachers.rules import RuleTeacher
+from clients.labelling.teachers.teacher import Teacher
 from model.engines.engine import Engine
 from service.body_limit import BodyLimit
 from service.errors import install_error_handlers
@@ -26,12 +28,18 @@ Ego frame: x forward, y left, z up, metres; heading in radians, counter-clockwis
 problem document (RFC 9457) with a stable `type`; every answer carries `X-Request-ID`."""
 
 
-def create_app(engine: Engine, settings: Settings, registry: CollectorRegistry | None = None) -> FastAPI:
+def create_app(
+    engine: Engine,
+    settings: Settings,
+    registry: CollectorRegistry | None = None,
+    teacher: Teacher = RuleTeacher(),
+) -> FastAPI:
     """The service over ``engine``, which it starts and stops.
 
     Args:
         engine: not yet started.
         settings: see `Settings`.
+        teacher: writes the reflections of /v1/label.
         registry: where metrics are registered; a new one by default, so that apps do not share counts.
     """
     configure_logging(settings.log_format)
@@ -58,7 +66,7 @@ def create_app(engine: Engine, settings: Settings, registry: CollectorRegistry |
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
     app.add_middleware(Around, metrics=metrics)
     install_error_handlers(app)
-    app.include_router(make_router(Parts(engine, settings, metrics, lifecycle)))
+    app.include_router(make_router(Parts(engine, settings, metrics, lifecycle, teacher)))
     add_inspector(app)
     describe(app)
     return app

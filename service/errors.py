@@ -42,6 +42,8 @@ _KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], Kind]]] = (
     (("scene", "history"), INVALID_HISTORY),
     (("scene", "route"), INVALID_ROUTE),
     (("plan",), INVALID_PLAN),
+    (("predicted_plan",), INVALID_PLAN),
+    (("expert_plan",), INVALID_PLAN),
     (("controls", "prefill"), INVALID_PLAN),
     (("controls",), INVALID_CONTROLS),
 )

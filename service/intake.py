@@ -60,15 +60,16 @@ def engine_request(
     if missing := [camera for camera in card.cameras if camera not in cameras]:
         raise at(MISSING_CAMERA, "/scene/clips", f"{card.name} also needs {', '.join(missing)}")
     if isinstance(asked, wire.ReflectRequest):
-        controls = _controls(asked.controls, _plan(asked.plan, "/plan"))
+        controls = _controls(asked.controls, plan_of(asked.plan, "/plan"))
     else:
         given = asked.controls.prefill
-        prefill = None if given is None else _plan(given, "/controls/prefill")
+        prefill = None if given is None else plan_of(given, "/controls/prefill")
         controls = _controls(asked.controls, prefill)
-    return PlanRequest(engine_id, _scene(asked.scene), asked.format, controls)
+    return PlanRequest(engine_id, scene_of(asked.scene), asked.format, controls)
 
 
-def _scene(asked: wire.Scene) -> Scene:
+def scene_of(asked: wire.Scene) -> Scene:
+    """A scene; raises `ProblemError` for pictures and geometry that cannot be accepted."""
     history = _history(asked.history)
     try:
         route = None if asked.route is None else check_route(asked.route)
@@ -136,7 +137,8 @@ def _controls(asked: wire.ReflectControls, prefill: Plan | None) -> Controls:
         raise at(INVALID_CONTROLS, "/controls", str(error)) from None
 
 
-def _plan(asked: wire.PlanGiven, pointer: str) -> Plan:
+def plan_of(asked: wire.PlanGiven, pointer: str) -> Plan:
+    """A given plan; raises `ProblemError` where it breaks the plan language."""
     try:
         return parse_plan(asked) if isinstance(asked, str) else _plan_of_tracks(asked)
     except PlanError as error:

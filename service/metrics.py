@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
@@ -69,6 +70,15 @@ class Metrics:
             buckets=PROBABILITY_BUCKETS,
             registry=registry,
         )
+        self._labels = Counter(
+            "looktwice_labels", "Reflections written by a teacher.", ["teacher"], registry=registry
+        )
+        self._label_checks_failed = Counter(
+            "looktwice_label_checks_failed",
+            "Checks that answers of a teacher did not pass.",
+            ["teacher", "check"],
+            registry=registry,
+        )
         self._think_probability = Histogram(
             "looktwice_think_probability",
             "Probability of a second look at the branch.",
@@ -84,6 +94,13 @@ class Metrics:
     def model_loaded(self, card: ModelCard) -> None:
         """Show which weights answer."""
         self._model.labels(card.name, card.revision, card.engine).set(1)
+
+    def label_asked(self, teacher: str, failed: Iterable[str], *, written: bool) -> None:
+        """Count one question to a teacher, and the checks that its answers failed."""
+        if written:
+            self._labels.labels(teacher).inc()
+        for check in failed:
+            self._label_checks_failed.labels(teacher, check).inc()
 
     def draw_finished(self, draw: Draw, thinking: Thinking, endpoint: str) -> None:
         """Count one draw."""

@@ -13,9 +13,11 @@ from fastapi.openapi.models import Example
 from starlette.responses import Response
 
 import clients.wire as wire
+from clients.labelling.teachers.teacher import Teacher
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.engines.engine import Engine
 from service.examples import example_reflection, example_request
+from service.labelling import label
 from service.lifecycle import Lifecycle
 from service.metrics import Metrics
 from service.openapi import Responses, problems
@@ -32,7 +34,9 @@ from service.problems import (
     INVALID_REQUEST,
     INVALID_ROUTE,
     INVALID_SCENE_FILE,
+    LABEL_REFUSED,
     MISSING_CAMERA,
+    NEEDS_ANNOTATIONS,
     NOT_READY,
     REFUSED,
     SCENES_UNREADABLE,
@@ -68,6 +72,7 @@ class Parts:
     settings: Settings
     metrics: Metrics
     lifecycle: Lifecycle
+    teacher: Teacher
 
 
 def make_router(parts: Parts) -> APIRouter:
@@ -97,6 +102,19 @@ def _add_planning(router: APIRouter, parts: Parts) -> None:
     ) -> Any:
         """A second look at a given plan: keep it or revise it, why, and the trajectory that follows."""
         return await _while_connected(request, parts, asked, reflect)
+
+    @router.post(
+        "/v1/label",
+        tags=["labelling"],
+        responses=problems(
+            *(INVALID_JSON, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE, INVALID_REQUEST, UNKNOWN_FIELD),
+            *(INVALID_CLIP, UNKNOWN_CAMERA, INVALID_IMAGE, INVALID_HISTORY, INVALID_ROUTE, INVALID_PLAN),
+            *(NEEDS_ANNOTATIONS, LABEL_REFUSED),
+        ),
+    )
+    async def write_label(request: Request, asked: wire.LabelRequest) -> wire.LabelResponse:
+        """Why a plan is less good than another: a teacher's paragraph, checked, to train on."""
+        return await label(asked, parts.teacher, parts.metrics, request.state.request_id)
 
     @router.get("/v1/models", tags=["planning"], responses=problems(NOT_READY, ENGINE_FAILED))
     async def models() -> wire.ModelList:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,7 +46,8 @@ def write_untrained(folder: Path, *, narrow: bool = False) -> Path:
         model = LookTwiceVla(config)
         write_code_embeddings(model, codec, vocabulary)
         if narrow:
-            embeddings = model.get_input_embeddings().weight.detach()
+            network: Any = model
+            embeddings = network.get_input_embeddings().weight.detach()
             for text in ("6", "\n"):
                 embeddings[vocabulary.encode(text)[0]] *= 6
     save(folder, model, vocabulary, codec)

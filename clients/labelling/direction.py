@@ -33,11 +33,9 @@ _FASTER: Final = (
 _LEFT: Final = r"(?:turn|bend|steer|curv)\w*(?: \w+){0,2} left|left(?: hand)? (?:turn|bend|curve)\w*"
 _RIGHT: Final = r"(?:turn|bend|steer|curv)\w*(?: \w+){0,2} right|right(?: hand)? (?:turn|bend|curve)\w*"
 _STRAIGHT: Final = r"straight(?:en\w*)?"
-_LANE: Final = r"(?:lane change|chang\w+(?: \w+){0,2} lanes?|mov\w+(?: \w+){0,3} lane|merg\w+)"
-_LANE_LEFT: Final = rf"{_LANE}(?: \w+){{0,3}} left|left lane change\w*|mov\w+(?: \w+){{0,2}} left|left lane"
-_LANE_RIGHT: Final = (
-    rf"{_LANE}(?: \w+){{0,3}} right|right lane change\w*|mov\w+(?: \w+){{0,2}} right|right lane"
-)
+_MOVE: Final = r"(?:mov|chang|merg|pull|shift|switch)(?:e|es|ing|ge|ging)?(?: \w+){0,3}"
+_LANE_LEFT: Final = rf"{_MOVE} left(?: lane)?|left lane change\w*"
+_LANE_RIGHT: Final = rf"{_MOVE} right(?: lane)?|right lane change\w*"
 _KEEP_LANE: Final = r"(?:stay|keep|remain)\w*(?: \w+){0,2} (?:in )?(?:my |this |the |our |its )?(?:\w+ )?lane"
 
 _WORDS: Final[dict[Change, re.Pattern[str]]] = {
@@ -61,8 +59,8 @@ _OPPOSITES: Final[dict[Change, tuple[Change, ...]]] = {
     "keep_lane": ("lane_left", "lane_right"),
 }
 _CLAUSES: Final = re.compile(
-    r"[.;:!?,]|\b(?:so(?! (?:long|much|far|early|late|fast|hard|soon))|but|therefore|thus|instead(?! of)|"
-    r"which is why|rather than|instead of|while)\b"
+    r"[.;:!?,](?=\s|$)|\b(?:so(?! (?:long|much|far|early|late|fast|hard|soon))|but|therefore|thus|"
+    r"instead(?! of)|which is why|rather than|instead of|while)\b"
 )
 _AGAINST: Final = re.compile(
     r"\b(?:if|would|could|might|risks?|too|not|no|never|without|avoid\w*|premature\w*|needless\w*|unnecessar\w+|"

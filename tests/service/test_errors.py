@@ -278,6 +278,8 @@ def test_types_are_stable() -> None:
         "request-refused": 422,
         "invalid-scene-file": 422,
         "internal": 500,
+        "needs-annotations": 422,
+        "label-refused": 502,
         "scenes-unreadable": 500,
         "not-ready": 503,
         "engine-failed": 503,

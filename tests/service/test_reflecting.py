@@ -70,7 +70,7 @@ def test_the_plan_may_come_as_tracks_and_be_a_part_of_one(served: Served, engine
 @pytest.mark.parametrize(
     ("plan", "place"),
     [
-        ("- longitudinal\n  - 0.0s-6.4s: Fly\n", (2, 15)),
+        ("- longitudinal\n  - 0.0s-6.4s: Fly\n", (2, 16)),
         ("- longitudinal\n  - 0.0s-2.0s: Wait\n", (2, None)),
     ],
 )

@@ -1,0 +1,1 @@
+"""Those who explain what is less good about a plan."""

@@ -1,0 +1,74 @@
+"""One question to a teacher, from the parsed body to the checked reflection."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+
+import clients.wire as wire
+from clients.labelling.teachers.teacher import (
+    Question,
+    ReflectionRefused,
+    Teacher,
+    TeacherError,
+    ask,
+)
+from clients.labelling.teachers.view import Surroundings
+from model.driving.scene import AGENT_KINDS, Agent
+from service.intake import plan_of, scene_of
+from service.metrics import Metrics
+from service.problems import INVALID_REQUEST, LABEL_REFUSED, NEEDS_ANNOTATIONS, ProblemError, at
+
+_UNKNOWN_HEIGHT_M = 1.5
+"""The wire has no heights; teachers look at nothing that depends on them."""
+
+
+async def label(
+    asked: wire.LabelRequest, teacher: Teacher, metrics: Metrics, request_id: str
+) -> wire.LabelResponse:
+    """A checked reflection.
+
+    Raises:
+        ProblemError: the request cannot be served; the teacher lacks something or fails the checks.
+    """
+    question = await asyncio.to_thread(_question, asked)
+    try:
+        reflection = await ask(teacher, question)
+    except TeacherError as error:
+        raise ProblemError(NEEDS_ANNOTATIONS, f"{teacher.name}: {error}") from None
+    except ReflectionRefused as error:
+        metrics.label_asked(teacher.name, [each.check for each in error.failed], written=False)
+        raise ProblemError(LABEL_REFUSED, f"{teacher.name}, asked {error.attempts} times: {error}") from None
+    metrics.label_asked(teacher.name, [each.check for each in reflection.failed], written=True)
+    return wire.LabelResponse(
+        request_id=request_id,
+        reflection=reflection.text,
+        teacher=wire.TeacherName(name=teacher.name, revision=teacher.revision),
+        attempts=reflection.attempts,
+        failed_checks=[f"{each.check}: {each.detail}" for each in reflection.failed],
+    )
+
+
+def _question(asked: wire.LabelRequest) -> Question:
+    return Question(
+        scene_of(asked.scene),
+        plan_of(asked.predicted_plan, "/predicted_plan"),
+        plan_of(asked.expert_plan, "/expert_plan"),
+        None if asked.annotations is None else _surroundings(asked.annotations),
+        asked.seed,
+    )
+
+
+def _surroundings(asked: wire.Annotations) -> Surroundings:
+    agents = tuple(_agent(agent, number) for number, agent in enumerate(asked.agents))
+    return Surroundings(agents, tuple(np.array(line, np.float32) for line in asked.lane_lines))
+
+
+def _agent(asked: wire.Agent, number: int) -> Agent:
+    kind = next((kind for kind in AGENT_KINDS if kind == asked.kind), None)
+    if kind is None:
+        problem = f"unknown kind {asked.kind!r}; known are {', '.join(AGENT_KINDS)}"
+        raise at(INVALID_REQUEST, f"/annotations/agents/{number}/kind", problem)
+    poses = np.array([[np.nan] * 3 if row is None else row for row in asked.poses], np.float32)
+    return Agent(asked.agent_id, kind, asked.length_m, asked.width_m, _UNKNOWN_HEIGHT_M, poses)

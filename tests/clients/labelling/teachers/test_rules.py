@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import asyncio
+import itertools
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from clients.labelling.checks import FailedCheck, check_reflection
+from clients.labelling.teachers.rules import RuleTeacher
+from clients.labelling.teachers.teacher import Question, ReflectionRefused, TeacherError, ask
+from clients.labelling.teachers.view import Surroundings
+from model.bundled import SCENES
+from model.driving.labeller import label_plan
+from model.driving.plan import WORDS, Plan, track_from_words
+from model.driving.scene import LabelledScene
+from model.driving.scene_store import read_scenes
+
+BUNDLED = list(read_scenes(SCENES, dense=False))
+PLANS = [label_plan(each.future, each.scene.history, each.lane_trace) for each in BUNDLED]
+INDEPENDENT = re.compile(
+    r"expert|truth|label|annot|dataset|data set|predict|image|frame|video|camera|picture|trajector|will\b|"
+    r"going to|about to|later\b.*(?:stop|turn|brake)|oracle|teacher|simulat|future|ground|hindsight",
+    re.IGNORECASE,
+)
+TEACHER = RuleTeacher()
+
+
+def reflect(labelled: LabelledScene, predicted: Plan, better: Plan, seed: int = 0) -> str:
+    question = Question(labelled.scene, predicted, better, Surroundings.of(labelled), seed)
+    return asyncio.run(TEACHER.reflect(question))
+
+
+def made_up(random: np.random.Generator) -> Plan:
+    """A plan of two words a track."""
+    return Plan(
+        **{
+            group: track_from_words([words[first]] * edge + [words[second]] * (64 - edge))
+            for group, words in WORDS.items()
+            for first, second, edge in [(*random.integers(0, len(words), 2), int(random.integers(5, 60)))]
+        }
+    )
+
+
+def test_what_it_writes_passes_all_checks() -> None:
+    random = np.random.default_rng(0)
+    pairs = [
+        *itertools.product(BUNDLED, PLANS, PLANS),
+        *((s, made_up(random), made_up(random)) for s in BUNDLED * 20),
+    ]
+    for seed, (labelled, predicted, better) in enumerate(pairs):
+        text = reflect(labelled, predicted, better, seed)
+        assert check_reflection(text, predicted, better) == [], text
+        assert not INDEPENDENT.search(text), text
+        assert len(text.split()) <= 80
+
+
+def test_it_writes_the_same_again_and_others_otherwise() -> None:
+    texts = {reflect(BUNDLED[0], PLANS[1], PLANS[0], seed) for seed in range(20)}
+    assert len(texts) > 5
+    assert reflect(BUNDLED[0], PLANS[1], PLANS[0], 3) == reflect(BUNDLED[0], PLANS[1], PLANS[0], 3)
+
+
+def test_it_tells_distances_as_they_are_seen() -> None:
+    for labelled, predicted, better in zip(BUNDLED, PLANS[1:] + PLANS[:1], PLANS, strict=True):
+        for metres in re.findall(r"(\d+) metres", reflect(labelled, predicted, better)):
+            assert 5 <= int(metres) <= 90
+
+
+def test_it_says_what_it_lacks() -> None:
+    with pytest.raises(TeacherError, match="annotations"):
+        asyncio.run(TEACHER.reflect(Question(BUNDLED[0].scene, PLANS[0], PLANS[1])))
+
+
+class Stubborn:
+    """Answers in turn, and remembers what it was told."""
+
+    name, revision = "stubborn", "1"
+
+    def __init__(self, *answers: str) -> None:
+        self.answers, self.complaints = list(answers), list[int]()
+
+    async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> str:
+        self.complaints.append(len(complaints))
+        return self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+
+
+def test_a_teacher_is_asked_again_with_what_was_wrong() -> None:
+    question = Question(BUNDLED[0].scene, PLANS[1], PLANS[0], Surroundings.of(BUNDLED[0]))
+    good = reflect(BUNDLED[0], PLANS[1], PLANS[0])
+    teacher = Stubborn("The expert does it otherwise", good)
+    answer = asyncio.run(ask(teacher, question))
+    assert (answer.text, answer.attempts) == (good, 2)
+    assert {"leak", "form"} <= {failed.check for failed in answer.failed}
+    assert teacher.complaints == [0, len(answer.failed)]
+
+
+def test_a_teacher_that_does_not_learn_is_refused() -> None:
+    question = Question(BUNDLED[0].scene, PLANS[1], PLANS[0], Surroundings.of(BUNDLED[0]))
+    teacher = Stubborn("The expert does it otherwise on this road.")
+    with pytest.raises(ReflectionRefused, match="leak") as refused:
+        asyncio.run(ask(teacher, question))
+    assert refused.value.attempts == 3 == len(teacher.complaints)
+    assert refused.value.text.startswith("The expert")

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from clients.labelling.checks import check_reflection
+from clients.wire import LabelResponse
+from model.driving.plan import parse_plan
+from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN
+from tests.service.serving import Served, body
+from tests.service.test_errors import problem
+
+PATH = "/v1/label"
+
+
+def asking(served: Served, **changes: Any) -> dict[str, Any]:
+    """A question about a bundled scene, annotations as the service itself gives them."""
+    shown = served.http.get("/v1/scenes/slow-leader").json()
+    return {
+        "scene": shown["scene"],
+        "predicted_plan": str(KEEP_ON),
+        "expert_plan": str(SLOW_DOWN),
+        "annotations": {"agents": shown["agents"], "lane_lines": shown["lane_lines"]},
+    } | changes
+
+
+def test_a_reflection_is_written_and_checked(served: Served) -> None:
+    answer = served.http.post(PATH, json=asking(served))
+    assert answer.status_code == 200, answer.text
+    written = LabelResponse.model_validate_json(answer.content)
+    assert check_reflection(written.reflection, KEEP_ON, SLOW_DOWN) == []
+    assert (written.teacher.name, written.attempts, written.failed_checks) == ("rules", 1, [])
+    again = LabelResponse.model_validate_json(served.http.post(PATH, json=asking(served)).content)
+    assert again.reflection == written.reflection
+    others = {
+        served.http.post(PATH, json=asking(served, seed=seed)).json()["reflection"] for seed in range(9)
+    }
+    assert len(others) > 2
+    assert served.metric("looktwice_labels_total", teacher="rules") == 11
+
+
+def test_without_annotations_the_built_in_teacher_says_what_it_lacks(served: Served) -> None:
+    for lacking in (asking(served, annotations=None), {**asking(served)}):
+        lacking.pop("annotations")
+        assert "annotations" in problem(served.http.post(PATH, json=lacking), "needs-annotations").detail
+
+
+@pytest.mark.parametrize("which", ["predicted_plan", "expert_plan"])
+def test_a_plan_that_does_not_parse_is_told_with_its_place(served: Served, which: str) -> None:
+    document = asking(served, **{which: "- longitudinal\n  - 0.0s-6.4s: Fly\n"})
+    fault = problem(served.http.post(PATH, json=document), "invalid-plan").errors[0]
+    assert (fault.pointer, fault.line) == (f"/{which}", 2)
+    assert problem(served.http.post(PATH, json=asking(served, **{which: 3})), "invalid-plan")
+
+
+def test_annotations_are_checked(served: Served) -> None:
+    document = asking(served)
+    document["annotations"]["agents"][0]["kind"] = "dragon"
+    fault = problem(served.http.post(PATH, json=document), "invalid-request").errors[0]
+    assert fault.pointer == "/annotations/agents/0/kind"
+    document = asking(served)
+    document["annotations"]["agents"][0]["poses"].pop()
+    assert problem(served.http.post(PATH, json=document), "invalid-request")
+
+
+def test_plans_that_agree_get_a_reflection_too(served: Served) -> None:
+    plan = str(KEEP_ON)
+    answer = served.http.post(PATH, json=asking(served, predicted_plan=plan, expert_plan=plan))
+    assert answer.status_code == 200
+    assert check_reflection(answer.json()["reflection"], parse_plan(plan), parse_plan(plan)) == []
+
+
+def test_the_scene_is_checked_like_any_other(served: Served) -> None:
+    document = asking(served)
+    document["scene"]["clips"][0]["images"][0] = body()["scene"]["clips"][0]["images"][0][:-40] + "!"
+    assert problem(served.http.post(PATH, json=document), "invalid-image")
