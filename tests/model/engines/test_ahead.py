@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from model.engines.engine import Controls, PlanRequest
+from model.engines.torch.ahead import Ahead
+from model.engines.torch.rows import Request, Row
+from model.engines.torch.sampler import uniform
+from model.formats.cf_vla import CF_VLA
+from model.formats.cursor import CompiledFormat
+from model.network.checkpoint import Loaded, load
+from tests.checkpoints import noisy_scene
+
+
+@pytest.fixture(scope="module")
+def loaded(untrained_checkpoint: Path) -> Loaded:
+    return load(untrained_checkpoint)
+
+
+def beginning(loaded: Loaded, **controls: Any) -> Row:
+    """A row in front of its first decision."""
+    start = CompiledFormat(CF_VLA, loaded.vocabulary).start()
+    asked = PlanRequest("a", noisy_scene(), "cf_vla", Controls(n=1, **controls))
+    row = Row(start, Request(asked, start, 0.0), (0,))
+    prompt: Any = SimpleNamespace(shown=b"pictures")
+    row.begin(prompt, 0)
+    row.write((), loaded.vocabulary)
+    return row
+
+
+def test_without_guesses_a_row_feeds_what_is_pending(loaded: Loaded) -> None:
+    row = beginning(loaded)
+    tokens, decisions = Ahead().feed(row, copy=True, guesses=0)
+    assert tokens == row.pending
+    assert [place for place, _ in decisions] == [len(tokens) - 1]
+
+
+def test_a_guess_is_what_the_draws_own_number_selects(loaded: Loaded) -> None:
+    """Half of the others chose the first, half the last: which is guessed is in the seed."""
+    guessed = set()
+    for seed in range(12):
+        row, ahead = beginning(loaded, seed=seed), Ahead()
+        ids = row.cursor.allowed().ids
+        ahead.saw(row, len(ids), [(int(ids[0]), (0, 1, 2)), (int(ids[-1]), (3, 4, 5))])
+        tokens, decisions = ahead.feed(row, copy=False, guesses=1)
+        guess = tokens[len(row.pending)]
+        assert guess == int(ids[0 if uniform(seed, 0, len(row.tokens)) < 0.5 else -1])
+        assert len(decisions) == 2, "the decision guessed, and the next one, which is not"
+        guessed.add(guess)
+    assert len(guessed) == 2
+
+
+def test_at_temperature_zero_the_most_frequent_is_guessed(loaded: Loaded) -> None:
+    row, ahead = beginning(loaded, temperature=0.0), Ahead()
+    ids = row.cursor.allowed().ids
+    ahead.saw(row, len(ids), [(int(ids[0]), (0,)), (int(ids[1]), (1, 2))])
+    tokens, _ = ahead.feed(row, copy=False, guesses=1)
+    assert tokens[len(row.pending)] == int(ids[1])
+
+
+def test_the_last_answer_to_the_same_pictures_is_repeated(loaded: Loaded) -> None:
+    ahead, first = Ahead(), beginning(loaded, seed=1)
+    while not first.cursor.done:
+        first.write((int(first.cursor.allowed().ids[-1]),), loaded.vocabulary)
+    ahead.finished(first)
+    row = beginning(loaded, seed=1)
+    tokens, decisions = ahead.feed(row, copy=False, guesses=1)
+    repeated = [token.id for token in first.tokens]
+    assert tokens[1:] == repeated[: len(tokens) - 1]
+    assert len(tokens) > len(row.pending) + 10
+    assert len(decisions) > 3
