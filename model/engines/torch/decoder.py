@@ -174,9 +174,9 @@ class Decoder:
     def step(self) -> list[StepEvent]:
         """Admit what fits, bring prompts on, feed all rows once, and return what happened."""
         began_s = self._clock()
-        for request in self._schedule.make_room():
+        for request in self._schedule.make_room(began_s):
             self._pause(request)
-        for request in self._schedule.admit():
+        for request in self._schedule.admit(began_s):
             rows = self._paused.pop(request.id, None) or self._first_rows(request)
             groups: dict[int, list[Row]] = {}
             for row in rows:
@@ -226,9 +226,10 @@ class Decoder:
 
     def _bring_prompts_on(self) -> list[StepEvent]:
         """Some tokens of the most urgent prompts; many while no draw waits for the pass."""
+        now_s = self._clock()
         left = self._chunk if self._rows else _ALONE * self._chunk
         taken: list[tuple[_Beginning, int]] = []
-        for beginning in sorted(self._beginnings, key=lambda each: urgency(each.request)):
+        for beginning in sorted(self._beginnings, key=lambda each: urgency(each.request, now_s)):
             if left <= 0:
                 break
             count = min(left, self._runner.prompt_tokens)

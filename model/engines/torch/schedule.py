@@ -11,9 +11,15 @@ PATIENCE_S: Final = 10.0
 """A request without a deadline waits as if it had this one: those that have some cannot starve it."""
 
 
-def urgency(request: Request) -> tuple[float, int]:
-    """What requests are ordered by: the earliest deadline first, then the earliest arrival."""
-    return min(request.deadline_s, request.submitted_s + PATIENCE_S), request.arrival
+def urgency(request: Request, now_s: float) -> tuple[float, int]:
+    """What requests are ordered by: the earliest deadline first, then the earliest arrival.
+
+    A request whose deadline has passed counts as one without: served first it would make others late too.
+    """
+    patience_s = request.submitted_s + PATIENCE_S
+    return (
+        patience_s if request.deadline_s < now_s else min(request.deadline_s, patience_s)
+    ), request.arrival
 
 
 class Memory(NamedTuple):
@@ -81,28 +87,28 @@ class Schedule:
         """Queue a request that `fits`."""
         self._waiting.append(request)
 
-    def make_room(self) -> list[Request]:
+    def make_room(self, now_s: float) -> list[Request]:
         """The running requests, least urgent first, that give way to the most urgent waiting one.
 
         They wait again. Only a deadline makes others give way, and only those that are less urgent.
         """
-        self._waiting.sort(key=urgency)
-        if not self._waiting or self._waiting[0].controls.deadline_ms is None:
+        self._sort(now_s)
+        if not self._waiting or not now_s <= self._waiting[0].deadline_s < float("inf"):
             return []
         first, victims = self._waiting[0], list[Request]()
-        running = sorted(self._admitted.values(), key=urgency)
+        running = sorted(self._admitted.values(), key=lambda request: urgency(request, now_s))
         while running and not self.memory_of(first).within(self._left(running)):
-            if urgency(running[-1]) < urgency(first):
+            if urgency(running[-1], now_s) < urgency(first, now_s):
                 return []
             victims.append(running.pop())
         for request in victims:
             self._waiting.append(self._admitted.pop(request.id))
         return victims
 
-    def admit(self) -> list[Request]:
+    def admit(self, now_s: float) -> list[Request]:
         """The requests that begin now. Nobody overtakes the most urgent one, however large it is."""
         admitted = []
-        self._waiting.sort(key=urgency)
+        self._sort(now_s)
         while self._waiting:
             request = self._waiting[0]
             if not self.memory_of(request).within(self.free):
@@ -110,6 +116,9 @@ class Schedule:
             self._admitted[request.id] = self._waiting.pop(0)
             admitted.append(request)
         return admitted
+
+    def _sort(self, now_s: float) -> None:
+        self._waiting.sort(key=lambda request: urgency(request, now_s))
 
     def release(self, request_id: str) -> None:
         """Forget a request, whether it waits or runs; unknown ids are ignored."""

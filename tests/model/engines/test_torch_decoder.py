@@ -338,3 +338,14 @@ def test_habits_save_passes_and_change_nothing(exact: Loaded) -> None:
     assert [texts(decoder, "second"), texts(decoder, "third")] == [first, first]
     assert decoder.counts.passes - passes < 2 * passes * 0.7
     assert texts(Decoder(Runner(exact, 3), replace(Shortcuts(), speculate=False)), "alone") == first
+
+
+def test_who_is_late_already_makes_nobody_else_late(exact: Loaded) -> None:
+    clock = Clock()
+    decoder = Decoder(Runner(exact, 4), clock=clock)
+    decoder.add(request("late", 0, "traj_only", n=2, deadline_ms=1_000))
+    decoder.add(request("in-time", 1, "traj_only", n=2, deadline_ms=3_000))
+    decoder.add(request("whenever", 2, "traj_only", n=2))
+    clock.now_s = 2.0
+    draws = decode(decoder)
+    assert [name for name, _ in draws] == ["in-time"] * 2 + ["late"] * 2 + ["whenever"] * 2
