@@ -10,11 +10,15 @@ from __future__ import annotations
 import re
 from typing import Final, Literal
 
-from model.driving.plan import TICKS, Plan
+from model.driving.plan import TICKS, Group, Plan
 
 Change = Literal["slower", "faster", "left", "right", "straight", "lane_left", "lane_right", "keep_lane"]
 
 _LEVEL: Final = {"Accelerate": 1.0, "Keep Speed": 0.0, "Decelerate": -1.0, "Wait": -1.0, "Reverse": -1.0}
+_CHANGE_OF: Final[dict[Group, dict[str, Change]]] = {
+    "lateral": {"Left Turn": "left", "Right Turn": "right", "Straight": "straight"},
+    "lane": {"Left Lane Change": "lane_left", "Right Lane Change": "lane_right", "Keep Lane": "keep_lane"},
+}
 MIN_TICKS: Final = 5
 """Half a second, the shortest that the labeller calls an action of its own."""
 
@@ -80,20 +84,8 @@ def wanted_changes(before: Plan, after: Plan) -> list[frozenset[Change]]:
     ]
     if abs(levels[1] - levels[0]) >= MIN_TICKS:
         found.append(frozenset({"slower" if levels[1] < levels[0] else "faster"}))
-    lateral = _more(
-        before, after, "lateral", {"Left Turn": "left", "Right Turn": "right", "Straight": "straight"}
-    )
-    if lateral:
-        found.append(lateral)
-    lane = _more(
-        before,
-        after,
-        "lane",
-        {"Left Lane Change": "lane_left", "Right Lane Change": "lane_right", "Keep Lane": "keep_lane"},
-    )
-    if lane:
-        found.append(lane)
-    return found
+    found += [_longer(before, after, group) for group in _CHANGE_OF]
+    return [changes for changes in found if changes]
 
 
 def told_changes(text: str) -> dict[Change, int]:
@@ -116,26 +108,23 @@ def agrees(text: str, before: Plan, after: Plan) -> bool:
 
     Speaking against the opposite of a change is speaking for it.
     """
-    told = told_changes(text)
+    told, wanted = told_changes(text), wanted_changes(before, after)
     spoken = False
-    for changes in wanted_changes(before, after):
+    for changes in wanted:
         score = sum(told[change] for change in changes)
         others = {other for change in changes for other in _OPPOSITES[change]} - changes
         score -= sum(told[other] for other in others)
         if score < 0:
             return False
         spoken |= score > 0
-    return spoken or not wanted_changes(before, after)
+    return spoken or not wanted
 
 
-def _more(before: Plan, after: Plan, group: str, names: dict[str, Change]) -> frozenset[Change]:
+def _longer(before: Plan, after: Plan, group: Group) -> frozenset[Change]:
     """The words of a track that ``after`` says for longer."""
     more: set[Change] = set()
-    for word, change in names.items():
-        ticks = [
-            sum(plan.word_at(group, tick) == word for tick in range(TICKS))  # type: ignore[arg-type]
-            for plan in (before, after)
-        ]
+    for word, change in _CHANGE_OF[group].items():
+        ticks = [sum(plan.word_at(group, tick) == word for tick in range(TICKS)) for plan in (before, after)]
         if ticks[1] - ticks[0] >= MIN_TICKS:
             more.add(change)
     return frozenset(more)

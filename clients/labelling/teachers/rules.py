@@ -48,7 +48,7 @@ class RuleTeacher:
         changes = wanted_changes(predicted, expert)
         if not changes:
             return _nothing_to_change(view, chance)
-        said = [_on(next(iter(sorted(each))), view, predicted, expert, chance) for each in changes[:2]]
+        said = [_on(min(each), view, predicted, expert, chance) for each in changes[:2]]
         return " ".join(said)
 
 
@@ -59,8 +59,8 @@ def _on(change: Change, view: View, predicted: Plan, expert: Plan, chance: rando
     if change == "faster":
         return _faster(view, predicted, chance)
     if change in ("left", "right", "straight"):
-        return _turning(change, view, predicted, expert, chance)
-    return _lanes(change, view, predicted, expert, chance)
+        return _turning(change, view, predicted, chance)
+    return _lanes(change, view, predicted, chance)
 
 
 def _slower(view: View, predicted: Plan, expert: Plan, chance: random.Random) -> str:
@@ -88,22 +88,22 @@ def _slower(view: View, predicted: Plan, expert: Plan, chance: random.Random) ->
         )
     )
     if near is not None and near.ahead_m < _CLOSE_M:
-        cue = f"{_a(near, chance)} is {_where(near)}, {_metres(near)}."
+        cue = f"{_a(near, chance)} is {_where(near)}, {_ahead(near.ahead_m)}."
         return f"{cue} {_capital(fast)} would leave no time to react, so {better}."
     if ahead is not None and (ahead.kind != "vehicle" or _holds_up(ahead, view)):
-        cue = f"{_a(ahead, chance)} {_motion(ahead, view, chance)} in my lane, {_metres(ahead)}."
+        cue = f"{_a(ahead, chance)} {_motion(ahead, view, chance)} in my lane, {_ahead(ahead.ahead_m)}."
         result = chance.choice(
             ("would close the gap too quickly", "would bring me too close", "could leave me no way out")
         )
         return f"{cue} {_capital(fast)} {result}, so {better}."
     if view.bend is not None:
-        cue = f"A curve begins {_bend_at(view)}."
+        cue = f"A curve begins {_ahead(view.bend_m)}."
         return f"{cue} {_capital(fast)} would carry too much speed into the curve, so {better}."
     if ahead is not None:
-        cue = f"{_a(ahead, chance)} is in my lane, {_metres(ahead)}."
+        cue = f"{_a(ahead, chance)} is in my lane, {_ahead(ahead.ahead_m)}."
         return f"{cue} {_capital(fast)} would eat up the gap, so {better}."
     if beside is not None and beside.ahead_m < _CLOSE_M:
-        cue = f"{_a(beside, chance)} is in {beside.place}, {_metres(beside)}."
+        cue = f"{_a(beside, chance)} is in {beside.place}, {_ahead(beside.ahead_m)}."
         return f"{cue} {_capital(fast)} would leave little room beside it, so {better}."
     cue = chance.choice(
         ("The road ahead asks for less pace.", "The stretch of road ahead is not one for this pace.")
@@ -124,24 +124,24 @@ def _faster(view: View, predicted: Plan, chance: random.Random) -> str:
     if ahead is None:
         cue = chance.choice(("My lane is clear as far as I can see.", "The road ahead in my lane is free."))
     elif ahead.kind == "vehicle" and ahead.speed_ms > view.speed_ms + _SLOWER_BY_MS:
-        cue = f"{_a(ahead, chance)} in my lane is drawing ahead, {_metres(ahead)}."
+        cue = f"{_a(ahead, chance)} in my lane is drawing ahead, {_ahead(ahead.ahead_m)}."
     else:
-        cue = f"{_a(ahead, chance)} in my lane leaves room enough, {_metres(ahead)}."
+        cue = f"{_a(ahead, chance)} in my lane leaves room enough, {_ahead(ahead.ahead_m)}."
     result = chance.choice(("would be needlessly cautious", "would hold up the traffic for no reason"))
     better = chance.choice(("I should pick up speed", "it is better to accelerate", "I should drive on"))
     return f"{cue} {_capital(slow)} for so long {result}, so {better}."
 
 
-def _turning(change: Change, view: View, predicted: Plan, expert: Plan, chance: random.Random) -> str:
+def _turning(change: Change, view: View, predicted: Plan, chance: random.Random) -> str:
     planned = _first(predicted, "lateral", "Left Turn") or _first(predicted, "lateral", "Right Turn")
     if change == "straight":
         cue = chance.choice(("The lane runs straight on here.", "The lane markings run straight ahead."))
         if view.bend is not None:
-            cue = f"My lane runs straight first, and the bend is {_bend_at(view)}."
+            cue = f"My lane runs straight first, and the bend is {_ahead(view.bend_m)}."
         when = f" from {planned}s" if planned else ""
         return f"{cue} Turning{when} would take me off my line, so I should steer straight for longer."
     if view.bend == change:
-        cue = f"The road bends {change} {_bend_at(view)}."
+        cue = f"The road bends {change} {_ahead(view.bend_m)}."
     else:
         cue = chance.choice(
             (f"My way leads {change} off this road.", f"The junction lets me go {change} here.")
@@ -151,7 +151,7 @@ def _turning(change: Change, view: View, predicted: Plan, expert: Plan, chance: 
     return f"{cue} Going on as planned {result}, so {better}."
 
 
-def _lanes(change: Change, view: View, predicted: Plan, expert: Plan, chance: random.Random) -> str:
+def _lanes(change: Change, view: View, predicted: Plan, chance: random.Random) -> str:
     if change == "keep_lane":
         moved = "left" if _first(predicted, "lane", "Left Lane Change") is not None else "right"
         other = view.first(
@@ -160,13 +160,13 @@ def _lanes(change: Change, view: View, predicted: Plan, expert: Plan, chance: ra
         cue = (
             chance.choice(("My lane is open ahead.", "Nothing on the road calls for another lane."))
             if other is None
-            else f"{_a(other, chance)} is in {other.place}, {_metres(other)}."
+            else f"{_a(other, chance)} is in {other.place}, {_ahead(other.ahead_m)}."
         )
         return f"{cue} Moving over would be unnecessary, so I should stay in my lane for longer."
     side = "left" if change == "lane_left" else "right"
     ahead = view.first("vehicle", "cone", "barrier", places=("my lane",))
     if ahead is not None:
-        cue = f"{_a(ahead, chance)} {_motion(ahead, view, chance)} in my lane, {_metres(ahead)}."
+        cue = f"{_a(ahead, chance)} {_motion(ahead, view, chance)} in my lane, {_ahead(ahead.ahead_m)}."
     else:
         cue = chance.choice(
             (f"There is room in the {side} lane.", f"The lane to the {side} of mine is open.")
@@ -186,7 +186,7 @@ def _nothing_to_change(view: View, chance: random.Random) -> str:
     cue = (
         "My lane is clear ahead"
         if ahead is None
-        else f"{_a(ahead, chance)} in my lane leaves room, {_metres(ahead)}"
+        else f"{_a(ahead, chance)} in my lane leaves room, {_ahead(ahead.ahead_m)}"
     )
     return f"{cue}, and what I have in mind fits the road as it runs."
 
@@ -213,15 +213,9 @@ def _where(sight: Sight) -> str:
     )
 
 
-def _metres(sight: Sight) -> str:
+def _ahead(metres: float) -> str:
     """A distance as one can estimate it."""
-    if sight.ahead_m < 8:
-        return "right ahead"
-    return f"some {5 * round(sight.ahead_m / 5)} metres ahead"
-
-
-def _bend_at(view: View) -> str:
-    return "right ahead" if view.bend_m < 8 else f"some {5 * round(view.bend_m / 5)} metres ahead"
+    return "right ahead" if metres < 8 else f"some {5 * round(metres / 5)} metres ahead"
 
 
 def _first(plan: Plan, group: Group, word: str) -> str | None:

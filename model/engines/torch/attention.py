@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from model.engines.torch.kv import KvRows
-from model.engines.torch.places import IntArray, Written
+from model.engines.torch.places import IntArray, Written, count_up
 
 _SPAN: Final = 32
 """Places seen are a multiple of this: few sizes, few kernels."""
@@ -91,7 +91,7 @@ class DrawPass:
         brought = np.bincount(prompts)
         order = np.argsort(prompts, kind="stable")
         number = np.empty_like(order)
-        number[order] = np.arange(count) - np.repeat(np.cumsum(brought) - brought, brought)
+        number[order] = count_up(brought)
         together = _together(brought)
         widths = np.array([brought[part].max() for part in together])
         rows = np.array([part.stop - part.start for part in together])

@@ -76,7 +76,7 @@ class Places:
         free = [np.flatnonzero(~each)[:count] for each, count in zip(used, brought, strict=True)]
 
         row_of = np.repeat(np.arange(len(fed)), counts)
-        within = np.arange(len(row_of)) - np.repeat(np.cumsum(counts) - counts, counts)
+        within = count_up(counts)
         places = np.empty_like(row_of)
         places[np.argsort(prompts[row_of], kind="stable")] = np.concatenate(free)
         self._places[row_of, held[row_of] + within] = places
@@ -86,3 +86,8 @@ class Places:
         seen = seen[row_of, : max(end, int(places.max()) + 1)]
         seen[later, places[earlier]] = True
         return Written(prompts[row_of], places, seen)
+
+
+def count_up(counts: IntArray) -> IntArray:
+    """0, 1, … as often as each of ``counts`` says."""
+    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)

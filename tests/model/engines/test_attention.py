@@ -18,8 +18,15 @@ def test_each_token_sees_its_prompt_and_what_its_draw_has_written(seed: int) -> 
     """Passes over draws that part and write by chance, against attention worked out draw by draw."""
     random = np.random.default_rng(seed)
     torch.manual_seed(seed)
-    sizes = {"layers": 2, "heads": GROUPS, "head_dim": WIDTH, "dtype": torch.float64}
-    memory = KvRows(rows=4, length=200, device=torch.device("cpu"), **sizes)  # type: ignore[arg-type]
+    memory = KvRows(
+        layers=2,
+        heads=GROUPS,
+        head_dim=WIDTH,
+        rows=4,
+        length=200,
+        dtype=torch.float64,
+        device=torch.device("cpu"),
+    )
     prompts = [torch.randn(2, 2, GROUPS, length, WIDTH, dtype=torch.float64) for length in PROMPTS]
     for row, prompt in enumerate(prompts):
         memory.row(row, prompt.shape[-2]).copy_(prompt)
