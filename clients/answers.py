@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
 from typing import Final, TypeVar
 
 import httpx
@@ -144,10 +147,17 @@ def unreachable(error: httpx.HTTPError) -> PlannerUnreachable:
 
 
 def retry_after_s(response: httpx.Response) -> float | None:
-    """Seconds the service asks to wait; None where it does not ask."""
-    # Only seconds: the service sends no dates.
-    given = response.headers.get("Retry-After", "")
-    return float(given) if given.isdecimal() else None
+    """Seconds that ``Retry-After`` (RFC 9110, section 10.2.3) asks to wait; None where nobody asks."""
+    given = response.headers.get("Retry-After", "").strip()
+    try:
+        seconds = float(given)
+    except ValueError:
+        try:
+            then = parsedate_to_datetime(given)
+        except ValueError:
+            return None
+        seconds = (then - datetime.now(UTC)).total_seconds()
+    return max(0.0, seconds) if math.isfinite(seconds) else None
 
 
 def read(response: httpx.Response, answer: type[_Answer]) -> _Answer:

@@ -10,11 +10,10 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import time
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self, cast
+from typing import Self
 
 import httpx
 from pydantic import BaseModel
@@ -40,6 +39,8 @@ from clients.answers import (
     retry_after_s,
     unreachable,
 )
+from clients.labelling.teachers.view import Surroundings
+from clients.wire_values import rows, wire_agents, wire_scene
 from model.driving.plan import Plan
 from model.driving.scene import Scene
 
@@ -59,6 +60,7 @@ __all__ = [
     "RequestRefused",
     "ServiceBusy",
     "ServiceFailed",
+    "label_request",
     "plan_request",
     "reflect_request",
 ]
@@ -139,9 +141,40 @@ class PlannerClient:
         answered = self._send(_call(self._http, "/v1/reflect", asked, request_id), controls.deadline_ms)
         return reflect_result(answered)
 
+    def label(
+        self,
+        scene: Scene,
+        predicted: Plan,
+        expert: Plan,
+        *,
+        surroundings: Surroundings | None = None,
+        seed: int = 0,
+    ) -> wire.LabelResponse:
+        """Have the service's teacher say why ``predicted`` is less good than ``expert``.
+
+        Args:
+            scene: what the model saw.
+            predicted: the plan it made.
+            expert: the better one, which the answer leads to without naming it.
+            surroundings: the scene's annotations; the built-in teacher needs them.
+            seed: another one, other words.
+
+        Raises:
+            PlannerError: see its subclasses.
+        """
+        asked = label_request(scene, predicted, expert, surroundings, seed)
+        return read(self._send(_call(self._http, "/v1/label", asked, None)), wire.LabelResponse)
+
     def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""
-        return read(self._send(self._http.build_request("GET", "/v1/models")), wire.ModelList).models
+        return self._model_list().models
+
+    def teacher(self) -> wire.TeacherName | None:
+        """Who writes the service's labels, if anybody; raises `PlannerError`."""
+        return self._model_list().teacher
+
+    def _model_list(self) -> wire.ModelList:
+        return read(self._send(self._http.build_request("GET", "/v1/models")), wire.ModelList)
 
     def close(self) -> None:
         """Close the connections."""
@@ -208,10 +241,29 @@ class AsyncPlannerClient:
         call = _call(self._http, "/v1/reflect", asked, request_id)
         return reflect_result(await self._send(call, controls.deadline_ms))
 
+    async def label(
+        self,
+        scene: Scene,
+        predicted: Plan,
+        expert: Plan,
+        *,
+        surroundings: Surroundings | None = None,
+        seed: int = 0,
+    ) -> wire.LabelResponse:
+        """Have the service's teacher look at a plan; see `PlannerClient.label`."""
+        asked = label_request(scene, predicted, expert, surroundings, seed)
+        return read(await self._send(_call(self._http, "/v1/label", asked, None)), wire.LabelResponse)
+
     async def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""
-        answered = await self._send(self._http.build_request("GET", "/v1/models"))
-        return read(answered, wire.ModelList).models
+        return (await self._model_list()).models
+
+    async def teacher(self) -> wire.TeacherName | None:
+        """Who writes the service's labels, if anybody; raises `PlannerError`."""
+        return (await self._model_list()).teacher
+
+    async def _model_list(self) -> wire.ModelList:
+        return read(await self._send(self._http.build_request("GET", "/v1/models")), wire.ModelList)
 
     async def close(self) -> None:
         """Close the connections."""
@@ -248,7 +300,7 @@ def plan_request(
     """The body of POST /v1/plan for ``scene``."""
     if prefill is not None:
         controls = controls.model_copy(update={"prefill": str(prefill)})
-    return wire.PlanRequest(scene=_scene(scene), controls=controls, format=format)
+    return wire.PlanRequest(scene=wire_scene(scene), controls=controls, format=format)
 
 
 def reflect_request(
@@ -259,21 +311,24 @@ def reflect_request(
     format: str = "cf_vla",
 ) -> wire.ReflectRequest:
     """The body of POST /v1/reflect for ``plan`` in ``scene``."""
-    return wire.ReflectRequest(scene=_scene(scene), plan=str(plan), controls=controls, format=format)
+    return wire.ReflectRequest(scene=wire_scene(scene), plan=str(plan), controls=controls, format=format)
 
 
-def _scene(scene: Scene) -> wire.Scene:
-    return wire.Scene(
-        scene_id=scene.scene_id,
-        clips=[
-            wire.Clip(
-                camera=cast(wire.Camera, clip.camera),
-                images=[base64.b64encode(image).decode() for image in clip.images],
-            )
-            for clip in scene.clips
-        ],
-        history=scene.history.tolist(),
-        route=None if scene.route is None else scene.route.tolist(),
+def label_request(
+    scene: Scene, predicted: Plan, expert: Plan, surroundings: Surroundings | None = None, seed: int = 0
+) -> wire.LabelRequest:
+    """The body of POST /v1/label for two plans in ``scene``."""
+    return wire.LabelRequest(
+        scene=wire_scene(scene),
+        predicted_plan=str(predicted),
+        expert_plan=str(expert),
+        annotations=None
+        if surroundings is None
+        else wire.Annotations(
+            agents=wire_agents(surroundings.agents),
+            lane_lines=[rows(line) for line in surroundings.lane_lines],
+        ),
+        seed=seed,
     )
 
 

@@ -319,6 +319,9 @@ class LabelResponse(Answered):
     teacher: TeacherName
     attempts: int = Field(ge=1, description="How often the teacher was asked.")
     failed_checks: list[str] = Field(description="What was wrong with its earlier answers.")
+    input_tokens: int = Field(default=0, ge=0, description="That all its answers took, as it counts.")
+    output_tokens: int = Field(default=0, ge=0, description="Of all its answers, as it counts.")
+    cost_usd: float = Field(default=0.0, ge=0, description="Of all its answers, where prices are known.")
 
 
 class ModelCard(Answered):
@@ -340,6 +343,9 @@ class ModelList(Answered):
     """Answer of GET /v1/models."""
 
     models: list[ModelCard]
+    teacher: TeacherName | None = Field(
+        default=None, description="Who writes the labels of POST /v1/label; null where nobody does."
+    )
 
 
 class LabelledScene(Answered):

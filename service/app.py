@@ -53,6 +53,7 @@ def create_app(
             yield
         finally:
             await lifecycle.end()
+            await teacher.close()
 
     app = FastAPI(
         title="LookTwice",

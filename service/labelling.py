@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Final
 
 import numpy as np
 
 import clients.wire as wire
+from clients.labelling.teachers.patience import patiently
 from clients.labelling.teachers.teacher import (
+    Answer,
     Question,
     ReflectionRefused,
     Teacher,
+    TeacherBusy,
+    TeacherClosed,
     TeacherError,
     ask,
 )
@@ -18,9 +23,12 @@ from clients.labelling.teachers.view import Surroundings
 from model.driving.scene import AGENT_KINDS, Agent
 from service.intake import plan_of, scene_of
 from service.metrics import Metrics
-from service.problems import INVALID_REQUEST, LABEL_REFUSED, NEEDS_ANNOTATIONS, ProblemError, at
+from service.problems import INVALID_REQUEST, LABEL_REFUSED, NEEDS_ANNOTATIONS, TEACHER_AWAY, ProblemError, at
 
-_UNKNOWN_HEIGHT_M = 1.5
+PATIENCE_S: Final = 30.0
+"""That a teacher may be busy or away before its caller is told."""
+
+_UNKNOWN_HEIGHT_M: Final = 1.5
 """The wire has no heights; teachers look at nothing that depends on them."""
 
 
@@ -33,8 +41,11 @@ async def label(
         ProblemError: the request cannot be served; the teacher lacks something or fails the checks.
     """
     question = await asyncio.to_thread(_question, asked)
+    answers: list[Answer] = []
     try:
-        reflection = await ask(teacher, question)
+        reflection = await patiently(lambda: ask(teacher, question, answers), PATIENCE_S)
+    except (TeacherBusy, TeacherClosed) as error:
+        raise ProblemError(TEACHER_AWAY, f"{teacher.name}: {error}") from None
     except TeacherError as error:
         raise ProblemError(NEEDS_ANNOTATIONS, f"{teacher.name}: {error}") from None
     except ReflectionRefused as error:
@@ -44,10 +55,18 @@ async def label(
     return wire.LabelResponse(
         request_id=request_id,
         reflection=reflection.text,
-        teacher=wire.TeacherName(name=teacher.name, revision=teacher.revision),
+        teacher=teacher_name(teacher),
         attempts=reflection.attempts,
         failed_checks=[f"{each.check}: {each.detail}" for each in reflection.failed],
+        input_tokens=sum(answer.input_tokens for answer in answers),
+        output_tokens=sum(answer.output_tokens for answer in answers),
+        cost_usd=sum(answer.cost_usd for answer in answers),
     )
+
+
+def teacher_name(teacher: Teacher) -> wire.TeacherName:
+    """A teacher's provenance."""
+    return wire.TeacherName(name=teacher.name, revision=teacher.revision)
 
 
 def _question(asked: wire.LabelRequest) -> Question:

@@ -47,6 +47,7 @@ INVALID_SCENE_FILE: Final = Kind("invalid-scene-file", 422, "This is not a scene
 INTERNAL: Final = Kind("internal", 500, "The service failed")
 NEEDS_ANNOTATIONS: Final = Kind("needs-annotations", 422, "The teacher needs what the request lacks")
 LABEL_REFUSED: Final = Kind("label-refused", 502, "None of the teacher's answers passed the checks")
+TEACHER_AWAY: Final = Kind("teacher-away", 503, "The teacher does not answer")
 SCENES_UNREADABLE: Final = Kind("scenes-unreadable", 500, "The bundled scenes cannot be read")
 NOT_READY: Final = Kind("not-ready", 503, "The model is not ready")
 ENGINE_FAILED: Final = Kind("engine-failed", 503, "The engine failed")

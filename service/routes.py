@@ -17,7 +17,7 @@ from clients.labelling.teachers.teacher import Teacher
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.engines.engine import Engine
 from service.examples import example_reflection, example_request
-from service.labelling import label
+from service.labelling import label, teacher_name
 from service.lifecycle import Lifecycle
 from service.metrics import Metrics
 from service.openapi import Responses, problems
@@ -40,6 +40,7 @@ from service.problems import (
     NOT_READY,
     REFUSED,
     SCENES_UNREADABLE,
+    TEACHER_AWAY,
     UNKNOWN_CAMERA,
     UNKNOWN_FIELD,
     UNKNOWN_FORMAT,
@@ -109,7 +110,7 @@ def _add_planning(router: APIRouter, parts: Parts) -> None:
         responses=problems(
             *(INVALID_JSON, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE, INVALID_REQUEST, UNKNOWN_FIELD),
             *(INVALID_CLIP, UNKNOWN_CAMERA, INVALID_IMAGE, INVALID_HISTORY, INVALID_ROUTE, INVALID_PLAN),
-            *(NEEDS_ANNOTATIONS, LABEL_REFUSED),
+            *(NEEDS_ANNOTATIONS, LABEL_REFUSED, TEACHER_AWAY),
         ),
     )
     async def write_label(request: Request, asked: wire.LabelRequest) -> wire.LabelResponse:
@@ -120,7 +121,7 @@ def _add_planning(router: APIRouter, parts: Parts) -> None:
     async def models() -> wire.ModelList:
         """The models that answer here."""
         parts.lifecycle.check_ready()
-        return wire.ModelList(models=[model_card(parts.engine.card)])
+        return wire.ModelList(models=[model_card(parts.engine.card)], teacher=teacher_name(parts.teacher))
 
 
 async def _while_connected(request: Request, parts: Parts, asked: _Asked, work: _Work[_Asked]) -> Any:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import base64
 import functools
 import tempfile
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Final, cast
+from typing import Final
 
-import numpy as np
 import pyarrow.parquet as pq
 
 import clients.wire as wire
-from model.driving.scene import Agent, LabelledScene
+from clients.wire_values import rows, wire_agents, wire_scene
+from model.driving.scene import LabelledScene
 from model.driving.scene_store import SceneFileError, count_scenes, read_scenes
-from model.driving.trajectory import FloatArray
 from service.problems import INVALID_SCENE_FILE, SCENES_UNREADABLE, UNKNOWN_SCENE, ProblemError
 
 MAX_SCENES_SHOWN: Final = 64
@@ -72,42 +70,16 @@ def scenes_of_file(content: bytes) -> list[wire.LabelledScene]:
 
 def view(labelled: LabelledScene) -> wire.LabelledScene:
     """A labelled scene as the page shows it; its `scene` can be sent to /v1/plan as it is."""
-    scene = labelled.scene
     return wire.LabelledScene(
-        scene=wire.Scene(
-            scene_id=scene.scene_id,
-            clips=[
-                wire.Clip(
-                    camera=cast(wire.Camera, clip.camera),
-                    images=[base64.b64encode(image).decode() for image in clip.images],
-                )
-                for clip in scene.clips
-            ],
-            history=_rows(scene.history),
-            route=None if scene.route is None else _rows(scene.route),
-        ),
+        scene=wire_scene(labelled.scene, _DECIMALS),
         episode_id=labelled.episode_id,
         seed=labelled.seed,
-        future=_rows(labelled.future),
-        agents=[_agent(agent) for agent in labelled.agents],
-        drivable=[_rows(ring) for ring in labelled.drivable],
-        lane_lines=[_rows(line) for line in labelled.lane_lines],
+        future=rows(labelled.future, _DECIMALS),
+        agents=wire_agents(labelled.agents, _DECIMALS),
+        drivable=[rows(ring, _DECIMALS) for ring in labelled.drivable],
+        lane_lines=[rows(line, _DECIMALS) for line in labelled.lane_lines],
         tags=sorted(labelled.tags),
     )
-
-
-def _agent(agent: Agent) -> wire.Agent:
-    return wire.Agent(
-        agent_id=agent.agent_id,
-        kind=agent.kind,
-        length_m=agent.length_m,
-        width_m=agent.width_m,
-        poses=[row if np.isfinite(row).all() else None for row in _rows(agent.poses)],
-    )
-
-
-def _rows(array: FloatArray) -> list[list[float]]:
-    return cast("list[list[float]]", array.astype(float).round(_DECIMALS).tolist())
 
 
 def _refuse_bombs(path: Path) -> None:

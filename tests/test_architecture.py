@@ -19,7 +19,7 @@ ALLOWED = {
     "model.formats": ("model.formats", "model.driving"),
     "clients": ("clients", "model.driving"),
     "loadtests": ("loadtests", "clients", "model.driving"),
-    "service": ("service", "clients.wire", "clients.labelling.teachers", "model"),
+    "service": ("service", "clients.wire", "clients.wire_values", "clients.labelling.teachers", "model"),
     "service.cli": EVERYTHING,
 }
 TORCH_FREE = ("model.driving", "model.formats", "clients", "loadtests")

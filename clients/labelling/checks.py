@@ -12,7 +12,7 @@ from model.driving.plan import Plan
 MOST_WORDS: Final = 80
 """CF-VLA section 8: one short paragraph."""
 
-Check = Literal["form", "length", "leak", "anchor", "direction"]
+Check = Literal["answer", "form", "length", "leak", "anchor", "direction"]
 
 _MARKUP: Final = re.compile(
     r"[*`#|<>\[\]{}~\\]|^\s*(?:[-+\u2022]|\d+[.)])\s|__|https?://|"

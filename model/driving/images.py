@@ -29,6 +29,12 @@ def check_image(encoded: bytes) -> tuple[int, int]:
         return image.size
 
 
+def media_type(encoded: bytes) -> str:
+    """``image/jpeg`` and the like; raises `ImageError` as `check_image` does."""
+    with _open(encoded) as image:
+        return Image.MIME[str(image.format)]
+
+
 def decode_image(encoded: bytes) -> npt.NDArray[np.uint8]:
     """The picture as uint8 RGB [h, w, 3]; raises `ImageError` as `check_image` does, or when damaged."""
     with _open(encoded) as image:

@@ -7,7 +7,7 @@ to a temporary name beside their place and renamed, so a reader never meets half
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, cast
@@ -124,12 +124,16 @@ def count_scenes(path: Path) -> int:
     return sum(_open(file).metadata.num_rows for file in scene_files(path))
 
 
-def read_scenes(path: Path, *, dense: bool = True) -> Iterator[LabelledScene]:
+def read_scenes(
+    path: Path, *, dense: bool = True, unlabelled: Callable[[str], None] | None = None
+) -> Iterator[LabelledScene]:
     """Yield the scenes of a file, or of a folder's files by name.
 
     Args:
         path: a ``.parquet`` file or a folder of them.
         dense: also read the dense targets, which planning and evaluation do not need.
+        unlabelled: told the names of scenes without an expert's future, which are left out; such a scene
+            is an error where nobody is to be told.
 
     Raises:
         SceneFileError: see the class.
@@ -140,6 +144,9 @@ def read_scenes(path: Path, *, dense: bool = True) -> Iterator[LabelledScene]:
         try:
             for group in range(parquet.num_row_groups):
                 for row in parquet.read_row_group(group, columns=columns).to_pylist():
+                    if row["future"] is None and unlabelled is not None:
+                        unlabelled(row["scene_id"])
+                        continue
                     yield _from_row(row)
         except (pa.ArrowException, OSError) as error:
             raise SceneFileError(f"{file} is damaged: {error}") from error

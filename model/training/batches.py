@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, cast
 
@@ -22,7 +22,7 @@ from model.network.prompts import motion_text
 from model.network.vocabulary import Vocabulary
 from model.training.examples import Examples
 from model.training.soft_codes import SoftCodes
-from model.training.targets import SectionWeights, Task, make_target
+from model.training.targets import Reflection, SectionWeights, Task, make_target
 
 Batch = dict[str, Tensor]
 
@@ -33,11 +33,12 @@ kept in little memory (on CPUs every new shape costs megabytes)."""
 
 @dataclass(frozen=True)
 class Item:
-    """Which example to learn from, and how."""
+    """Which example to learn from, and how; ``reflection`` is the place of one on it, where it has one."""
 
     index: int
     task: Task
     route: bool
+    reflection: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +67,10 @@ class ResponseDataset(Dataset[Sample]):
         weights: SectionWeights,
         *,
         pictures: bool,
+        reflections: Sequence[Reflection] = (),
         seed: int = 0,
     ) -> None:
-        self._examples, self._inputs = examples, inputs
+        self._examples, self._inputs, self._reflections = examples, inputs, reflections
         self._vectors = codec.vectors(examples.history, examples.future)
         self._soft = SoftCodes(codec, self._vectors)
         self._size = np.float32(np.sqrt((self._vectors**2).sum(axis=1).mean()))
@@ -83,7 +85,11 @@ class ResponseDataset(Dataset[Sample]):
         examples, index = self._examples, item.index
         soft = self._soft.draw(self._vectors[index], self._random)
         target = make_target(
-            self._formats[item.task], examples.plan(index), soft.codes.tolist(), self._weights
+            self._formats[item.task],
+            examples.plan(index),
+            soft.codes.tolist(),
+            self._weights,
+            None if item.reflection is None else self._reflections[item.reflection],
         )
         prompt = self._prompt(item)
         return Sample(
@@ -118,6 +124,8 @@ class ResponseDataset(Dataset[Sample]):
 class TaskSampler(BatchSampler):
     """Epochs of batches; a batch has one task, with or without route, so little is padded.
 
+    Reflections are examples of their own beside all others: the natural mixture of CF-VLA section 6.
+
     Args:
         examples: how many there are, and which have a route.
         batch_size: examples per batch.
@@ -125,6 +133,9 @@ class TaskSampler(BatchSampler):
         route_share: share of the examples, among those that have one, that are given their route.
         seed: of the order; every epoch has another one.
         processes: so many batches in a row are alike, as those who share the work wait for the slowest.
+        reflected: int64 [m], the example that each reflection is on.
+        reasoning: whether reflections are learned; otherwise their examples are learned once more without,
+            the control "multi-round" of CF-VLA section 4.3.
     """
 
     def __init__(
@@ -135,8 +146,10 @@ class TaskSampler(BatchSampler):
         route_share: float,
         seed: int,
         processes: int = 1,
+        reflected: npt.NDArray[np.int64] = np.zeros(0, np.int64),
+        reasoning: bool = True,
     ) -> None:
-        self._processes = processes
+        self._processes, self._reflected, self._reasoning = processes, reflected, reasoning
         self._has_route, self.batch_size, self._tasks = has_route, batch_size, tasks
         self._route_share, self._seed, self._epoch = route_share, seed, 0
         # accelerate, sharding batches over processes, reads these two and sets the epoch of `sampler`.
@@ -148,21 +161,26 @@ class TaskSampler(BatchSampler):
         self._epoch = epoch
 
     def __len__(self) -> int:
-        return len(self._has_route) // self.batch_size
+        return (len(self._has_route) + len(self._reflected)) // self.batch_size
 
     def __iter__(self) -> Iterator[list[Item]]:  # type: ignore[override]  # items instead of positions
         random = np.random.default_rng((self._seed, self._epoch))
-        order = random.permutation(len(self._has_route))
-        given = self._has_route & (random.random(len(order)) < self._route_share)
+        count = len(self._has_route)
+        order = random.permutation(count + len(self._reflected))
+        example = np.concatenate([np.arange(count), self._reflected])
+        given = self._has_route[example] & (random.random(len(order)) < self._route_share)
         names = list(self._tasks)
         drawn = random.choice(len(names), len(order), p=list(self._tasks.values()))
-        buckets: dict[tuple[int, bool], list[Item]] = {}
+        buckets: dict[tuple[Task, bool, bool], list[Item]] = {}
         leftover: list[Item] = []
         batches: list[list[Item]] = []
-        for index in order:
-            key = (int(drawn[index]), bool(given[index]))
+        for place in order:
+            reflects = place >= count
+            task: Task = "cf_vla" if reflects else names[drawn[place]]
+            reflection = int(place) - count if reflects and self._reasoning else None
+            key = (task, bool(given[place]), reflection is not None)
             bucket = buckets.setdefault(key, [])
-            bucket.append(Item(int(index), names[key[0]], key[1]))
+            bucket.append(Item(int(example[place]), task, key[1], reflection))
             if len(bucket) == self.batch_size * self._processes:
                 batches += self._split(buckets.pop(key))
         for bucket in buckets.values():

@@ -23,7 +23,7 @@ from model.driving.scene_store import read_scenes, scene_files
 from model.driving.trajectory import FloatArray
 from model.training.facts import scene_facts
 
-CACHE_VERSION: Final = 1
+CACHE_VERSION: Final = 2
 DENSE_FAR_M: Final = 200.0
 """Ranges beyond are all the same to a dense target."""
 
@@ -43,6 +43,7 @@ class Examples:
         dense_range_log: float16 [N, cameras, h, w], log(1 + metres); 0 where there is nothing.
         facts: float32 [N, facts].
         episode: int64 [N], the simulator's seed.
+        scene_id: str [N].
     """
 
     pictures: npt.NDArray[np.uint8]
@@ -55,6 +56,7 @@ class Examples:
     dense_range_log: npt.NDArray[np.float16]
     facts: FloatArray
     episode: npt.NDArray[np.int64]
+    scene_id: npt.NDArray[np.str_]
 
     def __len__(self) -> int:
         return len(self.history)
@@ -97,8 +99,9 @@ class Examples:
             )
             columns["facts"].append(scene_facts(labelled))
             columns["episode"].append(labelled.seed)
+            columns["scene_id"].append(scene.scene_id)
         types: dict[str, Any] = {"picture_spans": np.int64, "plan_bins": np.int8, "dense_classes": np.uint8}
-        types |= {"dense_range_log": np.float16, "episode": np.int64}
+        types |= {"dense_range_log": np.float16, "episode": np.int64, "scene_id": np.str_}
         arrays = {
             name: np.asarray(values, types.get(name, np.float32))
             for name, values in columns.items()

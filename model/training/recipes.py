@@ -32,6 +32,8 @@ class Recipe:
         learning_rate, warmup_steps: cosine decay to zero behind a linear warm-up.
         vision_rate: the tower's learning rate, relative to the rest; 0 leaves the tower as it is.
         probe: whether a `SceneProbe` is trained along.
+        reflections: what becomes of the reflections of a build: ``learned`` as counterfactual examples, or
+            their ``scenes`` learned once more without them; None where there are none.
         seed: of order and initialisation.
     """
 
@@ -47,6 +49,7 @@ class Recipe:
     weights: SectionWeights = field(default_factory=lambda: PAPER_WEIGHTS)
     vision_rate: float = 1.0
     probe: bool = False
+    reflections: Literal["learned", "scenes"] | None = None
     seed: int = 0
 
 
@@ -93,9 +96,33 @@ NANO: Final[Mapping[str, Recipe]] = {
             weights=NANO_WEIGHTS,
             probe=True,
         ),
+        Recipe(
+            "counterfactual",
+            "respond",
+            steps=3000,
+            batch_size=16,
+            learning_rate=2.5e-4,
+            warmup_steps=200,
+            tasks={"traj_only": 0.25, "cf_vla": 0.75},
+            weights=NANO_WEIGHTS,
+            probe=True,
+            reflections="learned",
+        ),
+        Recipe(
+            "multi-round",
+            "respond",
+            steps=3000,
+            batch_size=16,
+            learning_rate=2.5e-4,
+            warmup_steps=200,
+            tasks={"traj_only": 0.25, "cf_vla": 0.75},
+            weights=NANO_WEIGHTS,
+            probe=True,
+            reflections="scenes",
+        ),
     )
 }
-"""The stages of the shipped checkpoint."""
+"""The stages of the shipped checkpoint, and the control of its last one."""
 
 PAPER: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe
@@ -117,6 +144,26 @@ PAPER: Final[Mapping[str, Recipe]] = {
             learning_rate=1e-5,
             warmup_steps=2000,
             tasks={"traj_only": 0.5, "cf_vla": 0.5},
+        ),
+        Recipe(
+            "counterfactual",
+            "respond",
+            steps=300_000,
+            batch_size=1,
+            learning_rate=5e-6,
+            warmup_steps=2000,
+            tasks={"traj_only": 0.5, "cf_vla": 0.5},
+            reflections="learned",
+        ),
+        Recipe(
+            "multi-round",
+            "respond",
+            steps=300_000,
+            batch_size=1,
+            learning_rate=5e-6,
+            warmup_steps=2000,
+            tasks={"traj_only": 0.5, "cf_vla": 0.5},
+            reflections="scenes",
         ),
     )
 }

@@ -15,6 +15,7 @@ import torch
 from torch import nn
 from torch.utils.data import Dataset
 
+from model.driving.reflection_store import read_reflections
 from model.driving.scene import LabelledScene
 from model.network.attention import MATMUL_ATTENTION
 from model.network.checkpoint import Loaded, create_nano, load, save
@@ -28,6 +29,7 @@ from model.training.grounding import GroundingDataset, GroundingLearner, collate
 from model.training.learner import ResponseLearner
 from model.training.probe import SceneProbe
 from model.training.recipes import Recipe
+from model.training.reflections import OnExamples, reflections_on
 from model.training.trainer import LOG_FILE, LearnerTrainer, Validate
 from model.training.validation import open_loop
 
@@ -72,6 +74,7 @@ def run(
     settings: RunSettings,
     validation: Sequence[LabelledScene] = (),
     vision_source: Path | None = None,
+    reflections: Path | None = None,
 ) -> None:
     """Train ``source`` by a recipe and write the outcome to ``target``, weights in bfloat16.
 
@@ -87,7 +90,15 @@ def run(
         validation: scenes to report open-loop errors on while training with pictures.
         vision_source: a checkpoint whose vision tower replaces the source's; so the tower can be grounded
             while another process trains the language.
+        reflections: file of the reflections that the recipe asks for.
+
+    Raises:
+        ValueError: the recipe wants reflections and there are none, or the other way round, or they are on
+            other scenes.
     """
+    if (reflections is None) != (recipe.reflections is None):
+        wants = "needs reflections" if reflections is None else "takes no reflections"
+        raise ValueError(f"recipe {recipe.name} {wants}")
     loaded = load(source)
     stages = list(loaded.card.details.get("stages", []))
     if vision_source is not None:
@@ -101,7 +112,8 @@ def run(
     validate: Validate | None = None
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
-    learner, dataset, sampler, collator = _prepare(recipe, loaded, examples, settings.compiled)
+    on_examples = None if reflections is None else reflections_on(examples, read_reflections(reflections))
+    learner, dataset, sampler, collator = _prepare(recipe, loaded, examples, on_examples, settings.compiled)
     trainer = LearnerTrainer(
         learner,
         recipe,
@@ -128,7 +140,7 @@ def run(
         loaded.vocabulary,
         loaded.codec,
         dtype=torch.bfloat16,
-        details={"stages": [*stages, _about(recipe, examples)]},
+        details={"stages": [*stages, _about(recipe, examples, on_examples)]},
     )
 
 
@@ -147,7 +159,7 @@ def last_whole_state(folder: Path) -> str | None:
 
 
 def _prepare(
-    recipe: Recipe, loaded: Loaded, examples: Examples, compiled: bool
+    recipe: Recipe, loaded: Loaded, examples: Examples, on_examples: OnExamples | None, compiled: bool
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
     if recipe.goal == "ground":
         shape = examples.dense_classes.shape[2:4]
@@ -160,6 +172,7 @@ def _prepare(
         loaded.vocabulary,
         recipe.weights,
         pictures=recipe.pictures,
+        reflections=() if on_examples is None else on_examples.reflections,
         seed=recipe.seed,
     )
     has_route = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
@@ -170,6 +183,8 @@ def _prepare(
         recipe.route_share,
         recipe.seed,
         processes=int(os.environ.get("WORLD_SIZE", 1)),
+        reflected=np.zeros(0, np.int64) if on_examples is None else on_examples.examples,
+        reasoning=recipe.reflections == "learned",
     )
     loaded.model.model.visual.requires_grad_(recipe.vision_rate > 0)
     text: Any = loaded.model.config.text_config
@@ -190,7 +205,9 @@ def _inherit_log(log: Path, sources: Sequence[Path]) -> None:
     log.write_text("".join(rows))
 
 
-def _about(recipe: Recipe, examples: Examples) -> Mapping[str, Any]:
+def _about(recipe: Recipe, examples: Examples, on_examples: OnExamples | None) -> Mapping[str, Any]:
     about = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     about |= {"tasks": dict(recipe.tasks), "weights": dict(recipe.weights)}
+    if on_examples is not None:
+        about["reflections_count"] = len(on_examples.reflections)
     return about | {"examples": len(examples), "episodes": len(np.unique(examples.episode))}

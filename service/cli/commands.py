@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 import service.cli.bench as bench
+import service.cli.build as build
 import service.cli.evaluate as evaluate
 import service.cli.plan as plan
 import service.cli.scenes as scenes
@@ -21,5 +22,6 @@ app.command("plan")(plan.plan)
 app.command("serve")(serve.serve)
 app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
+app.add_typer(build.app, name="build")
 app.add_typer(bench.bench, name="bench")
 app.add_typer(scenes.app, name="scenes")

@@ -23,8 +23,9 @@ def serve(
     import uvicorn
 
     from service.app import create_app
-    from service.settings import Settings
+    from service.settings import Settings, TeacherSettings
 
     with told():
         made = make_engine(checkpoint, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
-        uvicorn.run(create_app(made, Settings()), host=host, port=port, log_config=None)
+        app = create_app(made, Settings(), teacher=TeacherSettings().teacher())
+        uvicorn.run(app, host=host, port=port, log_config=None)

@@ -12,11 +12,17 @@ from service.cli.options import told
 
 
 def train(
-    recipe: Annotated[str, typer.Argument(help="create, language, ground, traj-only or meta-act.")],
+    recipe: Annotated[
+        str,
+        typer.Argument(help="create, language, ground, traj-only, meta-act, counterfactual or multi-round."),
+    ],
     scenes: Annotated[Path, typer.Option(help="Training scenes: a file or a folder.")],
     target: Annotated[Path, typer.Option("--to", help="Checkpoint folder to write.")],
     source: Annotated[Path | None, typer.Option("--from", help="Checkpoint folder to start from.")] = None,
     vision_from: Annotated[Path | None, typer.Option(help="Checkpoint whose vision tower is taken.")] = None,
+    reflections: Annotated[
+        Path | None, typer.Option(help="A build's reflections, for counterfactual and multi-round.")
+    ] = None,
     validation: Annotated[
         Path | None, typer.Option(help="Scenes to report errors on while training.")
     ] = None,
@@ -79,5 +85,6 @@ def train(
             RunSettings(cache, bf16=bf16, compiled=compiled, use_cpu=not gpu),
             held_out,
             vision_from,
+            reflections,
         )
         training_curves(target / LOG_FILE, target / "curves.png")

@@ -12,7 +12,7 @@ from typing import Final
 
 from clients.labelling.checks import FailedCheck
 from clients.labelling.direction import Change, wanted_changes
-from clients.labelling.teachers.teacher import Question, TeacherError
+from clients.labelling.teachers.teacher import Answer, Question, TeacherError
 from clients.labelling.teachers.view import Sight, View, view_of
 from model.driving.plan import Group, Plan, format_tick
 from model.driving.scene import AgentKind
@@ -34,7 +34,7 @@ class RuleTeacher:
     name: Final = "rules"
     revision: Final = "1"
 
-    async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> str:
+    async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
         """One paragraph; the same for the same question, another one after complaints.
 
         Raises:
@@ -47,9 +47,12 @@ class RuleTeacher:
         view = view_of(scene, question.surroundings)
         changes = wanted_changes(predicted, expert)
         if not changes:
-            return _nothing_to_change(view, chance)
+            return Answer(_nothing_to_change(view, chance))
         said = [_on(min(each), view, predicted, expert, chance) for each in changes[:2]]
-        return " ".join(said)
+        return Answer(" ".join(said))
+
+    async def close(self) -> None:
+        """There is nothing to close."""
 
 
 def _on(change: Change, view: View, predicted: Plan, expert: Plan, chance: random.Random) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from clients.labelling.checks import FailedCheck, check_reflection
+from clients.labelling.teachers.patience import TryLater
 from clients.labelling.teachers.view import Surroundings
 from model.driving.plan import Plan
 from model.driving.scene import Scene
@@ -18,18 +19,44 @@ class TeacherError(Exception):
     """A teacher that cannot answer a question; the text says what it lacks."""
 
 
+class TeacherBusy(TeacherError, TryLater):
+    """A teacher that has no time, or is not there now: the same question may be answered later."""
+
+
+class TeacherClosed(TeacherError):
+    """A teacher that answers nobody as things are set up: a wrong key, model or address."""
+
+
 class ReflectionRefused(Exception):
     """A teacher whose answers failed the checks every time.
 
     Attributes:
         text: its last answer.
-        failed: what was wrong with that.
+        failed: what was wrong with all of them.
         attempts: how often it was asked.
     """
 
-    def __init__(self, text: str, failed: Sequence[FailedCheck], attempts: int) -> None:
-        super().__init__("; ".join(f"{each.check}: {each.detail}" for each in failed))
+    def __init__(
+        self, text: str, last: Sequence[FailedCheck], failed: Sequence[FailedCheck], attempts: int
+    ) -> None:
+        super().__init__("; ".join(f"{each.check}: {each.detail}" for each in last))
         self.text, self.failed, self.attempts = text, tuple(failed), attempts
+
+
+class Answer(NamedTuple):
+    """What a teacher wrote, and what that took.
+
+    Attributes:
+        text: as it came; unchecked.
+        input_tokens, output_tokens, cost_usd: as the teacher counts; 0 where it does not.
+        unusable: why it is no answer; empty where it is one.
+    """
+
+    text: str
+    input_tokens: int = 0
+    output_tokens: int = 0
+    cost_usd: float = 0.0
+    unusable: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +88,20 @@ class Teacher(Protocol):
 
     @property
     def revision(self) -> str:
-        """Changes when it would write something else."""
+        """Changes when it would write something else: model, prompt, sampling."""
         ...
 
-    async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> str:
-        """One paragraph; ``complaints`` say what was wrong with earlier ones. Raises `TeacherError`."""
+    async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
+        """One paragraph; ``complaints`` say what was wrong with earlier ones.
+
+        Raises:
+            TeacherError: it cannot answer; `TeacherBusy` where it could later, `TeacherClosed` where no
+                question would be answered.
+        """
+        ...
+
+    async def close(self) -> None:
+        """Nothing more will be asked."""
         ...
 
 
@@ -78,18 +114,47 @@ class Reflection:
     failed: tuple[FailedCheck, ...]
 
 
-async def ask(teacher: Teacher, question: Question, attempts: int = ATTEMPTS) -> Reflection:
-    """A teacher's checked answer; it is asked again with what was wrong, a few times.
+async def ask(
+    teacher: Teacher,
+    question: Question,
+    answers: list[Answer],
+    keep: Callable[[int, Answer], None] = lambda attempt, answer: None,
+) -> Reflection:
+    """A teacher's checked answer; it is asked again with what was wrong, `ATTEMPTS` times in all.
+
+    Args:
+        teacher: who is asked.
+        question: what.
+        answers: that it gave before to this question, in order; new ones are added, so that asking goes on
+            where it was broken off.
+        keep: told of each new answer, with its number from 1 on, before anything is made of it.
 
     Raises:
         TeacherError: it cannot answer.
         ReflectionRefused: none of its answers passed the checks.
     """
+    while not isinstance(verdict := judge(question, answers), Reflection):
+        answers.append(await teacher.reflect(question, verdict))
+        keep(len(answers), answers[-1])
+    return verdict
+
+
+def judge(question: Question, answers: Sequence[Answer]) -> Reflection | tuple[FailedCheck, ...]:
+    """The first answer that passes all checks, or what to tell the teacher when it is asked again.
+
+    Raises:
+        ReflectionRefused: it was asked `ATTEMPTS` times already.
+    """
     complaints: list[FailedCheck] = []
-    for attempt in range(1, attempts + 1):
-        text = await teacher.reflect(question, complaints)
-        failed = check_reflection(text, question.predicted, question.expert)
+    for attempt, answer in enumerate(answers, 1):
+        failed = (
+            [FailedCheck("answer", answer.unusable)]
+            if answer.unusable
+            else check_reflection(answer.text, question.predicted, question.expert)
+        )
         if not failed:
-            return Reflection(text, attempt, tuple(complaints))
+            return Reflection(answer.text, attempt, tuple(complaints))
         complaints += failed
-    raise ReflectionRefused(text, failed, attempts)
+        if attempt == ATTEMPTS:
+            raise ReflectionRefused(answer.text, failed, complaints, ATTEMPTS)
+    return tuple(complaints)

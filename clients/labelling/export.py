@@ -1,0 +1,123 @@
+"""What a build is for: reflections to train on, in our own form and in that of other trainers."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from clients.labelling.ledger import Ledger, LedgerError, Run
+from clients.labelling.teachers.prompt import camera_line
+from model.driving.images import media_type
+from model.driving.plan import parse_plan
+from model.driving.reflection_store import LabelledReflection
+from model.driving.scene import Scene
+from model.driving.scene_store import read_scenes
+from model.driving.trajectory import present_speed
+
+MESSAGES_FILE: Final = "messages.jsonl"
+DATASET: Final = "looktwice"
+
+
+def reflections(ledger: Ledger, label: Run) -> Iterator[LabelledReflection]:
+    """What a teacher wrote, with its provenance, scene by scene."""
+    rollout = next((run for run in ledger.runs("rollout") if run.id == label.config["rollout"]), None)
+    if rollout is None:
+        raise LedgerError("the labels' rollout is not in the ledger")
+    for entry in ledger.entries(label):
+        yield LabelledReflection(
+            scene_id=entry.scene_id,
+            predicted_plan=parse_plan(entry.record["predicted_plan"]),
+            reflection=entry.record["reflection"],
+            expert_plan=parse_plan(entry.record["expert_plan"]),
+            key=entry.key,
+            model=rollout.config["model"],
+            model_revision=rollout.config["revision"],
+            teacher=label.config["teacher"],
+            teacher_revision=label.config["revision"],
+            attempts=entry.record["attempts"],
+            labelled_at=entry.ended_at,
+        )
+
+
+def write_messages(ledger: Ledger, label: Run, scenes: Path, folder: Path) -> int:
+    """Write a data set of messages and images that LLaMA-Factory and TRL read; returns its length.
+
+    The scene and the plan to be corrected are the user's, the reflection and the better plan the
+    assistant's: so a trainer that learns what assistants say leaves the wrong plan out by itself.
+    """
+    by_scene: dict[str, list[LabelledReflection]] = {}
+    for each in reflections(ledger, label):
+        by_scene.setdefault(each.scene_id, []).append(each)
+    pictures = folder / "images"
+    pictures.mkdir(parents=True, exist_ok=True)
+    temporary = folder / f".{MESSAGES_FILE}.{os.getpid()}"
+    count = 0
+    with temporary.open("w") as lines:
+        for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None):
+            for each in by_scene.pop(labelled.scene.scene_id, []):
+                row = _row(labelled.scene, each, _write_images(labelled.scene, pictures))
+                lines.write(json.dumps(row) + "\n")
+                count += 1
+    if by_scene:
+        temporary.unlink()
+        raise LedgerError(f"{len(by_scene)} labelled scenes are not at {scenes}, such as {min(by_scene)}")
+    os.replace(temporary, folder / MESSAGES_FILE)
+    (folder / "dataset_info.json").write_text(json.dumps(_DATASET_INFO, indent=2) + "\n")
+    return count
+
+
+_DATASET_INFO: Final = {
+    DATASET: {
+        "file_name": MESSAGES_FILE,
+        "formatting": "sharegpt",
+        "columns": {"messages": "messages", "images": "images"},
+        "tags": {
+            "role_tag": "role",
+            "content_tag": "content",
+            "user_tag": "user",
+            "assistant_tag": "assistant",
+        },
+    }
+}
+
+
+def _write_images(scene: Scene, folder: Path) -> list[str]:
+    """A scene's pictures as files, by name relative to the data set."""
+    names = []
+    for clip in scene.clips:
+        for number, image in enumerate(clip.images):
+            name = f"{_file_name(scene.scene_id)}-{clip.camera}-{number}{_suffix(image)}"
+            (folder / name).write_bytes(image)
+            names.append(f"{folder.name}/{name}")
+    return names
+
+
+def _row(scene: Scene, labelled: LabelledReflection, images: list[str]) -> dict[str, Any]:
+    cameras = "\n".join(f"{camera_line(clip)}\n{'<image>' * len(clip.images)}" for clip in scene.clips)
+    asked = (
+        f"{cameras}\nYou drive at {present_speed(scene.history):.1f} m/s.\n"
+        f"Your plan for the next 6.4 seconds:\n{labelled.predicted_plan}"
+        "Reflect on it, then correct it."
+    )
+    answered = f"Thinking:\n{labelled.reflection}\nMeta Actions:\n{labelled.expert_plan}"
+    return {
+        "messages": [
+            {"role": "user", "content": asked},
+            {"role": "assistant", "content": answered.rstrip("\n")},
+        ],
+        "images": images,
+        "scene_id": labelled.scene_id,
+        "key": labelled.key,
+    }
+
+
+def _file_name(scene_id: str) -> str:
+    """A scene's id as part of a file's name."""
+    return "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in scene_id)
+
+
+def _suffix(image: bytes) -> str:
+    return {"image/jpeg": ".jpg", "image/png": ".png", "image/webp": ".webp"}[media_type(image)]

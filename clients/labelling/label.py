@@ -1,0 +1,129 @@
+"""Label: a teacher's reflection on the model's own plan, for every scene that the filter kept."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from clients.labelling.checks import FailedCheck
+from clients.labelling.ledger import Entry, Ledger, Record, Run, hash_of
+from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
+from clients.labelling.rollout import scene_hash
+from clients.labelling.teachers.teacher import (
+    ATTEMPTS,
+    Question,
+    Reflection,
+    ReflectionRefused,
+    Teacher,
+    TeacherBusy,
+    TeacherClosed,
+    TeacherError,
+    ask,
+)
+from clients.labelling.teachers.view import Surroundings
+from model.driving.plan import parse_plan
+from model.driving.scene import LabelledScene
+from model.driving.scene_store import read_scenes
+
+CHECKS_VERSION: Final = 1
+"""Of `clients.labelling.checks`; raised when they ask for something else."""
+
+
+class Asked(NamedTuple):
+    """A question, and the rollout that it comes from."""
+
+    entry: Entry
+    question: Question
+
+
+def config_of(rollout: Run, teacher: Teacher, seed: int) -> Record:
+    """What decides a label besides the scene and the predicted plan."""
+    return {
+        "rollout": rollout.id,
+        "teacher": teacher.name,
+        "revision": teacher.revision,
+        "checks": CHECKS_VERSION,
+        "attempts": ATTEMPTS,
+        "seed": seed,
+    }
+
+
+def questions(
+    ledger: Ledger, rollout: Run, scenes: Path, *, plans_per_scene: int = 1, seed: int = 0
+) -> Iterator[Asked]:
+    """What a teacher is to be asked: each kept scene with some of the plans that the model made freely.
+
+    Which plans is left to chance, once and for all for a scene and a seed.
+    """
+    for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None):
+        entry = ledger.kept(hash_of(rollout.id, scene_hash(labelled)))
+        if entry is None:
+            continue
+        for text in predicted_plans(entry, plans_per_scene, seed):
+            yield Asked(entry, _question(labelled, entry, text, seed))
+
+
+def predicted_plans(entry: Entry, count: int, seed: int) -> list[str]:
+    """Different ones of a scene's free draws, at random."""
+    texts = list(dict.fromkeys(draw["plan"] for draw in entry.record["free"]))
+    random.Random(f"{entry.key}/{seed}").shuffle(texts)
+    return texts[:count]
+
+
+def jobs(run: Run, asked: Iterator[Asked]) -> Iterator[Job[Asked]]:
+    """Questions as pieces of work."""
+    for each in asked:
+        key = hash_of(run.id, each.entry.key, str(each.question.predicted))
+        yield Job(key, each.entry.scene_id, each)
+
+
+def labeller(ledger: Ledger, run: Run, teacher: Teacher) -> Callable[[Job[Asked]], Awaitable[Record]]:
+    """Asks ``teacher`` and makes records of its answers, each of which is in the ledger before it is read."""
+
+    async def label(job: Job[Asked]) -> Record:
+        try:
+            reflection = await ask(
+                teacher,
+                job.subject.question,
+                ledger.answers(job.key),
+                lambda attempt, answer: ledger.answered(run, job.key, attempt, answer),
+            )
+        except TeacherBusy:
+            raise
+        except TeacherClosed as error:
+            raise StageStopped(f"{teacher.name}: {error}") from error
+        except TeacherError as error:
+            raise CannotBeDone(str(error)) from error
+        except ReflectionRefused as error:
+            raise refused(error) from error
+        return record(job.subject, reflection)
+
+    return label
+
+
+def record(asked: Asked, reflection: Reflection) -> Record:
+    """What the ledger keeps of a label."""
+    return {
+        "rollout": asked.entry.key,
+        "predicted_plan": str(asked.question.predicted),
+        "expert_plan": str(asked.question.expert),
+        "reflection": reflection.text,
+        "attempts": reflection.attempts,
+        "failed_checks": _told(reflection.failed),
+    }
+
+
+def refused(error: ReflectionRefused) -> CannotBeDone:
+    """The dead letter of a question whose answers all failed."""
+    return CannotBeDone(str(error), text=error.text, failed_checks=_told(error.failed))
+
+
+def _told(failed: Sequence[FailedCheck]) -> list[str]:
+    return [f"{each.check}: {each.detail}" for each in failed]
+
+
+def _question(labelled: LabelledScene, entry: Entry, predicted: str, seed: int) -> Question:
+    expert = parse_plan(entry.record["expert_plan"])
+    return Question(labelled.scene, parse_plan(predicted), expert, Surroundings.of(labelled), seed)

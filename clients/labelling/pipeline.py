@@ -1,0 +1,148 @@
+"""One stage of a build: many pieces of work, each done once, whatever happens meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final, Generic, TypeVar
+
+from clients.labelling.crowd import Crowd
+from clients.labelling.ledger import Ledger, Record, Run
+from clients.labelling.teachers.patience import TryLater, patiently
+
+_Subject = TypeVar("_Subject")
+
+ERRORS_COUNT_FROM: Final = 20
+"""Pieces of work before a share of errors means anything."""
+
+
+class CannotBeDone(Exception):
+    """A piece of work that will never succeed; it becomes a dead letter.
+
+    Attributes:
+        more: what else its dead letter says.
+    """
+
+    def __init__(self, reason: str, **more: Any) -> None:
+        super().__init__(reason)
+        self.more = more
+
+
+class StageStopped(RuntimeError):
+    """A stage that ended early; what is done is kept, and the same command goes on with the rest."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How a stage is run.
+
+    Attributes:
+        at_once: most pieces of work under way.
+        give_up_after_s: that the other side may be away before the stage stops.
+        max_error_rate: share of dead letters among what ended, beyond which the stage stops.
+    """
+
+    at_once: int = 32
+    give_up_after_s: float = 300.0
+    max_error_rate: float = 0.1
+
+
+@dataclass(frozen=True)
+class Job(Generic[_Subject]):
+    """A piece of work; ``key`` stands for all that decides its outcome."""
+
+    key: str
+    scene_id: str
+    subject: _Subject
+
+
+@dataclass
+class Tally:
+    """What a stage did this time, in how many seconds; ``earlier`` were there before."""
+
+    done: int = 0
+    dead: int = 0
+    earlier: int = 0
+    seconds: float = 0.0
+
+
+async def work_through(
+    ledger: Ledger,
+    run: Run,
+    jobs: Iterator[Job[_Subject]],
+    do: Callable[[Job[_Subject]], Awaitable[Record]],
+    limits: Limits = Limits(),
+    on_progress: Callable[[Tally], None] = lambda _: None,
+) -> Tally:
+    """Do what the ledger does not have yet, several at once, and enter each outcome as it comes.
+
+    Args:
+        ledger: what is done.
+        run: what the outcomes belong to.
+        jobs: in any order; read as they are needed, on another thread.
+        do: makes a record; may raise `TryLater` or `CannotBeDone`.
+        limits: see there.
+        on_progress: told after every piece of work.
+
+    Raises:
+        StageStopped: too many errors, or the other side is away for too long.
+    """
+    crowd, tally, began_s = Crowd(limits.at_once), Tally(), time.monotonic()
+    under_way: set[asyncio.Task[None]] = set()
+    begun: set[str] = set()
+
+    async def attempt(job: Job[_Subject]) -> Record:
+        async with crowd.place():
+            return await do(job)
+
+    async def finish(job: Job[_Subject]) -> None:
+        try:
+            record = await patiently(lambda: attempt(job), limits.give_up_after_s)
+        except CannotBeDone as error:
+            ledger.bury(run, job.key, job.scene_id, str(error), **error.more)
+            tally.dead += 1
+        except TryLater as error:
+            raise StageStopped(f"nothing came for {limits.give_up_after_s:g} s: {error}") from error
+        else:
+            ledger.finish(run, job.key, job.scene_id, record)
+            tally.done += 1
+        on_progress(tally)
+        ended = tally.done + tally.dead
+        if ended >= ERRORS_COUNT_FROM and tally.dead > limits.max_error_rate * ended:
+            raise StageStopped(
+                f"{tally.dead} of {ended} could not be done, the last one ({job.scene_id}) because: "
+                f"{_last_reason(ledger, run)}"
+            )
+
+    async def collect(count: int) -> None:
+        """Wait until at most ``count`` are under way; raises what one of them raised."""
+        nonlocal under_way
+        while len(under_way) > count:
+            ended, under_way = await asyncio.wait(under_way, return_when=asyncio.FIRST_COMPLETED)
+            for task in ended:
+                task.result()
+
+    try:
+        while (job := await asyncio.to_thread(next, jobs, None)) is not None:
+            if ledger.has(job.key) or job.key in begun:
+                tally.earlier += 1
+                on_progress(tally)
+                continue
+            begun.add(job.key)
+            # One more than may run waits at the door, so that a place is taken as soon as it is free.
+            await collect(crowd.allowed)
+            under_way.add(asyncio.create_task(finish(job)))
+        await collect(0)
+        tally.seconds = time.monotonic() - began_s
+    finally:
+        for task in under_way:
+            task.cancel()
+        await asyncio.gather(*under_way, return_exceptions=True)
+    return tally
+
+
+def _last_reason(ledger: Ledger, run: Run) -> str:
+    latest = max(ledger.entries(run, "dead"), key=lambda entry: entry.ended_at)
+    return str(latest.record["reason"])

@@ -1,0 +1,135 @@
+"""Rollout: what a served model does in a scene, alone and with the expert's plan (CF-VLA section 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clients import wire
+from clients.answers import PlannerProblem, PlannerUnreachable, PlanResult, RequestRefused, ServiceBusy
+from clients.labelling.ledger import Record, Run, hash_of
+from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
+from clients.labelling.teachers.patience import TryLater
+from clients.planner import AsyncPlannerClient, Patience
+from model.driving.labeller import label_plan
+from model.driving.metrics import displacement_errors
+from model.driving.plan import Plan, plan_iou
+from model.driving.scene import LabelledScene, Scene
+from model.driving.scene_store import read_scenes
+
+PATIENCE = Patience(timeout_s=120.0, attempts=1)
+"""Who waits how long is the pipeline's to say."""
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How responses are drawn; a part of every key.
+
+    Attributes:
+        n: draws, both freely and with the expert's plan.
+        temperature, top_p, seed: as in `wire.Controls`.
+        route: whether the model is told the route.
+    """
+
+    n: int = 6
+    temperature: float = 1.0
+    top_p: float = 1.0
+    seed: int = 0
+    route: bool = True
+
+    @property
+    def controls(self) -> wire.Controls:
+        """As the service takes them."""
+        return wire.Controls(n=self.n, temperature=self.temperature, top_p=self.top_p, seed=self.seed)
+
+
+def config_of(model: wire.ModelName, sampling: Sampling) -> Record:
+    """What decides a rollout besides the scene."""
+    return {"model": model.name, "revision": model.revision, **asdict(sampling)}
+
+
+def scene_hash(labelled: LabelledScene) -> str:
+    """Stands for a scene with its pictures, its way and its expert."""
+    scene = labelled.scene
+    arrays = (scene.history, labelled.future, *(() if scene.route is None else (scene.route,)))
+    pictures = [picture for clip in scene.clips for picture in (clip.camera.encode(), *clip.images)]
+    return hash_of(scene.scene_id, *pictures, *(array.tobytes() for array in arrays))
+
+
+def jobs(run: Run, scenes: Path, unlabelled: Callable[[str], None]) -> Iterator[Job[LabelledScene]]:
+    """The scenes of a file or folder as pieces of work; ``unlabelled`` is told of those without a future."""
+    for labelled in read_scenes(scenes, dense=False, unlabelled=unlabelled):
+        yield Job(hash_of(run.id, scene_hash(labelled)), labelled.scene.scene_id, labelled)
+
+
+def expert_plan(labelled: LabelledScene) -> Plan:
+    """What the expert did, in words."""
+    return label_plan(labelled.future, labelled.scene.history, labelled.lane_trace)
+
+
+async def roll_out(
+    planner: AsyncPlannerClient, labelled: LabelledScene, model: wire.ModelName, sampling: Sampling
+) -> Record:
+    """The record of one scene.
+
+    Raises:
+        TryLater: the service is busy or away.
+        CannotBeDone: it refuses the scene.
+        StageStopped: another model answers than before.
+    """
+    expert = expert_plan(labelled)
+    scene = labelled.scene if sampling.route else _without_route(labelled.scene)
+    try:
+        free = await planner.plan(scene, sampling.controls)
+        given = await planner.plan(scene, sampling.controls, prefill=expert)
+    except ServiceBusy as error:
+        raise TryLater(str(error), error.retry_after_s) from error
+    except PlannerUnreachable as error:
+        raise TryLater(str(error)) from error
+    except RequestRefused as error:
+        raise CannotBeDone(error.detail, type=error.type) from error
+    except PlannerProblem as error:
+        raise CannotBeDone(str(error), type=error.type) from error
+    for answer in (free, given):
+        if answer.model != model:
+            raise StageStopped(
+                f"the service now runs {answer.model.name} {answer.model.revision} instead of "
+                f"{model.revision}; run again to roll that one out"
+            )
+    return {
+        "tags": sorted(labelled.tags),
+        "expert_plan": str(expert),
+        "free": _draws(free, labelled, expert),
+        "prefilled": _draws(given, labelled, None),
+    }
+
+
+def _draws(result: PlanResult, labelled: LabelledScene, expert: Plan | None) -> list[dict[str, Any]]:
+    told = []
+    for draw in result.draws:
+        errors = displacement_errors(draw.trajectory[None], labelled.future)
+        row: dict[str, Any] = {"ade_m": round(errors.min_ade_m, 4), "tokens": sum(draw.tokens.values())}
+        if expert is not None and draw.plan is not None:
+            row |= {
+                "plan": str(draw.plan),
+                "plan_iou": round(plan_iou(draw.plan, expert), 4),
+                "branch": draw.branch,
+                "think_probability": draw.think_probability,
+            }
+            if draw.revised_plan is not None:
+                row |= {"thinking": draw.thinking, "revised_plan": str(draw.revised_plan)}
+        told.append(row)
+    return told
+
+
+def _without_route(scene: Scene) -> Scene:
+    return Scene(scene.scene_id, scene.clips, scene.history)
+
+
+def min_ade_m(draws: list[dict[str, Any]]) -> float:
+    """The smallest average displacement error of some draws."""
+    return float(np.min([draw["ade_m"] for draw in draws]))

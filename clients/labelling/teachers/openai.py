@@ -1,0 +1,170 @@
+"""A teacher behind any OpenAI-compatible endpoint: vLLM, SGLang, Ollama, or a paid one."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import httpx
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from clients.answers import retry_after_s
+from clients.labelling.checks import FailedCheck
+from clients.labelling.teachers.prompt import PROMPT_VERSION, SYSTEM, Part, Text, user_message
+from clients.labelling.teachers.teacher import (
+    Answer,
+    Question,
+    TeacherBusy,
+    TeacherClosed,
+    TeacherError,
+)
+from model.driving.images import media_type
+
+_BUSY: Final = (408, 409, 425, 429, 500, 502, 503, 504, 529)
+_CLOSED: Final = (401, 402, 403, 404, 405)
+_SHOWN: Final = 300
+"""Characters of an error's body that are told."""
+
+
+@dataclass(frozen=True)
+class OpenAiSettings:
+    """Where a teacher is, and how it is asked.
+
+    Attributes:
+        base_url: up to and without ``/chat/completions``, such as ``https://api.openai.com/v1``.
+        model: as the endpoint calls it.
+        api_key: sent as a bearer token; None where none is needed. Never shown or stored.
+        temperature, max_tokens: of sampling.
+        timeout_s: for one answer.
+        input_price_usd, output_price_usd: for a million tokens, to count costs by.
+        extra_body: more fields of the request, such as an endpoint's own sampling options; null takes a
+            field out.
+    """
+
+    base_url: str
+    model: str
+    api_key: str | None = field(default=None, repr=False)
+    temperature: float = 0.7
+    max_tokens: int = 300
+    timeout_s: float = 60.0
+    input_price_usd: float = 0.0
+    output_price_usd: float = 0.0
+    extra_body: Mapping[str, Any] = field(default_factory=dict)
+
+
+class _Message(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+    content: str | None = None
+
+
+class _Choice(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+    message: _Message
+    finish_reason: str | None = None
+
+
+class _Usage(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+    prompt_tokens: int = 0
+    completion_tokens: int = 0
+
+
+class _Completion(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+    choices: list[_Choice] = []
+    usage: _Usage | None = None
+
+
+class OpenAiTeacher:
+    """`clients.labelling.teachers.teacher.Teacher` over HTTP; asks once, others decide on asking again."""
+
+    def __init__(self, settings: OpenAiSettings) -> None:
+        self._settings = settings
+        headers = {} if settings.api_key is None else {"Authorization": f"Bearer {settings.api_key}"}
+        self._http = httpx.AsyncClient(
+            base_url=settings.base_url.rstrip("/") + "/", timeout=settings.timeout_s, headers=headers
+        )
+
+    @property
+    def name(self) -> str:
+        """The model's name at its endpoint."""
+        return f"openai:{self._settings.model}"
+
+    @property
+    def revision(self) -> str:
+        """Prompt and sampling."""
+        settings = self._settings
+        told = f"prompt {PROMPT_VERSION}, temperature {settings.temperature:g}, {settings.max_tokens} tokens"
+        extra = "".join(f", {name}={value}" for name, value in sorted(settings.extra_body.items()))
+        return told + extra
+
+    async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
+        """See `Teacher.reflect`."""
+        body = completion_request(self._settings, question, complaints)
+        try:
+            response = await self._http.post("chat/completions", json=body)
+        except httpx.HTTPError as error:
+            raise TeacherBusy(f"{type(error).__name__}: {error}") from error
+        status = response.status_code
+        if status in _BUSY:
+            raise TeacherBusy(_told(response), retry_after_s(response))
+        if status in _CLOSED:
+            raise TeacherClosed(_told(response))
+        if status != 200:
+            raise TeacherError(_told(response))
+        return completion_answer(self._settings, response.content)
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+
+def completion_request(
+    settings: OpenAiSettings, question: Question, complaints: Sequence[FailedCheck] = ()
+) -> dict[str, Any]:
+    """The body of POST /chat/completions for a question."""
+    body = {
+        "model": settings.model,
+        "messages": [
+            {"role": "system", "content": SYSTEM},
+            {"role": "user", "content": [_part(part) for part in user_message(question, complaints)]},
+        ],
+        "temperature": settings.temperature,
+        "max_tokens": settings.max_tokens,
+        # Another try gets other random numbers.
+        "seed": question.seed + len(complaints),
+        **settings.extra_body,
+    }
+    return {name: value for name, value in body.items() if value is not None}
+
+
+def completion_answer(settings: OpenAiSettings, content: bytes | str) -> Answer:
+    """What a completion says; `Answer.unusable` where it is none."""
+    try:
+        completion = _Completion.model_validate_json(content)
+    except ValidationError:
+        return Answer("", unusable="the endpoint did not answer with a chat completion")
+    used = completion.usage or _Usage()
+    cost_usd = (
+        used.prompt_tokens * settings.input_price_usd + used.completion_tokens * settings.output_price_usd
+    ) / 1e6
+    answer = Answer("", used.prompt_tokens, used.completion_tokens, cost_usd)
+    if not completion.choices or not completion.choices[0].message.content:
+        return answer._replace(unusable="write one short paragraph")
+    choice = completion.choices[0]
+    if choice.finish_reason == "length":
+        return answer._replace(unusable="write less: the answer was cut off")
+    return answer._replace(text=(choice.message.content or "").strip())
+
+
+def _part(part: Part) -> dict[str, Any]:
+    if isinstance(part, Text):
+        return {"type": "text", "text": part.text}
+    encoded = base64.b64encode(part.image).decode()
+    return {"type": "image_url", "image_url": {"url": f"data:{media_type(part.image)};base64,{encoded}"}}
+
+
+def _told(response: httpx.Response) -> str:
+    return f"{response.status_code} {response.reason_phrase}: {response.text[:_SHOWN]}"

@@ -1,0 +1,87 @@
+"""What a vision-language teacher is told: task, rules, pictures, both plans (after CF-VLA section 8)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from clients.labelling.checks import MOST_WORDS, FailedCheck
+from clients.labelling.teachers.teacher import Question
+from model.driving.plan import WORDS
+from model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE, Clip
+
+PROMPT_VERSION: Final = 1
+"""Raised with every change of wording: other words, other answers."""
+
+_CAMERAS: Final = {
+    FRONT_WIDE: "looks ahead with a field of view of 120 degrees",
+    FRONT_TELE: "looks ahead with a field of view of 30 degrees",
+}
+_GROUPS: Final = "\n".join(f"- {group}: {', '.join(words)}" for group, words in WORDS.items())
+
+SYSTEM: Final = f"""You are the driver of a car and look back at the plan that you have just made, \
+before you act on it. You see the road through the car's cameras. You write what goes through your \
+mind: what on the road asks for another plan, what would come of the plan as it is, and how to change it.
+
+A plan covers the next 6.4 seconds in three groups of actions, each over a stretch of time:
+{_GROUPS}
+
+You are also given a better plan, as a hint that stays with you: use it to find out what to look \
+for, and let your thoughts lead towards it. Never let on that you have it.
+
+Rules:
+- One paragraph of plain English sentences, in the first person, {MOST_WORDS} words at most. No \
+line breaks, no lists, no markup, no headings.
+- Name what you see that asks for the change: vehicles, people, markings, the run of the road, \
+obstacles, lights.
+- Say what your plan would lead to, and which change is better: slower or faster, which way, which \
+lane.
+- Do not list the better plan, its times or its wording.
+- Do not speak of experts, answers, labels, data, recordings, pictures or predictions, nor of \
+anything that will only be known later. You know what is on the road now, and nothing else.
+- Where the two plans hardly differ, say briefly what on the road supports yours."""
+
+
+@dataclass(frozen=True)
+class Text:
+    """A part of a message."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture, encoded, between parts of text."""
+
+    image: bytes
+
+
+Part = Text | Picture
+
+
+def camera_line(clip: Clip) -> str:
+    """What is said before a clip's pictures."""
+    looks = _CAMERAS.get(clip.camera, "is one of the car's cameras")
+    span_s = CLIP_PERIOD_S * (CLIP_FRAMES - 1)
+    return f"Camera {clip.camera} {looks}. What it shows over {span_s:g} seconds, the last one is now:"
+
+
+def user_message(question: Question, complaints: Sequence[FailedCheck]) -> list[Part]:
+    """The question itself, pictures in their order, and what was wrong with earlier answers."""
+    parts: list[Part] = []
+    span_s = CLIP_PERIOD_S * (CLIP_FRAMES - 1)
+    for clip in question.scene.clips:
+        looks = _CAMERAS.get(clip.camera, "is one of the car's cameras")
+        parts.append(
+            Text(f"Camera {clip.camera} {looks}. What it shows over {span_s:g} seconds, the last one is now:")
+        )
+        parts += [Picture(image) for image in clip.images]
+    parts.append(
+        Text(f"The better plan, for you alone:\n{question.expert}\nYour plan:\n{question.predicted}")
+    )
+    if complaints:
+        told = "\n".join(f"- {each.detail}" for each in dict.fromkeys(complaints))
+        parts.append(Text(f"You wrote a paragraph before that cannot be used. This time:\n{told}"))
+    parts.append(Text("Write the paragraph."))
+    return parts

@@ -1,0 +1,49 @@
+"""Scenes and what is known about them, as `clients.wire` carries them."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+
+from clients import wire
+from model.driving.scene import Agent, Scene
+
+
+def wire_scene(scene: Scene, decimals: int | None = None) -> wire.Scene:
+    """A scene; numbers rounded to so many ``decimals``, or as they are."""
+    return wire.Scene(
+        scene_id=scene.scene_id,
+        clips=[
+            wire.Clip(
+                camera=cast(wire.Camera, clip.camera),
+                images=[base64.b64encode(image).decode() for image in clip.images],
+            )
+            for clip in scene.clips
+        ],
+        history=rows(scene.history, decimals),
+        route=None if scene.route is None else rows(scene.route, decimals),
+    )
+
+
+def wire_agents(agents: Sequence[Agent], decimals: int | None = None) -> list[wire.Agent]:
+    """Agents; poses are null where they are absent."""
+    return [
+        wire.Agent(
+            agent_id=agent.agent_id,
+            kind=agent.kind,
+            length_m=agent.length_m,
+            width_m=agent.width_m,
+            poses=[row if np.isfinite(row).all() else None for row in rows(agent.poses, decimals)],
+        )
+        for agent in agents
+    ]
+
+
+def rows(array: npt.NDArray[np.floating], decimals: int | None = None) -> list[list[float]]:
+    """A table of numbers as lists."""
+    values = array.astype(float)
+    return cast("list[list[float]]", (values if decimals is None else values.round(decimals)).tolist())

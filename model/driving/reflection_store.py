@@ -1,0 +1,116 @@
+"""Reflections in Parquet files: one row a reflection, with its provenance; the D_CF of CF-VLA section 3.3.
+
+A file carries ``looktwice.reflection_version`` in its metadata; readers refuse other versions. It is written
+to a temporary name beside its place and renamed, so a reader never meets half a file.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from model.driving.plan import Plan, PlanError, parse_plan
+
+REFLECTION_VERSION: Final = "1"
+_VERSION_KEY: Final = b"looktwice.reflection_version"
+_ROW_GROUP: Final = 4096
+
+
+class ReflectionFileError(ValueError):
+    """A file of reflections that is missing, damaged, of another version, or holds a row that is none."""
+
+
+@dataclass(frozen=True)
+class LabelledReflection:
+    """A model's own plan in a scene, why it is to be corrected, and the better plan; with its provenance.
+
+    Attributes:
+        scene_id: of a scene in the scene store.
+        predicted_plan: what the model planned.
+        reflection: a teacher's paragraph.
+        expert_plan: what it leads to.
+        key: of the label in the ledger it comes from.
+        model, model_revision: who planned.
+        teacher, teacher_revision: who wrote.
+        attempts: how often the teacher was asked.
+        labelled_at: ISO 8601, UTC.
+    """
+
+    scene_id: str
+    predicted_plan: Plan
+    reflection: str
+    expert_plan: Plan
+    key: str
+    model: str
+    model_revision: str
+    teacher: str
+    teacher_revision: str
+    attempts: int
+    labelled_at: str
+
+
+_SCHEMA: Final = pa.schema(
+    [
+        (name, pa.int32() if name == "attempts" else pa.string())
+        for name in LabelledReflection.__dataclass_fields__
+    ]
+)
+
+
+def write_reflections(path: Path, reflections: Iterable[LabelledReflection]) -> int:
+    """Write ``reflections`` to one file and return how many there were; see the module's first lines."""
+    schema = _SCHEMA.with_metadata({_VERSION_KEY: REFLECTION_VERSION.encode()})
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    count, remaining = 0, iter(reflections)
+    try:
+        with pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True) as writer:
+            while rows := [_to_row(each) for each in islice(remaining, _ROW_GROUP)]:
+                writer.write_table(pa.Table.from_pylist(rows, schema=schema))
+                count += len(rows)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return count
+
+
+def read_reflections(path: Path) -> Iterator[LabelledReflection]:
+    """Yield the reflections of a file.
+
+    Raises:
+        ReflectionFileError: see the class.
+    """
+    try:
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+    except (pa.ArrowException, OSError) as error:
+        raise ReflectionFileError(f"{path} is not a whole Parquet file: {error}") from error
+    version = (file.schema_arrow.metadata or {}).get(_VERSION_KEY, b"").decode()
+    if version != REFLECTION_VERSION:
+        raise ReflectionFileError(
+            f"{path} holds no reflections of version {REFLECTION_VERSION} (found {version or 'none'})"
+        )
+    try:
+        for group in range(file.num_row_groups):
+            for row in file.read_row_group(group).to_pylist():
+                yield _from_row(row)
+    except (pa.ArrowException, OSError) as error:
+        raise ReflectionFileError(f"{path} is damaged: {error}") from error
+    except (PlanError, TypeError) as error:
+        raise ReflectionFileError(f"{path} holds a row that is no reflection: {error}") from error
+
+
+def _to_row(reflection: LabelledReflection) -> dict[str, Any]:
+    plans = {name: str(getattr(reflection, name)) for name in ("predicted_plan", "expert_plan")}
+    return asdict(reflection) | plans
+
+
+def _from_row(row: dict[str, Any]) -> LabelledReflection:
+    plans = {name: parse_plan(row[name]) for name in ("predicted_plan", "expert_plan")}
+    return LabelledReflection(**(row | plans))

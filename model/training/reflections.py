@@ -1,0 +1,32 @@
+"""Reflections of a build, found again among the examples that are trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from model.driving.reflection_store import LabelledReflection
+from model.training.examples import Examples
+from model.training.targets import Reflection
+
+
+class OnExamples(NamedTuple):
+    """Reflections, and the place of the example that each is on, int64 [m]."""
+
+    examples: npt.NDArray[np.int64]
+    reflections: list[Reflection]
+
+
+def reflections_on(examples: Examples, found: Iterable[LabelledReflection]) -> OnExamples:
+    """Reflections with the examples of their scenes; raises `ValueError` where a scene is missing."""
+    place_of = {str(scene_id): place for place, scene_id in enumerate(examples.scene_id)}
+    places, reflections = [], []
+    for each in found:
+        if each.scene_id not in place_of:
+            raise ValueError(f"there is a reflection on scene {each.scene_id}, which is not among the scenes")
+        places.append(place_of[each.scene_id])
+        reflections.append(Reflection(each.predicted_plan, each.reflection))
+    return OnExamples(np.array(places, np.int64), reflections)

@@ -1,0 +1,348 @@
+"""`looktwice build`: a counterfactual data set from a served model and a teacher; every step resumes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import tempfile
+from collections.abc import Awaitable, Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from service.cli.options import Json, told
+
+if TYPE_CHECKING:
+    from clients.labelling.label import Asked
+    from clients.labelling.ledger import Ledger, Record, Run
+    from clients.labelling.pipeline import Job, Limits, Tally
+    from clients.labelling.teachers.openai import OpenAiSettings
+
+app = typer.Typer(
+    help="Build a counterfactual data set: rollout, filter, label, export.", no_args_is_help=True
+)
+
+Folder = Annotated[Path, typer.Argument(help="The build: its ledger and what is made of it.")]
+Scenes = Annotated[Path, typer.Argument(help="Labelled scenes: a file or a folder.")]
+Limit = Annotated[int | None, typer.Option(help="At most so many pieces of work.", min=1)]
+Every = Annotated[int, typer.Option(help="Take every so many-th scene only.", min=1)]
+DryRun = Annotated[int, typer.Option(help="Do so many, print what comes of them, keep nothing.", min=0)]
+AtOnce = Annotated[int, typer.Option(help="Most requests under way; fewer while the service is busy.", min=1)]
+GiveUp = Annotated[float, typer.Option(help="Stop when nothing answers for so many seconds.", min=0)]
+MaxErrorRate = Annotated[float, typer.Option(help="Stop when more than this share fails.", min=0, max=1)]
+RetryDead = Annotated[bool, typer.Option(help="Do dead letters again.")]
+PlansPerScene = Annotated[int, typer.Option(help="Of the model's own plans, at random.", min=1)]
+LabelSeed = Annotated[int, typer.Option("--seed", help="Of that choice, and the teacher's.", min=0)]
+RunId = Annotated[str | None, typer.Option("--run", help="Which rollout, where there are several.")]
+
+
+@app.command()
+def rollout(
+    folder: Folder,
+    scenes: Scenes,
+    service: Annotated[str, typer.Option(help="URL of a running service.")] = "http://127.0.0.1:8000",
+    n: Annotated[int, typer.Option(help="Draws, free and with the expert's plan.", min=1, max=64)] = 6,
+    temperature: Annotated[float, typer.Option(help="Of sampling.", min=0, max=2)] = 1.0,
+    top_p: Annotated[float, typer.Option(help="Nucleus mass.", min=0.01, max=1)] = 1.0,
+    seed: Annotated[int, typer.Option(help="Of sampling.", min=0)] = 0,
+    route: Annotated[bool, typer.Option(help="Tell the model the route.")] = True,
+    at_once: AtOnce = 32,
+    give_up_after: GiveUp = 300.0,
+    max_error_rate: MaxErrorRate = 0.1,
+    retry_dead: RetryDead = False,
+    every: Every = 1,
+    limit: Limit = None,
+    dry_run: DryRun = 0,
+    as_json: Json = False,
+) -> None:
+    """Roll a served model out over scenes: what it plans alone, and with the expert's plan given."""
+    from clients.labelling.pipeline import Limits
+    from clients.labelling.rollout import PATIENCE, Sampling, config_of, jobs, roll_out
+    from clients.planner import AsyncPlannerClient, PlannerError
+    from clients.wire import ModelName
+
+    sampling = Sampling(n, temperature, top_p, seed, route)
+    unlabelled: list[str] = []
+
+    async def work(ledger: Ledger) -> tuple[Run, Tally]:
+        async with AsyncPlannerClient(service, PATIENCE) as planner:
+            try:
+                (card, *_) = await planner.models()
+            except PlannerError as error:
+                raise RuntimeError(f"no service answers at {service}: {error}") from error
+            model = ModelName(name=card.name, revision=card.revision)
+            run = ledger.run("rollout", config_of(model, sampling))
+            found = islice(jobs(run, scenes, unlabelled.append), 0, None, every)
+            return await _work(
+                ledger,
+                run,
+                found,
+                lambda job: roll_out(planner, job.subject, model, sampling),
+                Limits(at_once, give_up_after, max_error_rate),
+                retry_dead=retry_dead,
+                limit=dry_run or limit,
+                total=-(-_count(scenes) // every),
+                quiet=as_json,
+            )
+
+    with told():
+        run, tally = _stage(folder, work, dry=dry_run > 0)
+        for name in unlabelled:
+            typer.echo(f"{name}: left out, it has no expert's future", err=True)
+        _report(run, tally, as_json, left_out=len(unlabelled))
+
+
+@app.command("filter")
+def choose(
+    folder: Folder,
+    epsilon: Annotated[float, typer.Option(help="minADE of free draws must be above it, m.", min=0)] = 0.5,
+    gain: Annotated[float, typer.Option(help="By which the expert's plan must help, m.", min=0)] = 0.0,
+    everything: Annotated[bool, typer.Option(help="Keep all scenes.")] = False,
+    run: RunId = None,
+    as_json: Json = False,
+) -> None:
+    """Keep the scenes whose plan is what goes wrong; writes filter.png."""
+    from clients.labelling.filtering import Thresholds, filtered, summary
+    from clients.labelling.ledger import Ledger
+    from clients.labelling.scatter import scatter
+
+    thresholds = Thresholds(epsilon, gain, everything)
+    with told(), Ledger(folder) as ledger:
+        rollout = ledger.the_run("rollout", run)
+        found = filtered(ledger.entries(rollout), thresholds)
+        ledger.keep(rollout, (scene.entry.key for scene in found if scene.kept))
+        scatter(found, thresholds, folder / "filter.png")
+        result = summary(found)
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    typer.echo(f"{result['kept']} of {result['scenes']} scenes kept ({folder / 'filter.png'})")
+    for tag, counts in result["tags"].items():
+        typer.echo(f"  {tag:<14} {counts['kept']:>7} of {counts['scenes']:>7}")
+
+
+@app.command()
+def label(
+    folder: Folder,
+    scenes: Scenes,
+    teacher: Annotated[
+        Literal["settings", "service"],
+        typer.Option(help="settings: LOOKTWICE_TEACHER_…, built in by default; service: POST /v1/label."),
+    ] = "settings",
+    service: Annotated[str, typer.Option(help="URL of a running service.")] = "http://127.0.0.1:8000",
+    plans_per_scene: PlansPerScene = 1,
+    seed: LabelSeed = 0,
+    run: RunId = None,
+    at_once: AtOnce = 16,
+    give_up_after: GiveUp = 300.0,
+    max_error_rate: MaxErrorRate = 0.1,
+    retry_dead: RetryDead = False,
+    limit: Limit = None,
+    dry_run: DryRun = 0,
+    as_json: Json = False,
+) -> None:
+    """Have a teacher say, for every scene kept, what is less good about the model's plan."""
+    from clients.labelling.label import config_of, jobs, labeller, questions
+    from clients.labelling.pipeline import Limits
+    from clients.labelling.teachers.service import ServiceTeacher
+    from clients.labelling.teachers.teacher import TeacherError
+    from service.settings import TeacherSettings
+
+    spent: dict[str, Any] = {}
+
+    async def work(ledger: Ledger) -> tuple[Run, Tally]:
+        rollout = ledger.the_run("rollout", run)
+        if not ledger.count_kept(rollout):
+            raise RuntimeError("no scene is kept: run `looktwice build filter` first")
+        try:
+            asked = (
+                TeacherSettings().teacher()
+                if teacher == "settings"
+                else await ServiceTeacher.connect(service)
+            )
+        except TeacherError as error:
+            raise RuntimeError(str(error)) from error
+        try:
+            begun = ledger.run("label", config_of(rollout, asked, seed))
+            before = ledger.spent(begun)
+            found = questions(ledger, rollout, scenes, plans_per_scene=plans_per_scene, seed=seed)
+            result = await _work(
+                ledger,
+                begun,
+                jobs(begun, found),
+                labeller(ledger, begun, asked),
+                Limits(at_once, give_up_after, max_error_rate),
+                retry_dead=retry_dead,
+                limit=dry_run or limit,
+                total=ledger.count_kept(rollout) * plans_per_scene,
+                quiet=as_json,
+            )
+            after = ledger.spent(begun)
+            spent.update({name: after[i] - before[i] for i, name in enumerate(after._fields)})
+            return result
+        finally:
+            await asked.close()
+
+    with told():
+        begun, tally = _stage(folder, work, dry=dry_run > 0)
+        _report(begun, tally, as_json, **spent)
+
+
+@app.command()
+def export(
+    folder: Folder,
+    to: Annotated[Path, typer.Option(help="File (parquet, openai-batch) or folder (messages) to write.")],
+    form: Annotated[
+        Literal["parquet", "messages", "openai-batch"],
+        typer.Option(help="parquet: to train on; messages: for TRL, LLaMA-Factory; openai-batch: questions."),
+    ] = "parquet",
+    scenes: Annotated[
+        Path | None, typer.Option(help="Labelled scenes, for messages and openai-batch.")
+    ] = None,
+    plans_per_scene: PlansPerScene = 1,
+    seed: LabelSeed = 0,
+    run: Annotated[str | None, typer.Option("--run", help="Which labels (openai-batch: rollout).")] = None,
+) -> None:
+    """Write what was labelled, or what is still to be asked."""
+    from clients.labelling.batch import batch_requests
+    from clients.labelling.export import reflections, write_messages
+    from clients.labelling.ledger import Ledger
+    from model.driving.reflection_store import write_reflections
+
+    with told(), Ledger(folder) as ledger:
+        if form == "parquet":
+            count = write_reflections(to, reflections(ledger, ledger.the_run("label", run)))
+        elif scenes is None:
+            raise ValueError(f"--form {form} needs --scenes")
+        elif form == "messages":
+            count = write_messages(ledger, ledger.the_run("label", run), scenes, to)
+        else:
+            settings, _, found = _batch(ledger, scenes, plans_per_scene, seed, run)
+            asked = [json.dumps(line) + "\n" for line in batch_requests(ledger, found, settings)]
+            to.write_text("".join(asked))
+            count = len(asked)
+        typer.echo(f"{count} written to {to}")
+
+
+@app.command()
+def take(
+    folder: Folder,
+    scenes: Scenes,
+    results: Annotated[Path, typer.Argument(help="Output file of an OpenAI batch.")],
+    plans_per_scene: PlansPerScene = 1,
+    seed: LabelSeed = 0,
+    run: RunId = None,
+    as_json: Json = False,
+) -> None:
+    """Take the answers to an exported openai-batch; what fails its checks is in the next export again."""
+    from clients.labelling.batch import read_results, take_results
+    from clients.labelling.dead_letters import write_dead_letters
+    from clients.labelling.ledger import Ledger
+
+    with told(), Ledger(folder) as ledger, results.open() as lines:
+        settings, begun, found = _batch(ledger, scenes, plans_per_scene, seed, run)
+        tally = take_results(ledger, begun, found, read_results(lines, settings))
+        write_dead_letters(ledger, folder)
+        _report(begun, tally, as_json)
+
+
+def _batch(
+    ledger: Ledger, scenes: Path, plans_per_scene: int, seed: int, run: str | None
+) -> tuple[OpenAiSettings, Run, Iterator[Job[Asked]]]:
+    """The questions for the endpoint that the settings name."""
+    from clients.labelling.label import config_of, jobs, questions
+    from clients.labelling.teachers.openai import OpenAiTeacher
+    from service.settings import TeacherSettings
+
+    settings = TeacherSettings().openai()
+    rollout = ledger.the_run("rollout", run)
+    begun = ledger.run("label", config_of(rollout, OpenAiTeacher(settings), seed))
+    found = questions(ledger, rollout, scenes, plans_per_scene=plans_per_scene, seed=seed)
+    return settings, begun, jobs(begun, found)
+
+
+def _stage(
+    folder: Path, work: Callable[[Ledger], Awaitable[tuple[Run, Tally]]], *, dry: bool
+) -> tuple[Run, Tally]:
+    """Run a stage on a folder's ledger, or on a copy that is thrown away."""
+    from clients.labelling.dead_letters import write_dead_letters
+    from clients.labelling.ledger import FILE, Ledger
+
+    async def run(ledger: Ledger) -> tuple[Run, Tally]:
+        return await work(ledger)
+
+    if dry:
+        with tempfile.TemporaryDirectory(prefix="looktwice-") as scratch:
+            if (folder / FILE).exists():
+                Ledger.copy(folder, Path(scratch))
+            with Ledger(Path(scratch)) as ledger:
+                result = asyncio.run(run(ledger))
+                for entry in ledger.latest(result[0], result[1].done + result[1].dead):
+                    typer.echo(json.dumps({"scene_id": entry.scene_id, entry.state: entry.record}, indent=1))
+                return result
+    with Ledger(folder) as ledger:
+        try:
+            return asyncio.run(run(ledger))
+        finally:
+            write_dead_letters(ledger, folder)
+
+
+async def _work(
+    ledger: Ledger,
+    run: Run,
+    jobs: Iterator[Job[Any]],
+    do: Callable[[Job[Any]], Awaitable[Record]],
+    limits: Limits,
+    *,
+    retry_dead: bool,
+    limit: int | None,
+    total: int | None,
+    quiet: bool,
+) -> tuple[Run, Tally]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from clients.labelling.pipeline import work_through
+
+    if retry_dead:
+        ledger.forget_dead(run)
+    columns = (TextColumn(run.stage), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    bar = TextColumn("{task.description}")
+    with Progress(*columns, bar, console=Console(stderr=True, quiet=quiet)) as progress:
+        task = progress.add_task("", total=min(limit or total or 0, total or limit or 0) or None)
+
+        def show(tally: Tally) -> None:
+            ended = tally.done + tally.dead + tally.earlier
+            told = f"{tally.dead} dead letters" if tally.dead else ""
+            progress.update(task, completed=ended, description=told)
+
+        return run, await work_through(ledger, run, islice(jobs, limit), do, limits, show)
+
+
+def _count(scenes: Path) -> int:
+    from model.driving.scene_store import count_scenes
+
+    return count_scenes(scenes)
+
+
+def _report(run: Run, tally: Tally, as_json: bool, **more: Any) -> None:
+    result = {
+        "run": run.id,
+        "config": dict(run.config),
+        "done": tally.done,
+        "dead": tally.dead,
+        "earlier": tally.earlier,
+        "seconds": round(tally.seconds, 3),
+        "per_s": round((tally.done + tally.dead) / max(tally.seconds, 1e-9), 3),
+    } | more
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    typer.echo(
+        f"{run.stage} {run.id[:8]}: {tally.done} done in {tally.seconds:.0f} s ({result['per_s']} a second), "
+        f"{tally.dead} dead letters, {tally.earlier} were done before"
+    )
+    for name, value in more.items():
+        typer.echo(f"  {name.replace('_', ' ')}: {value}")
