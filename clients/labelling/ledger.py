@@ -112,14 +112,14 @@ class Ledger:
         except OSError:
             self._lock.close()
             raise LedgerError(f"another build is at work in {folder}; wait until it has ended") from None
+        # Every statement is a transaction of its own. Scenes are read, and looked up, on another thread;
+        # the library takes one statement at a time.
+        self._db = sqlite3.connect(folder / FILE, isolation_level=None, check_same_thread=False)
         try:
-            # Every statement is a transaction of its own. Scenes are read, and looked up, on another thread;
-            # the library takes one statement at a time.
-            self._db = sqlite3.connect(folder / FILE, isolation_level=None, check_same_thread=False)
             self._open()
-        except sqlite3.DatabaseError as error:
-            self._lock.close()
-            raise LedgerError(f"{folder / FILE} is no ledger: {error}") from error
+        except (sqlite3.DatabaseError, LedgerError) as error:
+            self.close()
+            raise LedgerError(f"{folder / FILE} cannot be used: {error}") from error
 
     def _open(self) -> None:
         self._db.execute("PRAGMA journal_mode = WAL")

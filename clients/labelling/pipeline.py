@@ -98,13 +98,19 @@ async def work_through(
             return await do(job)
 
     async def finish(job: Job[_Subject]) -> None:
+        done_before = tally.done
         try:
             record = await patiently(lambda: attempt(job), limits.give_up_after_s)
         except CannotBeDone as error:
             ledger.bury(run, job.key, job.scene_id, str(error), **error.more)
             tally.dead += 1
         except TryLater as error:
-            raise StageStopped(f"nothing came for {limits.give_up_after_s:g} s: {error}") from error
+            told = f"nothing came for {limits.give_up_after_s:g} s: {error}"
+            if tally.done == done_before:
+                raise StageStopped(told) from error
+            # Others were served meanwhile: it is this one.
+            ledger.bury(run, job.key, job.scene_id, told)
+            tally.dead += 1
         else:
             ledger.finish(run, job.key, job.scene_id, record)
             tally.done += 1

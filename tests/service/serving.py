@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,21 +11,21 @@ from dataclasses import dataclass
 from typing import Any, Generic
 
 import httpx
-import uvicorn
 from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
 from typing_extensions import TypeVar
 
+from clients.labelling.teachers.rules import RuleTeacher
+from clients.labelling.teachers.teacher import Teacher
 from model.driving.scene import Scene
 from model.engines.engine import Engine
 from service.app import create_app
 from service.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
+from tests.sockets import PATIENCE_S, listening
 
 ServedEngine = TypeVar("ServedEngine", bound=Engine, default=ScriptedEngine)
-
-PATIENCE_S = 30
 
 
 @dataclass
@@ -71,34 +70,22 @@ class Served(Generic[ServedEngine]):
 
 
 @contextmanager
-def serve(engine: ServedEngine, settings: Settings, *, wait: bool = True) -> Iterator[Served[ServedEngine]]:
+def serve(
+    engine: ServedEngine,
+    settings: Settings,
+    *,
+    wait: bool = True,
+    teacher: Teacher = RuleTeacher(),
+    port: int = 0,
+) -> Iterator[Served[ServedEngine]]:
     """Serve ``engine`` over a real socket until the block ends."""
-    listening = socket.create_server(("127.0.0.1", 0))
-    url = f"http://127.0.0.1:{listening.getsockname()[1]}"
-    app = create_app(engine, settings, CollectorRegistry())
-    config = uvicorn.Config(app, log_config=None, ws="none", timeout_graceful_shutdown=5)
-    server = uvicorn.Server(config)
-    loops: list[asyncio.AbstractEventLoop] = []
-
-    async def run() -> None:
-        loops.append(asyncio.get_running_loop())
-        await server.serve([listening])
-
-    thread = threading.Thread(target=lambda: asyncio.run(run()), name="server")
-    thread.start()
-    try:
-        with httpx.Client(base_url=url, timeout=PATIENCE_S) as http:
-            # The socket listens already, so this request waits for the server and is not refused.
-            assert http.get("/healthz").status_code in (200, 503)
-            served = Served(engine, url, http, loops[0])
-            if wait:
-                served.until_ready()
-            yield served
-    finally:
-        server.should_exit = True
-        thread.join(PATIENCE_S)
-        listening.close()
-    assert not thread.is_alive()
+    app = create_app(engine, settings, CollectorRegistry(), teacher)
+    with listening(app, port) as (url, loop), httpx.Client(base_url=url, timeout=PATIENCE_S) as http:
+        assert http.get("/healthz").status_code in (200, 503)
+        served = Served(engine, url, http, loop)
+        if wait:
+            served.until_ready()
+        yield served
 
 
 def body(of: Scene | None = None, **controls: Any) -> dict[str, Any]:

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import asyncio
+import base64
+import email.utils
+import json
+import time
+
+import pytest
+
+from clients.labelling.checks import FailedCheck, check_reflection
+from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from clients.labelling.teachers.teacher import (
+    Answer,
+    Question,
+    TeacherBusy,
+    TeacherClosed,
+    TeacherError,
+    ask,
+)
+from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer, completion
+from tests.service.scenes import scene
+from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN
+from tests.sockets import listening
+
+QUESTION = Question(scene(), KEEP_ON, SLOW_DOWN, seed=7)
+
+
+def answer(server: ChatServer, complaints: tuple[FailedCheck, ...] = (), **settings: object) -> Answer:
+    """One answer of a teacher over a real socket."""
+
+    async def asking(url: str) -> Answer:
+        teacher = OpenAiTeacher(OpenAiSettings(f"{url}/v1", "some-vlm", **settings))  # type: ignore[arg-type]
+        try:
+            return await teacher.reflect(QUESTION, complaints)
+        finally:
+            await teacher.close()
+
+    with listening(server.app()) as (url, _):
+        return asyncio.run(asking(url))
+
+
+def test_the_model_answer_used_here_passes_the_checks() -> None:
+    assert check_reflection(GOOD, KEEP_ON, SLOW_DOWN) == []
+    assert check_reflection(LEAKING, KEEP_ON, SLOW_DOWN) != []
+
+
+def test_a_question_holds_pictures_plans_and_rules() -> None:
+    server = ChatServer([GOOD])
+    found = answer(server, api_key="sk-secret", input_price_usd=2.0, output_price_usd=10.0)
+    assert found._replace(cost_usd=0.0) == Answer(GOOD, 1000, 50)
+    assert found.cost_usd == pytest.approx(0.0025)
+    (body,) = server.asked
+    assert server.keys == ["Bearer sk-secret"]
+    assert (body["model"], body["temperature"], body["max_tokens"], body["seed"]) == ("some-vlm", 0.7, 300, 7)
+    system, user = body["messages"]
+    assert "80 words" in system["content"]
+    parts = user["content"]
+    pictures = [part["image_url"]["url"] for part in parts if part["type"] == "image_url"]
+    expected = [image for clip in QUESTION.scene.clips for image in clip.images]
+    assert [base64.b64decode(url.removeprefix("data:image/jpeg;base64,")) for url in pictures] == expected
+    text = "\n".join(part["text"] for part in parts if part["type"] == "text")
+    assert str(KEEP_ON) in text
+    assert str(SLOW_DOWN) in text
+    assert "front_wide_120" in text
+
+
+def test_a_second_question_says_what_was_wrong() -> None:
+    server = ChatServer([LEAKING, GOOD])
+
+    async def asking(url: str) -> None:
+        teacher = OpenAiTeacher(OpenAiSettings(f"{url}/v1/", "some-vlm"))
+        reflection = await ask(teacher, QUESTION, [])
+        assert (reflection.text, reflection.attempts) == (GOOD, 2)
+        await teacher.close()
+
+    with listening(server.app()) as (url, _):
+        asyncio.run(asking(url))
+    first, second = (json.dumps(body) for body in server.asked)
+    assert "'expert'" not in first.replace('\\"', "'")
+    assert "do not say 'expert'" in second
+    assert server.asked[0]["seed"] != server.asked[1]["seed"]
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"<html>welcome</html>",
+        b"{}",
+        b'{"choices": []}',
+        json.dumps(completion(None)).encode(),
+        json.dumps(completion("I was about to", finish_reason="length")).encode(),
+    ],
+)
+def test_rubbish_is_no_answer(sent: bytes) -> None:
+    found = answer(ChatServer([sent]))
+    assert found.text == ""
+    assert found.unusable
+
+
+@pytest.mark.parametrize("status", [429, 500, 503, 529])
+@pytest.mark.parametrize(("header", "wait_s"), [("0.5", 0.5), ("12", 12.0), ("soon", None), (None, None)])
+def test_busy_endpoints_say_when_to_come_again(status: int, header: str | None, wait_s: float | None) -> None:
+    headers = {} if header is None else {"Retry-After": header}
+    with pytest.raises(TeacherBusy, match=str(status)) as busy:
+        answer(ChatServer([(status, headers)]))
+    assert busy.value.wait_s == wait_s
+
+
+def test_a_date_is_a_time_to_come_again_too() -> None:
+    then = email.utils.formatdate(time.time() + 60, usegmt=True)
+    with pytest.raises(TeacherBusy) as busy:
+        answer(ChatServer([(503, {"Retry-After": then})]))
+    assert busy.value.wait_s == pytest.approx(60, abs=5)
+
+
+@pytest.mark.parametrize("status", [401, 403, 404])
+def test_a_wrong_key_or_model_closes_the_teacher(status: int) -> None:
+    with pytest.raises(TeacherClosed, match="told why"):
+        answer(ChatServer([(status, {})]))
+
+
+def test_a_refused_question_is_its_own_matter() -> None:
+    with pytest.raises(TeacherError) as refused:
+        answer(ChatServer([(400, {})]))
+    assert not isinstance(refused.value, TeacherBusy | TeacherClosed)
+
+
+def test_nobody_there_is_busy() -> None:
+    teacher = OpenAiTeacher(OpenAiSettings("http://127.0.0.1:9/v1", "some-vlm", timeout_s=2.0))
+    with pytest.raises(TeacherBusy, match="Connect"):
+        asyncio.run(teacher.reflect(QUESTION))
+
+
+def test_the_key_is_never_shown() -> None:
+    settings = OpenAiSettings("http://x/v1", "some-vlm", api_key="sk-secret", extra_body={"top_k": 3})
+    teacher = OpenAiTeacher(settings)
+    assert "sk-secret" not in f"{settings!r} {teacher.name} {teacher.revision}"
+    assert "top_k" in teacher.revision, "what changes answers is a part of the key"
+
+
+def test_fields_can_be_put_in_and_taken_out() -> None:
+    server = ChatServer([GOOD])
+    answer(server, extra_body={"max_tokens": None, "max_completion_tokens": 99})
+    assert "max_tokens" not in server.asked[0]
+    assert server.asked[0]["max_completion_tokens"] == 99

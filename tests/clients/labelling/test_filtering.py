@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from clients.labelling.filtering import Thresholds, filtered, summary
+from clients.labelling.ledger import Entry
+from clients.labelling.scatter import scatter
+from model.driving.images import decode_image
+from tests.clients.labelling.builds import rollout_record
+
+
+def entry(free_m: float, prefilled_m: float, *tags: str) -> Entry:
+    return Entry("key", "scene", "done", rollout_record(free_m, prefilled_m, tags), "now")
+
+
+def kept(thresholds: Thresholds, *pairs: tuple[float, float]) -> list[bool]:
+    return [scene.kept for scene in filtered([entry(*pair) for pair in pairs], thresholds)]
+
+
+def test_kept_is_what_an_expert_s_plan_would_have_mended() -> None:
+    pairs = [(2.0, 0.5), (0.5, 0.1), (0.51, 0.1), (2.0, 2.0), (2.0, 3.0)]
+    assert kept(Thresholds(), *pairs) == [True, False, True, False, False]
+    assert kept(Thresholds(epsilon_m=1.0), *pairs) == [True, False, False, False, False]
+    assert kept(Thresholds(gain_m=1.6), *pairs) == [False] * 5
+    assert kept(Thresholds(everything=True), *pairs) == [True] * 5
+
+
+def test_the_smallest_error_of_the_draws_counts() -> None:
+    (scene,) = filtered([entry(2.0, 0.5)], Thresholds())
+    assert (scene.free_m, scene.prefilled_m, scene.plan_iou) == (2.0, 0.5, 0.5)
+
+
+def test_scenes_are_counted_by_what_makes_them_difficult() -> None:
+    found = filtered(
+        [entry(2.0, 0.5, "turn", "pedestrian"), entry(0.1, 0.1, "turn"), entry(3.0, 0.1)], Thresholds()
+    )
+    assert summary(found) == {
+        "scenes": 3,
+        "kept": 2,
+        "tags": {
+            "pedestrian": {"scenes": 1, "kept": 1},
+            "quiet": {"scenes": 1, "kept": 1},
+            "turn": {"scenes": 2, "kept": 1},
+        },
+    }
+
+
+def test_a_picture_shows_each_scene_where_it_lies(tmp_path: Path) -> None:
+    below = filtered([entry(4.0, 0.2) for _ in range(3)], Thresholds())
+    scatter(below, Thresholds(), tmp_path / "below.png")
+    scatter(filtered([entry(0.2, 4.0)], Thresholds()), Thresholds(), tmp_path / "above.png")
+    one, other = (decode_image((tmp_path / f"{name}.png").read_bytes()) for name in ("below", "above"))
+    assert one.shape == other.shape
+    assert (one != other).any()

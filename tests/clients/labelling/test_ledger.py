@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from clients.labelling.dead_letters import FILE as LETTERS
+from clients.labelling.dead_letters import write_dead_letters
+from clients.labelling.ledger import FILE, Ledger, LedgerError, hash_of
+from clients.labelling.teachers.teacher import Answer
+
+CONFIG = {"model": "nano", "seed": 0}
+
+
+def test_what_is_entered_is_there_in_the_next_process(tmp_path: Path) -> None:
+    with Ledger(tmp_path) as ledger:
+        run = ledger.run("rollout", CONFIG)
+        ledger.finish(run, "a", "scene a", {"x": [1.5]})
+        ledger.bury(run, "b", "scene b", "no", status=422)
+    with Ledger(tmp_path) as ledger:
+        assert ledger.run("rollout", CONFIG) == run == ledger.the_run("rollout")
+        assert ledger.run("rollout", {**CONFIG, "seed": 1}).id != run.id
+        assert [ledger.has(key) for key in "abc"] == [True, True, False]
+        (done,), (dead,) = ledger.entries(run), ledger.entries(run, "dead")
+        assert (done.scene_id, done.record) == ("scene a", {"x": [1.5]})
+        assert dead.record == {"reason": "no", "status": 422}
+        assert (ledger.count(run), ledger.count(run, "dead")) == (1, 1)
+
+
+def test_nothing_is_done_twice(tmp_path: Path) -> None:
+    with Ledger(tmp_path) as ledger:
+        run = ledger.run("rollout", CONFIG)
+        ledger.finish(run, "a", "scene", {})
+        with pytest.raises(LedgerError, match="twice"):
+            ledger.finish(run, "a", "scene", {})
+
+
+def test_one_process_at_a_time(tmp_path: Path) -> None:
+    with Ledger(tmp_path), pytest.raises(LedgerError, match="at work"):
+        Ledger(tmp_path)
+    Ledger(tmp_path).close()
+
+
+def test_other_files_are_no_ledgers(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_bytes(b"something else" * 100)
+    with pytest.raises(LedgerError, match="cannot be used"):
+        Ledger(tmp_path)
+    newer = tmp_path / "newer"
+    Ledger(newer).close()
+    with sqlite3.connect(newer / FILE) as db:
+        db.execute("PRAGMA user_version = 99")
+    db.close()
+    with pytest.raises(LedgerError, match="version 99"):
+        Ledger(newer)
+    with pytest.raises(LedgerError, match="version 99"):
+        Ledger(newer)  # the lock was given back
+
+
+def test_several_runs_want_to_be_told_apart(tmp_path: Path) -> None:
+    with Ledger(tmp_path) as ledger:
+        with pytest.raises(LedgerError, match="no rollout yet"):
+            ledger.the_run("rollout")
+        runs = [ledger.run("rollout", {**CONFIG, "seed": seed}) for seed in (0, 1)]
+        for run in runs:
+            ledger.finish(run, f"of {run.id}", "scene", {})
+        with pytest.raises(LedgerError, match=runs[1].id[:8]):
+            ledger.the_run("rollout")
+        assert ledger.the_run("rollout", runs[1].id[:8]) == runs[1]
+        assert {run.id for run in ledger.runs("rollout")} == {run.id for run in runs}
+
+
+def test_answers_are_counted_with_those_that_were_no_use(tmp_path: Path) -> None:
+    with Ledger(tmp_path) as ledger:
+        run = ledger.run("label", CONFIG)
+        ledger.answered(run, "a", 1, Answer("no", 100, 10, 0.5))
+        ledger.answered(run, "a", 2, Answer("yes", 110, 20, 0.25))
+        assert ledger.answers("a") == [Answer("no", 100, 10, 0.5), Answer("yes", 110, 20, 0.25)]
+        assert tuple(ledger.spent(run)) == (2, 210, 30, 0.75)
+        assert tuple(ledger.spent(ledger.run("label", {}))) == (0, 0, 0, 0.0)
+
+
+def test_what_is_kept_can_be_chosen_anew(tmp_path: Path) -> None:
+    with Ledger(tmp_path) as ledger:
+        run, other = ledger.run("rollout", CONFIG), ledger.run("rollout", {})
+        for key in "abc":
+            ledger.finish(run, key, f"scene {key}", {"key": key})
+        ledger.finish(other, "d", "scene d", {})
+        ledger.keep(run, "ab")
+        ledger.keep(other, "d")
+        ledger.keep(run, "bc")
+        assert [ledger.kept(key) is not None for key in "abcd"] == [False, True, True, True]
+        assert (ledger.count_kept(run), ledger.count_kept(other)) == (2, 1)
+        with pytest.raises(sqlite3.IntegrityError):
+            ledger.keep(run, "aa")
+        assert ledger.count_kept(run) == 2, "a choice that fails changes nothing"
+
+
+def test_dead_letters_are_written_and_can_be_tried_again(tmp_path: Path) -> None:
+    with Ledger(tmp_path) as ledger:
+        run = ledger.run("label", CONFIG)
+        ledger.finish(run, "a", "scene a", {})
+        ledger.answered(run, "b", 1, Answer("no"))
+        ledger.bury(run, "b", "scene b", "leaks", text="no")
+        assert write_dead_letters(ledger, tmp_path) == 1
+        (line,) = (tmp_path / LETTERS).read_text().splitlines()
+        assert '"scene_id": "scene b"' in line
+        assert '"reason": "leaks"' in line
+        assert ledger.forget_dead(run) == 1
+        assert not ledger.has("b")
+        assert ledger.answers("b") == [], "a new question gets new answers"
+        assert ledger.has("a")
+        assert write_dead_letters(ledger, tmp_path) == 0
+        assert (tmp_path / LETTERS).read_text() == ""
+
+
+def test_hashes_tell_parts_apart() -> None:
+    assert hash_of("ab", "c") != hash_of("a", "bc") != hash_of("abc")
+    assert hash_of(b"1") != hash_of("1")
+    assert hash_of({"a": 1, "b": 2}) == hash_of({"b": 2, "a": 1})

@@ -1,0 +1,41 @@
+"""ASGI applications behind real sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import uvicorn
+
+PATIENCE_S = 30
+
+
+@contextmanager
+def listening(app: Any, port: int = 0) -> Iterator[tuple[str, asyncio.AbstractEventLoop]]:
+    """The application's URL and event loop, until the block ends."""
+    listener = socket.create_server(("127.0.0.1", port))
+    config = uvicorn.Config(app, log_config=None, ws="none", timeout_graceful_shutdown=5)
+    server = uvicorn.Server(config)
+    loops: list[asyncio.AbstractEventLoop] = []
+    begun = threading.Event()
+
+    async def run() -> None:
+        loops.append(asyncio.get_running_loop())
+        begun.set()
+        await server.serve([listener])
+
+    thread = threading.Thread(target=lambda: asyncio.run(run()), name="server")
+    thread.start()
+    assert begun.wait(PATIENCE_S)
+    try:
+        # The socket listens already, so a first request waits for the server and is not refused.
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}", loops[0]
+    finally:
+        server.should_exit = True
+        thread.join(PATIENCE_S)
+        listener.close()
+    assert not thread.is_alive()
