@@ -1,9 +1,9 @@
-"""One episode: the expert among traffic and hazards, step by step, without pictures."""
+"""One episode: the ego among traffic and hazards, step by step, without pictures."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
 from typing import Final
@@ -12,14 +12,7 @@ import numpy as np
 
 from clients.metadrive.actors import STEP_S, VEHICLE_MODELS, Body, Pedestrian, Vehicle
 from clients.metadrive.driver import SpeedLimits, Style
-from clients.metadrive.episode_log import (
-    BRAKE_LIGHT,
-    LEFT_LIGHT,
-    RIGHT_LIGHT,
-    ActorLog,
-    EpisodeLog,
-    Outcome,
-)
+from clients.metadrive.episode_log import EpisodeLog, Outcome, Recorder
 from clients.metadrive.expert import Expert, varied
 from clients.metadrive.hazards import Director
 from clients.metadrive.maps import make_map
@@ -32,39 +25,69 @@ _BEHIND_M: Final = 80.0
 
 
 def run_episode(seed: int, duration_s: float = 48.0) -> EpisodeLog:
-    """Drive one episode; the same seed gives the same episode.
+    """Let the expert drive one episode; the same seed gives the same episode.
 
     Raises:
         MapError: no map fits the seed.
     """
+    world = make_world(seed, duration_s)
+    near = world.remember()
+    while not world.ended:
+        world.move(near, world.drive_as_expert)
+        near = world.remember()
+    return world.log()
+
+
+def make_world(seed: int, duration_s: float = 48.0) -> World:
+    """An episode before its first step; raises `MapError`."""
     rng = np.random.default_rng([seed, 2])
     speed = float(
         rng.choice([rng.uniform(22, 42), rng.uniform(42, 62), rng.uniform(62, 80)], p=[0.04, 0.14, 0.82])
     )
     style = varied(Style(speed / 3.6), rng)
     road_map = make_map(seed, max(320.0, 1.15 * duration_s * style.speed))
-    return _Episode(seed, road_map, style, rng).run(duration_s)
+    return World(seed, road_map, style, rng, round(duration_s / STEP_S))
 
 
-class _Episode:
-    def __init__(self, seed: int, road_map: RoadMap, style: Style, rng: np.random.Generator) -> None:
-        self._seed = seed
+class World:
+    """Everything that moves in an episode, and what is remembered of it.
+
+    Args:
+        seed: of the episode.
+        road_map: where it takes place.
+        style: how the expert drives.
+        rng: decides about everything else.
+        steps: of 0.1 s, at most.
+
+    Attributes:
+        ego: the vehicle whose episode it is; whoever drives it may put another one in its place.
+        outcome: how it ended; ``time`` while it runs.
+        ended: whether it did.
+    """
+
+    def __init__(
+        self, seed: int, road_map: RoadMap, style: Style, rng: np.random.Generator, steps: int
+    ) -> None:
         self._map = road_map
         self._rng = rng
+        self._steps = steps
+        self.outcome: Outcome = "time"
+        self.ended = False
         self._ids = count(1)
         self._limits = SpeedLimits(road_map.rails, style.lateral)
         self._oncoming_limits = SpeedLimits(road_map.oncoming_rails, 2.0)
-        self._ego = self._new_ego(style)
+        self.ego = self._new_ego(style)
         self._style = style
         self._expert = Expert(road_map, style, self._limits, True, bool(rng.random() < 0.75))
         self._director = Director(road_map, rng, self._next_id, style.speed)
-        self._bodies: list[Body] = self._director.place(self._ego.progress)
+        self._bodies: list[Body] = self._director.place(self.ego.progress)
         self._fill_oncoming_s()
         self._drivers: dict[int, Expert] = {}
         self._bodies += self._traffic()
         for body in self._bodies:
             if isinstance(body, Vehicle) and body.actor_id not in self._drivers:
                 self._drivers[body.actor_id] = self._driver(body, float(rng.uniform(0.75, 1.0)) * style.speed)
+        self._recorder = Recorder(seed, road_map, self._bodies, steps)
 
     def _next_id(self) -> int:
         return next(self._ids)
@@ -94,7 +117,7 @@ class _Episode:
             body.oncoming_s = 0.5 * float(np.argmin(gap)) if gap.min() < 25 else -1e6
 
     def _traffic(self) -> Iterator[Vehicle]:
-        rng, ego = self._rng, self._ego
+        rng, ego = self._rng, self.ego
         density = float(rng.choice([2.0, 3.4, 6.0]))
         taken = [(b.progress, b.rail) for b in self._bodies if isinstance(b, Vehicle)]
         blocked = [b.progress for b in self._bodies if not isinstance(b, (Vehicle, Pedestrian))]
@@ -132,54 +155,54 @@ class _Episode:
         self._drivers[car.actor_id] = self._driver(car, max(wish, 4.0))
         car.speed = min(wish, limits.at(rail, s))
         if on_route and abs(ahead_m) < 60:
-            car.speed = min(car.speed, self._ego.speed + float(rng.uniform(-2, 2)))
-            car.speed = 0.0 if self._ego.speed == 0 else max(car.speed, 0.0)
+            car.speed = min(car.speed, self.ego.speed + float(rng.uniform(-2, 2)))
+            car.speed = 0.0 if self.ego.speed == 0 else max(car.speed, 0.0)
         return car
 
-    def run(self, duration_s: float) -> EpisodeLog:
-        """Step until the time, the route or the expert's luck ends."""
-        ego, steps = self._ego, round(duration_s / STEP_S)
-        track, lanes, offsets, rails, progress = [], [], [], [], []
-        seen: list[dict[int, tuple[float, float, float, int, float]]] = []
-        outcome: Outcome = "time"
-        for step in range(steps):
-            time_s = step * STEP_S
-            near = self._near()
-            lane, offset = self._lane()
-            track.append((ego.x, ego.y, ego.heading, ego.speed))
-            lanes.append(lane)
-            offsets.append(offset)
-            rails.append(ego.rail)
-            progress.append(ego.progress)
-            seen.append({b.actor_id: (b.x, b.y, b.heading, _lights(b), b.phase) for b in near})
-            if self._hits(near):
-                outcome = "collision"
-                break
-            if ego.progress > self._map.length - 25:
-                outcome = "route_end"
-                break
-            self._director.step(time_s, ego, near)
-            everyone = [ego, *near]
-            self._expert.step(ego, near)
-            for body in near:
-                if isinstance(body, Pedestrian):
-                    body.step()
-                elif isinstance(body, Vehicle):
-                    self._drive(body, time_s, everyone)
-        return EpisodeLog(
-            self._seed,
-            self._map,
-            outcome,
-            np.array(track),
-            np.array(lanes),
-            np.array(offsets),
-            np.array(rails),
-            np.array(progress),
-            self._actor_logs(seen),
-        )
+    @property
+    def now(self) -> int:
+        """The step that was remembered last."""
+        return self._recorder.steps - 1
+
+    @property
+    def live(self) -> EpisodeLog:
+        """The log as it grows, with room for all steps."""
+        return self._recorder.live
+
+    def log(self) -> EpisodeLog:
+        """What happened so far."""
+        return self._recorder.log(self.outcome)
+
+    def remember(self) -> list[Body]:
+        """Write this moment into the log, and see whether it is the last; returns who is near."""
+        ego, near = self.ego, self._near()
+        self._recorder.add(ego, *self._lane(), near)
+        if self._hits(near):
+            self.outcome, self.ended = "collision", True
+        elif ego.progress > self._map.length - 25:
+            self.outcome, self.ended = "route_end", True
+        else:
+            self.ended = self._recorder.steps >= self._steps
+        return near
+
+    def move(self, near: list[Body], drive: Callable[[list[Body]], None]) -> None:
+        """Let ``drive`` move the ego among those ``near``, and everyone else, on to the next moment."""
+        time_s = self.now * STEP_S
+        self._director.step(time_s, self.ego, near)
+        everyone: list[Body] = [self.ego, *near]
+        drive(near)
+        for body in near:
+            if isinstance(body, Pedestrian):
+                body.step()
+            elif isinstance(body, Vehicle):
+                self._drive(body, time_s, everyone)
+
+    def drive_as_expert(self, near: list[Body]) -> None:
+        """Move the ego as the expert does."""
+        self._expert.step(self.ego, near)
 
     def _near(self) -> list[Body]:
-        ego = self._ego
+        ego = self.ego
         near: list[Body] = []
         for body in self._bodies:
             if isinstance(body, Vehicle):
@@ -212,7 +235,7 @@ class _Episode:
         self._drivers[car.actor_id].step(car, everyone)
 
     def _lane(self) -> tuple[int, float]:
-        ego, road_map = self._ego, self._map
+        ego, road_map = self.ego, self._map
         rail = road_map.rails[ego.rail]
         lane = road_map.lanes[rail.lane_at(ego.s)]
         offset, _ = ego.offset_at(ego.s)
@@ -225,7 +248,7 @@ class _Episode:
         return lane.lane_id, offset
 
     def _hits(self, near: list[Body]) -> bool:
-        ego = self._ego
+        ego = self.ego
         for body in near:
             if math.hypot(body.x - ego.x, body.y - ego.y) > 6.0:
                 continue
@@ -234,37 +257,6 @@ class _Episode:
             if _overlap(mine, theirs):
                 return True
         return False
-
-    def _actor_logs(
-        self, seen: list[dict[int, tuple[float, float, float, int, float]]]
-    ) -> tuple[ActorLog, ...]:
-        logs = []
-        for body in self._bodies:
-            poses = np.full((len(seen), 3), np.nan)
-            lights = np.zeros(len(seen), np.uint8)
-            phase = np.zeros(len(seen))
-            for step, row in enumerate(seen):
-                if body.actor_id in row:
-                    *pose, lights[step], phase[step] = row[body.actor_id]
-                    poses[step] = pose
-            if np.isfinite(poses).any():
-                logs.append(
-                    ActorLog(body.actor_id, body.kind, body.model, body.tint, body.size, poses, lights, phase)
-                )
-        return tuple(logs)
-
-
-def _lights(body: Body) -> int:
-    if not isinstance(body, Vehicle):
-        return 0
-    lights = 0
-    if body.acceleration < -0.6 or (body.speed < 0.1 and not body.hazard_lights):
-        lights |= BRAKE_LIGHT
-    if body.hazard_lights or body.indicator > 0:
-        lights |= LEFT_LIGHT
-    if body.hazard_lights or body.indicator < 0:
-        lights |= RIGHT_LIGHT
-    return lights
 
 
 def _overlap(first: Array, second: Array) -> bool:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from clients.metadrive.actors import Body, Vehicle
 from clients.metadrive.roads import Array, RoadMap
 from model.driving.scene import AgentKind
 
@@ -58,3 +60,89 @@ class EpisodeLog:
     rails: npt.NDArray[np.int64]
     progress: Array
     actors: tuple[ActorLog, ...]
+
+
+class Recorder:
+    """Remembers an episode as it goes on.
+
+    Args:
+        seed, road_map: the episode's.
+        bodies: everyone who can ever appear.
+        steps: at most.
+
+    Attributes:
+        live: the log with room for all steps and actors; what has not happened yet is NaN or 0 in it.
+        steps: so many are remembered.
+    """
+
+    def __init__(self, seed: int, road_map: RoadMap, bodies: Sequence[Body], steps: int) -> None:
+        self.steps = 0
+        self._places = {body.actor_id: place for place, body in enumerate(bodies)}
+        self.live = EpisodeLog(
+            seed,
+            road_map,
+            "time",
+            np.full((steps, 4), np.nan),
+            np.zeros(steps, np.int64),
+            np.zeros(steps),
+            np.zeros(steps, np.int64),
+            np.zeros(steps),
+            tuple(
+                ActorLog(
+                    body.actor_id,
+                    body.kind,
+                    body.model,
+                    body.tint,
+                    body.size,
+                    np.full((steps, 3), np.nan),
+                    np.zeros(steps, np.uint8),
+                    np.zeros(steps),
+                )
+                for body in bodies
+            ),
+        )
+
+    def add(self, ego: Vehicle, lane: int, lane_offset: float, near: Sequence[Body]) -> None:
+        """Remember a moment."""
+        log, step = self.live, self.steps
+        log.ego[step] = ego.x, ego.y, ego.heading, ego.speed
+        log.lanes[step], log.lane_offsets[step] = lane, lane_offset
+        log.rails[step], log.progress[step] = ego.rail, ego.progress
+        for body in near:
+            actor = log.actors[self._places[body.actor_id]]
+            actor.poses[step] = body.x, body.y, body.heading
+            actor.lights[step], actor.phase[step] = _lights(body), body.phase
+        self.steps += 1
+
+    def log(self, outcome: Outcome) -> EpisodeLog:
+        """What happened, without those who never came near."""
+        past, live = slice(0, self.steps), self.live
+        actors = tuple(
+            replace(actor, poses=actor.poses[past], lights=actor.lights[past], phase=actor.phase[past])
+            for actor in live.actors
+            if np.isfinite(actor.poses[past]).any()
+        )
+        return EpisodeLog(
+            live.seed,
+            live.road_map,
+            outcome,
+            live.ego[past],
+            live.lanes[past],
+            live.lane_offsets[past],
+            live.rails[past],
+            live.progress[past],
+            actors,
+        )
+
+
+def _lights(body: Body) -> int:
+    if not isinstance(body, Vehicle):
+        return 0
+    lights = 0
+    if body.acceleration < -0.6 or (body.speed < 0.1 and not body.hazard_lights):
+        lights |= BRAKE_LIGHT
+    if body.hazard_lights or body.indicator > 0:
+        lights |= LEFT_LIGHT
+    if body.hazard_lights or body.indicator < 0:
+        lights |= RIGHT_LIGHT
+    return lights

@@ -12,6 +12,7 @@ import shapely.affinity
 from clients.metadrive.annotate import Tagger, dense_target, route_ahead, to_ego
 from clients.metadrive.episode_log import EpisodeLog
 from clients.metadrive.rig import Picture, Rig
+from clients.metadrive.roads import Array
 from clients.metadrive.stage import Stage
 from model.driving.metrics import collides, leaves_road
 from model.driving.scene import (
@@ -88,6 +89,21 @@ def labelled_scenes(
         stage.close()
 
 
+def history_at(log: EpisodeLog, step: int) -> FloatArray:
+    """The ego's last 1.6 s at ``step``, float32 [16, 4]."""
+    return _seen_from(log.ego[step - HISTORY_STEPS + 1 : step + 1], HISTORY_STEPS - 1)
+
+
+def _seen_from(track: Array, present: int) -> FloatArray:
+    """A track of the ego (x, y, heading, speed) as poses [t, 4], seen from the one at ``present``."""
+    poses = np.zeros((len(track), 4))
+    poses[:, :2], poses[:, 3] = track[:, :2], track[:, 2]
+    seen = to_ego_frame(poses, poses[present])
+    seen[:, 3] = np.unwrap(seen[:, 3])
+    seen[:, 3] -= seen[present, 3]
+    return seen.astype(np.float32)
+
+
 class _Moment:
     """One step of an episode seen from the ego."""
 
@@ -95,13 +111,9 @@ class _Moment:
         self._log, self._step = log, step
         self._window = slice(step - HISTORY_STEPS + 1, step + FUTURE_STEPS + 1)
         self._ego = log.ego[step]
-        poses = np.zeros((HISTORY_STEPS + FUTURE_STEPS, 4))
-        poses[:, :2], poses[:, 3] = log.ego[self._window, :2], log.ego[self._window, 2]
-        seen = to_ego_frame(poses, poses[HISTORY_STEPS - 1])
-        seen[:, 3] = np.unwrap(seen[:, 3])
-        seen[:, 3] -= seen[HISTORY_STEPS - 1, 3]
-        self.history: FloatArray = seen[:HISTORY_STEPS].astype(np.float32)
-        self.future: FloatArray = seen[HISTORY_STEPS:].astype(np.float32)
+        seen = _seen_from(log.ego[self._window], HISTORY_STEPS - 1)
+        self.history = seen[:HISTORY_STEPS]
+        self.future = seen[HISTORY_STEPS:]
         self.area = self._area()
         self.drivable = _rings(self.area)
         self.agents = tuple(self._agents())

@@ -32,6 +32,8 @@ MEASURES: Final = (
     "plan_iou_revised",
     "output_tokens",
     "think_rate",
+    "thought_iou_first",
+    "thought_iou_revised",
 )
 """Fields of `SceneResult` that are averaged over scenes, in the table's order."""
 
@@ -56,6 +58,8 @@ class SceneResult:
         plan_iou_revised: IOU of the plan a draw ends with (the first one, where it did not reflect), mean.
         output_tokens: tokens per draw, forced ones included.
         think_rate: share of draws that reflected; None where the format has no branch.
+        thought_iou_first, thought_iou_revised: IOU of the first and of the revised plan with the expert's,
+            mean over the draws that reflected; None where none did.
     """
 
     scene_id: str
@@ -74,6 +78,8 @@ class SceneResult:
     plan_iou_revised: float | None = None
     output_tokens: float | None = None
     think_rate: float | None = None
+    thought_iou_first: float | None = None
+    thought_iou_revised: float | None = None
 
 
 def expert_plan(labelled: LabelledScene) -> Plan:
@@ -114,6 +120,11 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw]) -> SceneResul
     last = [
         iou_with_expert(draw.revised_plan or draw.plan, expert) for draw in draws if draw.plan is not None
     ]
+    thought = [
+        (iou_with_expert(draw.plan, expert), iou_with_expert(draw.revised_plan, expert))
+        for draw in draws
+        if draw.plan is not None and draw.revised_plan is not None
+    ]
     branches = [draw.branch for draw in draws if draw.branch is not None]
     return replace(
         evaluate_trajectories(labelled, np.stack([draw.trajectory for draw in draws])),
@@ -122,6 +133,8 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw]) -> SceneResul
         plan_iou_revised=_mean(last),
         output_tokens=_mean([float(sum(draw.tokens.values())) for draw in draws]),
         think_rate=_mean([float(branch == "Thinking:") for branch in branches]),
+        thought_iou_first=_mean([first for first, _ in thought]),
+        thought_iou_revised=_mean([revised for _, revised in thought]),
     )
 
 

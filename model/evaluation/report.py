@@ -53,6 +53,21 @@ async def evaluate_checkpoint(
         EngineError, RequestError, ValueError: see `evaluate_engine`.
     """
     baselines = evaluate_baselines(scenes)
+    results = await evaluate_variants(engine, scenes, variants, concurrency=concurrency, on_result=on_result)
+    rows = [row for name, of in baselines.items() for row in _rows(name, of)]
+    rows += [row for variant, of in results.items() for row in variant_rows(variant, of)]
+    return Report(tuple(rows), tuple(compare_variants(baselines, results)))
+
+
+async def evaluate_variants(
+    engine: Engine,
+    scenes: Sequence[LabelledScene],
+    variants: Sequence[Variant],
+    *,
+    concurrency: int = 16,
+    on_result: Callable[[Variant, SceneResult], None] | None = None,
+) -> dict[Variant, list[SceneResult]]:
+    """Results of a started engine in every variant; see `evaluate_checkpoint`."""
     results = {}
     for variant in variants:
 
@@ -63,16 +78,13 @@ async def evaluate_checkpoint(
         results[variant] = await evaluate_engine(
             engine, scenes, variant, concurrency=concurrency, on_result=done
         )
-    rows = [row for name, of in baselines.items() for row in _rows(name, of)]
-    for variant, of in results.items():
-        rows += _rows(
-            variant.name,
-            of,
-            thinking=variant.controls.thinking,
-            n=variant.controls.n,
-            route=variant.route,
-        )
-    return Report(tuple(rows), tuple(compare_variants(baselines, results)))
+    return results
+
+
+def variant_rows(variant: Variant, results: Sequence[SceneResult]) -> list[Row]:
+    """A variant's rows: over all scenes, and over those with a lead vehicle close by."""
+    controls = variant.controls
+    return _rows(variant.name, results, thinking=controls.thinking, n=controls.n, route=variant.route)
 
 
 def _rows(name: str, results: Sequence[SceneResult], **about: Any) -> list[Row]:

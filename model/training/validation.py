@@ -4,26 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 import torch
 
-from model.driving.metrics import displacement_errors
-from model.driving.plan import plan_iou
 from model.driving.scene import LabelledScene
 from model.engines.engine import Controls, DrawFinished, PlanRequest
 from model.engines.torch.decoder import Decoder, Failed
 from model.engines.torch.runner import Runner
-from model.evaluation.open_loop import expert_plan
+from model.evaluation.open_loop import evaluate_draws
 from model.network.checkpoint import Loaded
 
 _ROWS = 48
+_MEASURES: Final = ("min_ade_m", "plan_iou_first", "plan_iou_revised", "think_rate")
 
 
 def open_loop(
     loaded: Loaded, scenes: Sequence[LabelledScene], formats: Sequence[str], n: int = 6
 ) -> Mapping[str, float]:
-    """minADE over n draws, per format and with or without the route, and the first plan's IOU.
+    """minADE over n draws, per format and with or without the route; IOU of first and last plan, think rate.
 
     The network is put into evaluation mode meanwhile.
     """
@@ -38,7 +38,7 @@ def open_loop(
                 decoder = Decoder(Runner(loaded, _ROWS))
                 for labelled in scenes:
                     scene = labelled.scene if route else replace(labelled.scene, route=None)
-                    decoder.add(PlanRequest(scene.scene_id, scene, format, Controls(n=n, thinking="never")))
+                    decoder.add(PlanRequest(scene.scene_id, scene, format, Controls(n=n)))
                 draws: dict[str, list[DrawFinished]] = {}
                 while not decoder.idle:
                     for name, event in decoder.step():
@@ -46,18 +46,14 @@ def open_loop(
                             raise event.error
                         if isinstance(event, DrawFinished):
                             draws.setdefault(name, []).append(event)
-                errors, ious = [], []
-                for name, finished in draws.items():
-                    trajectories = np.stack([event.draw.trajectory for event in finished])
-                    errors.append(displacement_errors(trajectories, futures[name].future).min_ade_m)
-                    ious += [
-                        plan_iou(event.draw.plan, expert_plan(futures[name]))
-                        for event in finished
-                        if event.draw.plan is not None
-                    ]
+                results = [
+                    evaluate_draws(futures[name], [event.draw for event in finished])
+                    for name, finished in draws.items()
+                ]
                 label = f"{format}{'+route' if route else ''}"
-                figures[f"min_ade_m/{label}"] = float(np.mean(errors))
-                if ious:
-                    figures[f"plan_iou/{label}"] = float(np.mean(ious))
+                for measure in _MEASURES:
+                    values = [getattr(result, measure) for result in results]
+                    if None not in values:
+                        figures[f"{measure}/{label}"] = float(np.mean(values))
     network.train(was_training)
     return figures

@@ -6,6 +6,7 @@ import typer
 
 import service.cli.bench as bench
 import service.cli.build as build
+import service.cli.drive as drive
 import service.cli.evaluate as evaluate
 import service.cli.plan as plan
 import service.cli.scenes as scenes
@@ -22,6 +23,7 @@ app.command("plan")(plan.plan)
 app.command("serve")(serve.serve)
 app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
+app.command("drive")(drive.drive)
 app.add_typer(build.app, name="build")
 app.add_typer(bench.bench, name="bench")
 app.add_typer(scenes.app, name="scenes")

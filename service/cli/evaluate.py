@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 from itertools import islice
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -13,11 +14,16 @@ from service.cli.engines import Device, EngineName, Rows, VllmArguments, make_en
 from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, ScenePath, told
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
+
+    from rich.progress import Progress
 
     from model.driving.scene import LabelledScene
     from model.engines.engine import Engine
+    from model.evaluation.ladder import LadderReport
+    from model.evaluation.open_loop import SceneResult
     from model.evaluation.report import Report
+    from model.evaluation.variants import Variant
 
 
 def evaluate(
@@ -29,6 +35,14 @@ def evaluate(
     engine: EngineName = "torch",
     device: Device = "cpu",
     vllm_arguments: VllmArguments = "{}",
+    preset: Annotated[
+        Literal["standard", "ladder"],
+        typer.Option(help="ladder: what thinking brings, checkpoint by checkpoint."),
+    ] = "standard",
+    ladder: Annotated[
+        Path | None, typer.Option(help="Folder of the ladder's checkpoints; --checkpoint counts among them.")
+    ] = None,
+    plots: Annotated[Path | None, typer.Option(help="Folder for the ladder's pictures.")] = None,
     as_json: Json = False,
 ) -> None:
     """Evaluate open loop: baselines, with and without route, expert plans given, images shuffled."""
@@ -38,25 +52,111 @@ def evaluate(
         count = count_scenes(scenes)
         every = max(1, count // limit) if limit else 1
         labelled = list(islice(read_scenes(scenes, dense=False), 0, limit and every * limit, every))
-        made = make_engine(checkpoint, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
-        report = asyncio.run(_evaluate(labelled, made, n, rows, quiet=as_json))
+
+        def engine_of(folder: Path) -> Engine:
+            return make_engine(folder, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
+
+        report: Report | LadderReport
+        if preset == "ladder":
+            report = _ladder(labelled, engine_of, checkpoint, ladder, n, rows, plots, quiet=as_json)
+        else:
+            report = asyncio.run(_evaluate(labelled, engine_of(checkpoint), n, rows, quiet=as_json))
         typer.echo(json.dumps(report.to_json()) if as_json else str(report))
+
+
+def _ladder(
+    scenes: Sequence[LabelledScene],
+    engine_of: Callable[[Path], Engine],
+    checkpoint: Path,
+    folder: Path | None,
+    n: int,
+    rows: int,
+    plots: Path | None,
+    *,
+    quiet: bool,
+) -> LadderReport:
+    """Climb the ladder: every checkpoint in turn, the best one with all temperatures and thresholds."""
+    from model.evaluation import ladder_plots
+    from model.evaluation.ladder import (
+        COUNTERFACTUAL,
+        RUNGS,
+        TEMPERATURES,
+        THRESHOLDS,
+        ladder_report,
+        rung_variants,
+        sweep_variants,
+    )
+
+    found = {} if folder is None else {rung: folder / rung for rung in RUNGS if (folder / rung).is_dir()}
+    found.setdefault(COUNTERFACTUAL, checkpoint)
+    results: dict[Variant, list[SceneResult]] = {}
+    for rung, path in found.items():
+        variants = [each for route in (False, True) for each in rung_variants(rung, n=n, route=route)]
+        if rung == COUNTERFACTUAL:
+            variants += sweep_variants(rung, n=n)
+        results |= asyncio.run(_results(scenes, engine_of(path), variants, n, rows, quiet=quiet))
+    report = ladder_report(results)
+    if plots is not None:
+        plots.mkdir(parents=True, exist_ok=True)
+        row_of = {row.name: row for row in report.report.rows if row.subgroup is None}
+        ladder_plots.difficulty_plot(
+            report.difficulty[f"{COUNTERFACTUAL}, adaptive"], plots / "thinking-by-difficulty.png"
+        )
+        ladder_plots.temperature_plot(
+            [(value, row_of[f"{COUNTERFACTUAL}, temperature {value:g}"]) for value in TEMPERATURES],
+            plots / "thinking-by-temperature.png",
+        )
+        ladder_plots.threshold_plot(
+            [(value, row_of[f"{COUNTERFACTUAL}, threshold {value:g}"]) for value in THRESHOLDS],
+            plots / "risk-and-compute.png",
+        )
+    return report
+
+
+async def _results(
+    scenes: Sequence[LabelledScene],
+    engine: Engine,
+    variants: Sequence[Variant],
+    n: int,
+    rows: int,
+    *,
+    quiet: bool,
+) -> dict[Variant, list[SceneResult]]:
+    from model.evaluation.report import evaluate_variants
+
+    await engine.start()
+    try:
+        with _progress(quiet) as progress:
+            task = progress.add_task("scenes", total=len(scenes) * len(variants))
+            return await evaluate_variants(
+                engine,
+                scenes,
+                variants,
+                concurrency=max(1, rows // n) + 1,
+                on_result=lambda variant, _: progress.update(task, advance=1, description=variant.name),
+            )
+    finally:
+        await engine.stop()
+
+
+def _progress(quiet: bool) -> Progress:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    # Progress goes to stderr, so that stdout holds nothing but the table.
+    return Progress(console=Console(stderr=True, quiet=quiet))
 
 
 async def _evaluate(
     scenes: Sequence[LabelledScene], engine: Engine, n: int, rows: int, *, quiet: bool
 ) -> Report:
-    from rich.console import Console
-    from rich.progress import Progress
-
     from model.evaluation.report import evaluate_checkpoint
     from model.evaluation.variants import standard_variants
 
     await engine.start()
     try:
         variants = standard_variants(engine.card.formats, n=n)
-        # Progress goes to stderr, so that stdout holds nothing but the table.
-        with Progress(console=Console(stderr=True, quiet=quiet)) as progress:
+        with _progress(quiet) as progress:
             task = progress.add_task("scenes", total=len(scenes) * len(variants))
             return await evaluate_checkpoint(
                 engine,

@@ -49,7 +49,7 @@ def test_the_stages_lead_to_a_checkpoint_that_tells_its_history(
     assert {row["stage"] for row in rows} == {"1 ground", "2 meta-act"}
     validated = [row for row in rows if "min_ade_m/cf_vla+route" in row]
     assert [row["step"] for row in validated] == [2, 4]
-    assert all(0 < row["plan_iou/cf_vla"] < 1 for row in validated)
+    assert all(0 < row["plan_iou_first/cf_vla"] < 1 for row in validated)
 
 
 def test_a_vision_tower_can_be_taken_from_elsewhere(

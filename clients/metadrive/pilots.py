@@ -1,0 +1,105 @@
+"""Who can drive in the closed loop: whoever makes a trajectory of a scene."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from clients import wire
+from clients.planner import PlannerClient
+from model.driving.scene import Scene
+from model.driving.trajectory import FloatArray, constant_velocity
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """What a pilot wants to do.
+
+    Attributes:
+        trajectory: float32 [64, 4] in the ego frame.
+        others: the draws that were not chosen, float32 [n, 64, 4].
+        words: the plan that is followed, in words; empty without one.
+        thinking: why it was revised; empty without a second look.
+        think_rate: share of the draws that took one; None where nobody thinks.
+        milliseconds: that it took.
+        late: whether that was more than its deadline.
+    """
+
+    trajectory: FloatArray
+    others: FloatArray
+    words: str = ""
+    thinking: str = ""
+    think_rate: float | None = None
+    milliseconds: float = 0.0
+    late: bool = False
+
+
+class Pilot(Protocol):
+    """Makes trajectories."""
+
+    @property
+    def name(self) -> str:
+        """Of its row in the table."""
+        ...
+
+    def plan(self, scene: Scene) -> Planned:
+        """What to do in ``scene``."""
+        ...
+
+
+class ConstantVelocity:
+    """Goes straight on at its present speed: the floor."""
+
+    name = "constant velocity"
+
+    def plan(self, scene: Scene) -> Planned:
+        """See `Pilot.plan`."""
+        return Planned(constant_velocity(scene.history), np.zeros((0, 64, 4), np.float32))
+
+
+class ServicePilot:
+    """Plans through the HTTP API alone, and follows the draw that the others agree with most.
+
+    Args:
+        planner: a client of the service.
+        name: of its row.
+        controls: of every request; the seed goes up by one from plan to plan.
+        route: whether the model is told the route.
+    """
+
+    def __init__(
+        self, planner: PlannerClient, name: str, controls: wire.Controls, *, route: bool = True
+    ) -> None:
+        self._planner, self.name, self._controls, self._route = planner, name, controls, route
+        self._asked = 0
+
+    def plan(self, scene: Scene) -> Planned:
+        """See `Pilot.plan`; raises `PlannerError`."""
+        controls = self._controls.model_copy(update={"seed": self._controls.seed + self._asked})
+        self._asked += 1
+        asked = scene if self._route else Scene(scene.scene_id, scene.clips, scene.history)
+        began_s = time.perf_counter()
+        result = self._planner.plan(asked, controls)
+        milliseconds = 1000 * (time.perf_counter() - began_s)
+        trajectories = np.stack([draw.trajectory for draw in result.draws])
+        chosen = agreed(trajectories)
+        draw = result.draws[chosen]
+        plan = draw.revised_plan or draw.plan
+        return Planned(
+            trajectory=draw.trajectory,
+            others=np.delete(trajectories, chosen, axis=0),
+            words="" if plan is None else str(plan),
+            thinking=draw.thinking or "",
+            think_rate=float(np.mean([draw.thinking is not None for draw in result.draws])),
+            milliseconds=milliseconds,
+            late=controls.deadline_ms is not None and milliseconds > controls.deadline_ms,
+        )
+
+
+def agreed(trajectories: FloatArray) -> int:
+    """The place of the trajectory [n, 64, 4] that is nearest to all others on average."""
+    apart = np.linalg.norm(trajectories[:, None, :, :2] - trajectories[None, :, :, :2], axis=-1)
+    return int(apart.mean(axis=(1, 2)).argmin())

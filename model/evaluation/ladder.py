@@ -1,0 +1,176 @@
+"""The ladder of CF-VLA's tables 1, 2 and 4: what each step of learning, and a second look, brings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from model.engines.engine import Controls
+from model.evaluation.bootstrap import Comparison, compare
+from model.evaluation.open_loop import SceneResult
+from model.evaluation.report import Report, variant_rows
+from model.evaluation.variants import Variant
+
+META_ACT: Final = "meta-act"
+MULTI_ROUND: Final = "multi-round"
+COUNTERFACTUAL: Final = "counterfactual"
+ROUND_2: Final = "round-2"
+WHOLE_DATASET: Final = "whole-dataset"
+RUNGS: Final = (META_ACT, MULTI_ROUND, WHOLE_DATASET, COUNTERFACTUAL, ROUND_2)
+"""Checkpoints of a ladder, by the folder that each lies in."""
+
+TEMPERATURES: Final = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)
+THRESHOLDS: Final = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+GROUPS: Final = 10
+"""Scenes are told apart by difficulty in so many groups."""
+
+Results = Mapping[Variant, Sequence[SceneResult]]
+
+
+def rung_variants(rung: str, *, n: int, route: bool) -> list[Variant]:
+    """The rows of one checkpoint of the ladder, without or with the route."""
+
+    def variant(name: str, **changes: Any) -> Variant:
+        controls = Controls(n=n, thinking=changes.pop("thinking", "never"))
+        return Variant(f"{name}{' + route' if route else ''}", "cf_vla", controls, route, **changes)
+
+    if rung == META_ACT:
+        return [
+            replace(variant("traj-only"), format="traj_only"),
+            variant(META_ACT),
+            variant(f"{META_ACT}, expert plan", expert_plan=True),
+        ]
+    if rung == MULTI_ROUND:
+        return [variant(f"{META_ACT}, {MULTI_ROUND}")]
+    return [
+        variant(f"{rung}, adaptive", thinking="adaptive"),
+        variant(f"{rung}, never thinks"),
+        variant(f"{rung}, always thinks", thinking="always"),
+    ]
+
+
+def sweep_variants(rung: str, *, n: int) -> list[Variant]:
+    """Figure 8's temperatures, and think thresholds from often to seldom; without the route."""
+    return [
+        Variant(f"{rung}, temperature {value:g}", "cf_vla", Controls(n=n, temperature=value))
+        for value in TEMPERATURES
+    ] + [
+        Variant(f"{rung}, threshold {value:g}", "cf_vla", Controls(n=n, think_threshold=value))
+        for value in THRESHOLDS
+    ]
+
+
+@dataclass(frozen=True)
+class Difficulty:
+    """Scenes of like difficulty: what thinking does there.
+
+    Attributes:
+        scenes: how many.
+        never_m, adaptive_m: mean minADE without thinking, and where the model decides.
+        think_rate: share of draws that thought.
+    """
+
+    scenes: int
+    never_m: float
+    adaptive_m: float
+    think_rate: float
+
+
+def by_difficulty(
+    adaptive: Sequence[SceneResult], never: Sequence[SceneResult], groups: int = GROUPS
+) -> list[Difficulty]:
+    """Scenes from easy to hard, in groups of equal size.
+
+    How hard a scene is, is told by the same model's minADE when it may not think, so that thinking has no
+    part in what it is measured by.
+    """
+    without = {result.scene_id: result.min_ade_m for result in never}
+    order = sorted(adaptive, key=lambda result: without[result.scene_id])
+    found = []
+    for part in np.array_split(np.arange(len(order)), groups):
+        group = [order[place] for place in part]
+        found.append(
+            Difficulty(
+                len(group),
+                float(np.mean([without[result.scene_id] for result in group])),
+                float(np.mean([result.min_ade_m for result in group])),
+                float(np.mean([result.think_rate or 0.0 for result in group])),
+            )
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class LadderReport:
+    """Rows, comparisons and difficulties of a ladder.
+
+    Attributes:
+        report: rows of all variants, and comparisons.
+        difficulty: by adaptive row, from easy to hard.
+    """
+
+    report: Report
+    difficulty: Mapping[str, Sequence[Difficulty]]
+
+    def to_json(self) -> dict[str, Any]:
+        """The table's JSON with ``difficulty`` added."""
+        groups = {name: [asdict(group) for group in of] for name, of in self.difficulty.items()}
+        return self.report.to_json() | {"difficulty": groups}
+
+    def __str__(self) -> str:
+        lines = [str(self.report)]
+        for name, groups in self.difficulty.items():
+            rates = " ".join(f"{group.think_rate:.0%}" for group in groups)
+            lines.append(f"{name} thinks, from easy to hard scenes: {rates}")
+        return "\n".join(lines)
+
+
+def ladder_report(results: Results) -> LadderReport:
+    """What came of a ladder's variants; those that are missing are left out."""
+    of = {variant.name: found for variant, found in results.items()}
+    rows = [row for variant, found in results.items() for row in variant_rows(variant, found)]
+    comparisons = []
+    difficulty = {}
+    for route in ("", " + route"):
+        for name, measure in _COMPARED:
+            one, other = (f"{side}{route}" for side in name)
+            if one in of and other in of:
+                comparisons.append(compare(f"{one} : {other}", of[one], of[other], measure))
+        for rung in RUNGS:
+            adaptive, never = f"{rung}, adaptive{route}", f"{rung}, never thinks{route}"
+            if adaptive in of and never in of:
+                difficulty[adaptive] = by_difficulty(of[adaptive], of[never])
+            if adaptive in of and any(result.thought_iou_first is not None for result in of[adaptive]):
+                comparisons.append(revision(adaptive, of[adaptive]))
+    return LadderReport(Report(tuple(rows), tuple(comparisons)), difficulty)
+
+
+def revision(name: str, results: Sequence[SceneResult]) -> Comparison:
+    """Plan IOU behind and before the second look, over the draws that took one."""
+    revised = [replace(result, thought_iou_first=result.thought_iou_revised) for result in results]
+    return compare(f"{name}: revised : first plan, where it thinks", revised, results, "thought_iou_first")
+
+
+_COMPARED: Final = (
+    ((META_ACT, "traj-only"), "min_ade_m"),
+    ((f"{META_ACT}, expert plan", META_ACT), "min_ade_m"),
+    ((f"{META_ACT}, {MULTI_ROUND}", META_ACT), "min_ade_m"),
+    *(
+        ((f"{rung}, adaptive", other), measure)
+        for rung in (COUNTERFACTUAL, ROUND_2)
+        for other, measure in (
+            (META_ACT, "min_ade_m"),
+            (META_ACT, "avg_ade_m"),
+            (META_ACT, "collision_rate"),
+            (f"{META_ACT}, {MULTI_ROUND}", "min_ade_m"),
+            (f"{rung}, never thinks", "min_ade_m"),
+            (f"{rung}, always thinks", "min_ade_m"),
+            (f"{WHOLE_DATASET}, adaptive", "min_ade_m"),
+        )
+    ),
+    ((f"{ROUND_2}, adaptive", f"{COUNTERFACTUAL}, adaptive"), "min_ade_m"),
+    ((f"{ROUND_2}, adaptive", f"{COUNTERFACTUAL}, adaptive"), "think_rate"),
+)

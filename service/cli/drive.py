@@ -1,0 +1,87 @@
+"""`looktwice drive`: a car in the simulator that drives through the HTTP API alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Final, cast
+
+import typer
+
+from service.cli.options import Json, told
+
+DRIVERS: Final = ("expert", "constant-velocity", "adaptive", "never", "always")
+
+
+def drive(
+    service: Annotated[str, typer.Option(help="URL of a running service.")] = "http://127.0.0.1:8000",
+    episodes: Annotated[int, typer.Option(help="How many, each with its own seed.", min=1)] = 30,
+    first_seed: Annotated[int, typer.Option(help="Seeds from 600000 on are for testing.", min=0)] = 600_000,
+    seconds: Annotated[float, typer.Option(help="Of an episode, at most.", min=5)] = 30.0,
+    drivers: Annotated[
+        list[str] | None, typer.Option("--driver", help=f"Once for each of {', '.join(DRIVERS)}.")
+    ] = None,
+    n: Annotated[int, typer.Option(help="Draws; the car follows the one nearest to the others.", min=1)] = 6,
+    temperature: Annotated[float, typer.Option(help="Of sampling.", min=0, max=2)] = 1.0,
+    deadline_ms: Annotated[int | None, typer.Option(help="That each plan has.", min=1)] = None,
+    route: Annotated[bool, typer.Option(help="Tell the model the route.")] = True,
+    gif: Annotated[Path | None, typer.Option(help="Film of the first episode of the last driver.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Drive closed loop, planning anew every half second; expert and constant velocity are the limits."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from clients import wire
+    from clients.answers import PlannerError
+    from clients.metadrive.drive import EXPERT, Drive, DriveConfig
+    from clients.metadrive.drive import drive as drive_episode
+    from clients.metadrive.drive_table import driver_rows, format_table, to_json
+    from clients.metadrive.film import Film
+    from clients.metadrive.maps import MapError
+    from clients.metadrive.pilots import ConstantVelocity, Pilot, ServicePilot
+    from clients.metadrive.rig import Rig
+    from clients.planner import Patience, PlannerClient
+    from model.driving.scene import split_of_seed
+
+    def pilot_of(driver: str, planner: PlannerClient) -> Pilot | None:
+        if driver == "expert":
+            return None
+        if driver == "constant-velocity":
+            return ConstantVelocity()
+        controls = wire.Controls(
+            n=n, temperature=temperature, thinking=cast(wire.Thinking, driver), deadline_ms=deadline_ms
+        )
+        return ServicePilot(planner, driver, controls, route=route)
+
+    wanted = drivers or list(DRIVERS[:-1])
+    if unknown := set(wanted) - set(DRIVERS):
+        raise typer.BadParameter(f"unknown drivers: {', '.join(sorted(unknown))}")
+    with told(), PlannerClient(service, Patience(timeout_s=120.0)) as planner:
+        seeds = range(first_seed, first_seed + episodes)
+        for seed in (seeds[0], seeds[-1]):
+            split_of_seed(seed)
+        rig, film = Rig(), Film()
+        found: dict[str, list[Drive]] = {}
+        # Progress goes to stderr, so that stdout holds nothing but the table.
+        with Progress(console=Console(stderr=True, quiet=as_json)) as progress:
+            task = progress.add_task("", total=len(seeds) * len(wanted))
+            for seed in seeds:
+                for driver in wanted:
+                    pilot = pilot_of(driver, planner)
+                    name = EXPERT if pilot is None else pilot.name
+                    filmed = gif is not None and seed == seeds[0] and driver == wanted[-1]
+                    try:
+                        drove = drive_episode(
+                            seed, pilot, rig, DriveConfig(seconds), film.add if filmed else None
+                        )
+                    except MapError:
+                        typer.echo(f"no map fits seed {seed}: left out", err=True)
+                        break
+                    except PlannerError as error:
+                        raise RuntimeError(f"{service}: {error}") from error
+                    found.setdefault(name, []).append(drove)
+                    progress.update(task, advance=1, description=f"{name}: {drove.ended}")
+        if gif is not None:
+            film.save(gif)
+        typer.echo(json.dumps(to_json(found)) if as_json else format_table(driver_rows(found)))
