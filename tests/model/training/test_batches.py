@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from model.driving.plan import parse_plan
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.network.checkpoint import Loaded, load
 from model.training.batches import Item, ResponseDataset, TaskSampler, collate
 from model.training.examples import Examples
 from model.training.learner import ResponseLearner
-from model.training.targets import PAPER_WEIGHTS, Task
+from model.training.targets import PAPER_WEIGHTS, Reflection, Task
 from tests.model.training.scenes import training_scene
 
 
@@ -89,3 +90,53 @@ def test_learning_without_pictures_leaves_the_tower_alone(loaded: Loaded) -> Non
     assert all(parameter.grad is None for parameter in loaded.model.model.visual.parameters())
     assert loaded.model.lm_head.weight.grad is not None
     loaded.model.zero_grad()
+
+
+REFLECTED = np.array([3, 3, 5], np.int64)
+
+
+def test_reflections_are_examples_beside_all_others() -> None:
+    sampler = TaskSampler(np.ones(8, np.bool_), 1, {"cf_vla": 1.0}, 0.5, seed=0, reflected=REFLECTED)
+    items = [item for batch in sampler for item in batch]
+    assert len(items) == len(sampler) == 11
+    assert {(item.index, item.reflection) for item in items if item.reflection is not None} == {
+        (3, 0),
+        (3, 1),
+        (5, 2),
+    }
+    assert sorted(item.index for item in items if item.reflection is None) == list(range(8))
+
+
+def test_the_control_learns_the_same_scenes_without_reasoning() -> None:
+    sampler = TaskSampler(
+        np.ones(8, np.bool_), 1, {"traj_only": 1.0}, 0.5, seed=0, reflected=REFLECTED, reasoning=False
+    )
+    items = [item for batch in sampler for item in batch]
+    assert {item.reflection for item in items} == {None}
+    assert Counter(item.index for item in items if item.task == "cf_vla") == {3: 2, 5: 1}
+
+
+def test_a_counterfactual_example_learns_everything_but_the_wrong_plan(loaded: Loaded) -> None:
+    wrong = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
+    examples = Examples.from_scenes((training_scene(k) for k in range(8)), (FRONT_WIDE, FRONT_TELE))
+    data = ResponseDataset(
+        examples,
+        loaded.codec,
+        loaded.inputs,
+        loaded.vocabulary,
+        PAPER_WEIGHTS,
+        pictures=True,
+        reflections=[Reflection(wrong, "The road ahead is clear, so I should drive on.")],
+    )
+    sample = data[Item(2, "cf_vla", True, 0)]
+    prompt = len(loaded.inputs.prompt("cf_vla", route=True).ids)
+    response = loaded.vocabulary.decode(sample.ids[prompt:])
+    plain = data[Item(2, "cf_vla", True)]
+    assert str(wrong) in response
+    assert "The road ahead is clear" in response
+    assert str(examples.plan(2)) in response
+    assert response.index(str(wrong)) < response.index("Thinking:") < response.index(str(examples.plan(2)))
+    weighed = [token for token, weight in zip(sample.ids, sample.weights, strict=True) if weight > 0]
+    assert loaded.vocabulary.decode(weighed).startswith("Thinking:")
+    assert "Wait" not in loaded.vocabulary.decode(weighed)
+    assert "Thinking:" not in loaded.vocabulary.decode(plain.ids)

@@ -52,7 +52,7 @@ def test_the_cache_gives_the_same_and_follows_its_file(tmp_path: Path) -> None:
     first = load_examples(tmp_path / "scenes", tmp_path / "cache", CAMERAS)
     again = load_examples(tmp_path / "scenes", tmp_path / "cache", CAMERAS)
     for field in fields(Examples):
-        assert np.array_equal(getattr(first, field.name), getattr(again, field.name), equal_nan=True)
+        np.testing.assert_array_equal(getattr(first, field.name), getattr(again, field.name))
     assert len(first) == 6
     write_scenes(tmp_path / "scenes" / "b.parquet", SCENES[4:5])
     newer = os.stat(tmp_path / "cache").st_mtime + 10

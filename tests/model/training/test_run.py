@@ -11,7 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from model.driving.plan import parse_plan
+from model.driving.reflection_store import LabelledReflection, write_reflections
+from model.driving.scene import LabelledScene
 from model.driving.scene_store import write_scenes
+from model.evaluation.open_loop import expert_plan
 from model.network.checkpoint import load
 from model.training.recipes import NANO, Recipe
 from model.training.run import RunSettings, last_whole_state, run
@@ -130,3 +134,43 @@ def test_two_processes_share_the_work(untrained_checkpoint: Path, scenes: Path, 
     rows = [json.loads(line) for line in (target / "log.jsonl").read_text().splitlines()]
     assert sum("train_runtime" in row for row in rows) == 1
     assert load(target).card.details["stages"][0]["steps"] == 6
+
+
+def test_reflections_are_learned_and_counted(
+    untrained_checkpoint: Path, scenes: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "reflections.parquet"
+    write_reflections(file, [reflection(SCENES[3]), reflection(SCENES[4])])
+    settings = RunSettings(tmp_path / "cache", bf16=False)
+    for name in ("counterfactual", "multi-round"):
+        target = tmp_path / name
+        run(short(name, 2), scenes, untrained_checkpoint, target, settings, reflections=file)
+        assert load(target).card.details["stages"][-1]["reflections_count"] == 2
+    with pytest.raises(ValueError, match="needs reflections"):
+        run(short("counterfactual"), scenes, untrained_checkpoint, tmp_path / "no", settings)
+    with pytest.raises(ValueError, match="takes no reflections"):
+        run(
+            short("meta-act"),
+            scenes,
+            untrained_checkpoint,
+            tmp_path / "no",
+            settings,
+            reflections=file,
+        )
+    write_reflections(file, [reflection(training_scene(99))])
+    with pytest.raises(ValueError, match="not among the scenes"):
+        run(
+            short("counterfactual"),
+            scenes,
+            untrained_checkpoint,
+            tmp_path / "no",
+            settings,
+            reflections=file,
+        )
+
+
+def reflection(labelled: LabelledScene) -> LabelledReflection:
+    """A reflection on a scene, by nobody in particular."""
+    wrong, right = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n"), expert_plan(labelled)
+    text = "The road ahead is clear, so I should drive on."
+    return LabelledReflection(labelled.scene.scene_id, wrong, text, right, *("x",) * 5, 1, "now")

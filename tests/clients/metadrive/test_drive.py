@@ -1,0 +1,177 @@
+"""The closed loop, with real pictures and a real socket; the oracle knows what the expert did."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clients import wire
+from clients.metadrive.drive import EXPERT, TAKE_OVER, Drive, DriveConfig, Shot, drive
+from clients.metadrive.drive_table import driver_rows, format_table, to_json
+from clients.metadrive.episode import make_world, run_episode
+from clients.metadrive.episode_log import EpisodeLog
+from clients.metadrive.film import Film
+from clients.metadrive.pilots import ConstantVelocity, Planned, ServicePilot, agreed
+from clients.metadrive.rig import Rig
+from clients.metadrive.tracking import FreeVehicle, world_trajectory
+from clients.planner import PlannerClient
+from model.driving.scene import Scene
+from model.driving.trajectory import to_ego_frame
+from service.settings import Settings
+from tests.clients.metadrive.conftest import SEED
+from tests.service.scripted_engine import ScriptedEngine
+from tests.service.serving import serve
+
+CONFIG = DriveConfig(duration_s=12.0)
+NOBODY = np.zeros((0, 64, 4), np.float32)
+
+
+class Oracle:
+    """Plans what the expert did in the same episode, from wherever the car is."""
+
+    name = "oracle"
+
+    def __init__(self, log: EpisodeLog) -> None:
+        self._log, self.scenes = log, list[Scene]()
+        self._cars: list[FreeVehicle] = []
+
+    def plan(self, scene: Scene) -> Planned:
+        self.scenes.append(scene)
+        step = int(scene.scene_id.split("-")[1])
+        ego = self._log.ego
+        rows = [min(step + k, len(ego) - 1) for k in range(65)]
+        poses = np.zeros((65, 4))
+        poses[:, :2], poses[:, 3] = ego[rows, :2], ego[rows, 2]
+        seen = to_ego_frame(poses, poses[0])
+        return Planned(seen[1:].astype(np.float32), NOBODY)
+
+
+@pytest.fixture(scope="module")
+def expert(rig: Rig) -> Drive:
+    return drive(SEED, None, rig, CONFIG)
+
+
+def test_the_expert_drives_as_in_its_own_episode(expert: Drive) -> None:
+    log = run_episode(SEED, CONFIG.duration_s)
+    assert expert.ended == log.outcome
+    assert expert.driven_m > 20
+    assert not expert.off_road
+    assert (expert.plans, expert.thought) == (0, None)
+    again = make_world(SEED, CONFIG.duration_s)
+    near = again.remember()
+    while not again.ended:
+        again.move(near, again.drive_as_expert)
+        near = again.remember()
+    np.testing.assert_array_equal(again.log().ego, log.ego)
+
+
+def test_who_plans_what_the_expert_did_gets_as_far(rig: Rig, expert: Drive) -> None:
+    oracle = Oracle(run_episode(SEED, CONFIG.duration_s + 7.0))
+    drove = drive(SEED, oracle, rig, CONFIG)
+    assert drove.driven_m == pytest.approx(expert.driven_m, rel=0.1)
+    assert drove.ended == "time"
+    assert not drove.off_road
+    assert drove.plans == len(oracle.scenes) == (round(CONFIG.duration_s * 10) - TAKE_OVER + 4) // 5
+
+
+def test_a_scene_holds_what_the_car_sees_and_nothing_else(rig: Rig) -> None:
+    oracle = Oracle(run_episode(SEED, CONFIG.duration_s + 7.0))
+    drive(SEED, oracle, rig, CONFIG)
+    first, second = oracle.scenes[:2]
+    assert [len(clip.images) for clip in first.clips] == [4, 4]
+    assert first.route is not None
+    assert first.history[-1].tolist() == [0, 0, 0, 0]
+    # Half a second later the clips have moved on by one picture.
+    for before, after in zip(first.clips, second.clips, strict=True):
+        assert before.images[1:] == after.images[:-1]
+
+
+def test_constant_velocity_goes_straight_on(rig: Rig) -> None:
+    drove = drive(SEED, ConstantVelocity(), rig, CONFIG)
+    assert drove.plans > 0
+    assert drove.thought is None
+    assert drove.lateral_ms2 < 0.1
+
+
+def test_a_car_follows_a_curve_that_it_is_shown() -> None:
+    world = make_world(SEED, 20.0)
+    car = FreeVehicle.from_rails(world.ego)
+    car.speed = 10.0
+    times = 0.1 * np.arange(1, 65)
+    angle = 10.0 * times / 40.0  # a circle of 40 m at 10 m/s
+    curve = np.stack([40 * np.sin(angle), 40 * (1 - np.cos(angle)), 0 * times, angle], axis=1)
+    way = world_trajectory(np.array([car.x, car.y, car.heading, car.speed]), curve.astype(np.float32))
+    apart = []
+    for step in range(40):
+        car.follow(way, 0.1 * step, world.live.road_map)
+        apart.append(np.hypot(*(way[step + 1, :2] - [car.x, car.y])))
+    assert max(apart) < 0.6
+    assert car.speed == pytest.approx(10.0, abs=0.5)
+
+
+def test_a_car_stops_where_its_trajectory_ends() -> None:
+    world = make_world(SEED, 20.0)
+    car = FreeVehicle.from_rails(world.ego)
+    car.speed = 8.0
+    times = np.minimum(0.1 * np.arange(1, 65), 4.0)
+    stop = np.zeros((64, 4), np.float32)
+    stop[:, 0] = 8.0 * times - times**2
+    way = world_trajectory(np.array([car.x, car.y, car.heading, car.speed]), stop)
+    for step in range(64):
+        car.follow(way, 0.1 * step, world.live.road_map)
+    assert abs(car.speed) < 0.3
+    assert np.hypot(*(way[-1, :2] - [car.x, car.y])) < 1.0
+
+
+def test_the_draw_that_the_others_agree_with_is_followed() -> None:
+    draws = np.zeros((4, 64, 4), np.float32)
+    draws[:, :, 1] = np.array([0.0, 1.0, 1.2, 9.0])[:, None]
+    assert agreed(draws) == 1
+    assert agreed(draws[:1]) == 0
+
+
+def test_it_drives_through_the_api(rig: Rig, tmp_path: Path) -> None:
+    engine, film, shots = ScriptedEngine(), Film(), list[Shot]()
+
+    def on_shot(shot: Shot) -> None:
+        shots.append(shot)
+        film.add(shot)
+
+    with (
+        serve(engine, Settings(bundled_scenes=tmp_path / "none")) as served,
+        PlannerClient(served.url) as planner,
+    ):
+        controls = wire.Controls(n=3, thinking="always", deadline_ms=60_000)
+        pilot = ServicePilot(planner, "always", controls, route=False)
+        drove = drive(SEED, pilot, rig, replace(CONFIG, duration_s=4.0), on_shot)
+    assert drove.plans == len(engine.submitted) > 3
+    assert (drove.thought, drove.late) == (1.0, 0)
+    assert {request.controls.seed for request in engine.submitted} == set(range(drove.plans))
+    assert all(request.scene.route is None for request in engine.submitted)
+    assert drove.milliseconds is not None
+    planned = shots[-1].planned
+    assert planned is not None
+    assert planned.thinking
+    assert "longitudinal" in planned.words
+    film.save(tmp_path / "drive.gif")
+    with Image.open(tmp_path / "drive.gif") as gif:
+        assert gif.n_frames == len(shots)  # type: ignore[attr-defined]  # a GIF has it
+    with pytest.raises(ValueError, match="frame"):
+        Film().save(tmp_path / "none.gif")
+
+
+def test_drivers_are_compared_over_the_same_episodes() -> None:
+    whole = Drive(1, "time", 200.0, False, 3.0, 1.0)
+    half = Drive(1, "collision", 100.0, True, 5.0, 2.0, 10, 0.2, 1, 250.0)
+    expert, mine = driver_rows({EXPERT: [whole, whole], "adaptive": [half, whole]})
+    assert (expert.route_completion, mine.route_completion) == (1.0, 0.75)
+    assert (mine.collisions, mine.off_road, mine.deadline_misses, mine.think_rate) == (1, 1, 1, 0.2)
+    assert "adaptive" in format_table([expert, mine])
+    told = to_json({EXPERT: [whole], "adaptive": [half]})["drivers"]
+    assert {"name", "episodes", "route_completion", "collisions", "off_road", "think_rate"} <= set(told[1])
+    assert told[1]["drives"][0]["ended"] == "collision"
+    assert driver_rows({"adaptive": [half]})[0].route_completion is None

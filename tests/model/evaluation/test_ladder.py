@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.driving.images import decode_image
+from model.driving.plan import parse_plan
+from model.evaluation.ladder import (
+    COUNTERFACTUAL,
+    META_ACT,
+    RUNGS,
+    TEMPERATURES,
+    THRESHOLDS,
+    by_difficulty,
+    ladder_report,
+    rung_variants,
+    sweep_variants,
+)
+from model.evaluation.ladder_plots import difficulty_plot, temperature_plot, threshold_plot
+from model.evaluation.open_loop import SceneResult, evaluate_draws, expert_plan
+from tests.model.driving.drives import labelled_scene
+from tests.model.evaluation.fakes import draw_of
+
+
+def result(scene: int, error_m: float, think_rate: float | None = None, **more: float) -> SceneResult:
+    return SceneResult(
+        f"s{scene}", f"e{scene // 4}", frozenset(), False, *(error_m,) * 5, 0.1, 0.1,
+        plan_iou_first=0.5, plan_iou_revised=0.6, output_tokens=60.0, think_rate=think_rate, **more,
+    )  # fmt: skip
+
+
+def test_a_rung_has_its_rows_with_and_without_the_route() -> None:
+    names = {rung: [each.name for each in rung_variants(rung, n=6, route=True)] for rung in RUNGS}
+    assert names[META_ACT] == [
+        "traj-only + route",
+        "meta-act + route",
+        "meta-act, expert plan + route",
+    ]
+    assert [each.controls.thinking for each in rung_variants(COUNTERFACTUAL, n=6, route=False)] == [
+        "adaptive",
+        "never",
+        "always",
+    ]
+    everything = [name for of in names.values() for name in of]
+    assert len(set(everything)) == len(everything)
+    assert len(sweep_variants(COUNTERFACTUAL, n=6)) == len(TEMPERATURES) + len(THRESHOLDS)
+
+
+def test_difficulty_is_told_by_the_error_without_thinking() -> None:
+    never = [result(scene, float(scene)) for scene in range(40)]
+    adaptive = [result(scene, 40.0 - scene, scene / 40) for scene in reversed(range(40))]
+    groups = by_difficulty(adaptive, never, 5)
+    assert [group.scenes for group in groups] == [8] * 5
+    assert [group.never_m for group in groups] == sorted(group.never_m for group in groups)
+    assert groups[-1].think_rate == pytest.approx(np.mean(np.arange(32, 40) / 40))
+    assert groups[0].adaptive_m > groups[-1].adaptive_m
+
+
+def test_the_ladder_compares_what_the_paper_compares() -> None:
+    results = {
+        each: [result(scene, 2.0, 0.2) for scene in range(40)]
+        for rung in (META_ACT, COUNTERFACTUAL)
+        for each in rung_variants(rung, n=6, route=False)
+    }
+    for variant, of in results.items():
+        factor = {"counterfactual, adaptive": 0.9, "traj-only": 1.2}.get(variant.name, 1.0)
+        results[variant] = [
+            replace(each, min_ade_m=each.min_ade_m * factor, thought_iou_first=0.5, thought_iou_revised=0.7)
+            for each in of
+        ]
+    report = ladder_report(results)
+    ratios = {each.name: each.ratio for each in report.report.comparisons if each.measure == "min_ade_m"}
+    assert ratios["counterfactual, adaptive : meta-act"] == pytest.approx(0.9)
+    assert ratios["meta-act : traj-only"] == pytest.approx(1 / 1.2)
+    assert not any("round-2" in name for name in ratios), "what is not there is left out"
+    (revised,) = [each for each in report.report.comparisons if "where it thinks" in each.name]
+    assert revised.value == pytest.approx(0.7)
+    assert revised.against == pytest.approx(0.5)
+    told = report.to_json()
+    assert {"rows", "comparisons", "difficulty", "scenes"} <= set(told)
+    assert len(told["difficulty"]["counterfactual, adaptive"]) == 10
+    assert "from easy to hard" in str(report)
+
+
+def test_revised_plans_are_measured_where_there_are_some() -> None:
+    labelled = labelled_scene()
+    right, wrong = expert_plan(labelled), parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
+    thought = draw_of(labelled.future, wrong, right)
+    direct = draw_of(labelled.future, right)
+    both = evaluate_draws(labelled, [thought, direct])
+    assert (both.thought_iou_first, both.thought_iou_revised) == (0.0, 1.0)
+    assert evaluate_draws(labelled, [direct]).thought_iou_first is None
+
+
+def test_the_pictures_show_what_is_measured(tmp_path: Path) -> None:
+    never = [result(scene, float(scene)) for scene in range(40)]
+    adaptive = [result(scene, float(scene), scene / 40) for scene in range(40)]
+    difficulty_plot(by_difficulty(adaptive, never), tmp_path / "difficulty.png")
+    variants = sweep_variants(COUNTERFACTUAL, n=6)
+    rows = ladder_report({each: adaptive for each in variants}).report.rows
+    by_name = {row.name: row for row in rows}
+    temperature_plot(
+        [(value, by_name[f"{COUNTERFACTUAL}, temperature {value:g}"]) for value in TEMPERATURES],
+        tmp_path / "temperature.png",
+    )
+    threshold_plot(
+        [(value, by_name[f"{COUNTERFACTUAL}, threshold {value:g}"]) for value in THRESHOLDS],
+        tmp_path / "threshold.png",
+    )
+    for name in ("difficulty", "temperature", "threshold"):
+        assert decode_image((tmp_path / f"{name}.png").read_bytes()).std() > 10
