@@ -1,0 +1,130 @@
+"""The whole build with the shipped checkpoint: a real service, real scenes, real commands."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from model.bundled import CHECKPOINT, SCENES
+from model.driving.reflection_store import read_reflections
+from model.engines.torch.engine import TorchEngine, TorchSettings
+from service.cli.commands import app
+from service.settings import Settings
+from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer
+from tests.service.serving import serve
+from tests.sockets import listening
+
+COUNT = 12
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    with serve(TorchEngine(CHECKPOINT, TorchSettings(rows=24)), Settings()) as served:
+        yield served.url
+
+
+@pytest.fixture(scope="module")
+def rolled(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A build whose scenes are rolled out and all kept."""
+    folder = tmp_path_factory.mktemp("build")
+    done = told("rollout", folder, SCENES, "--service", url, "--n", 2, "--json")
+    assert (done["done"], done["dead"]) == (COUNT, 0)
+    assert told("filter", folder, "--everything", "--json")["kept"] == COUNT
+    return folder
+
+
+def ran(*arguments: object, code: int = 0) -> str:
+    """What a command prints."""
+    result = CliRunner().invoke(app, ["build", *map(str, arguments)])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def told(*arguments: object) -> dict[str, Any]:
+    # The service runs in this process too, and its log goes where the command prints.
+    lines = [json.loads(line) for line in ran(*arguments).splitlines() if line.startswith("{")]
+    (found,) = [line for line in lines if "event" not in line]
+    assert isinstance(found, dict)
+    return found
+
+
+def test_rolled_out_once_and_for_all(rolled: Path, url: str) -> None:
+    again = told("rollout", rolled, SCENES, "--service", url, "--n", 2, "--json")
+    assert (again["done"], again["earlier"]) == (0, COUNT)
+    assert (rolled / "filter.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_labelled_and_exported_in_every_form(rolled: Path, tmp_path: Path) -> None:
+    done = told("label", rolled, SCENES, "--json")
+    assert (done["done"], done["dead"], done["answers"]) == (COUNT, 0, COUNT)
+    run = done["run"][:8]
+    ran("export", rolled, "--to", tmp_path / "r.parquet", "--run", run)
+    assert len(list(read_reflections(tmp_path / "r.parquet"))) == COUNT
+    ran("export", rolled, "--form", "messages", "--scenes", SCENES, "--to", tmp_path / "m", "--run", run)
+    assert len((tmp_path / "m" / "messages.jsonl").read_text().splitlines()) == COUNT
+    assert "--scenes" in ran("export", rolled, "--form", "messages", "--to", tmp_path / "n", code=2)
+
+
+def test_labelled_by_the_service(rolled: Path, url: str) -> None:
+    arguments = ("--teacher", "service", "--service", url, "--seed", 1, "--json")
+    assert told("label", rolled, SCENES, *arguments)["done"] == COUNT
+
+
+def test_labelled_by_an_endpoint(rolled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    server = ChatServer([LEAKING])
+    with listening(server.app()) as (url, _):
+        for name, value in {"KIND": "openai", "BASE_URL": f"{url}/v1", "MODEL": "some-vlm"}.items():
+            monkeypatch.setenv(f"LOOKTWICE_TEACHER_{name}", value)
+        done = told("label", rolled, SCENES, "--limit", 3, "--max-error-rate", 1, "--json")
+    assert (done["done"], done["dead"], done["answers"]) == (0, 3, 9)
+    assert (done["input_tokens"], done["output_tokens"]) == (9000, 450)
+    letters = [json.loads(line) for line in (rolled / "dead_letters.jsonl").read_text().splitlines()]
+    assert {letter["text"] for letter in letters} == {LEAKING}
+
+
+def test_a_dry_run_keeps_nothing(rolled: Path, url: str, tmp_path: Path) -> None:
+    folder = tmp_path / "empty"
+    shown = ran("rollout", folder, SCENES, "--service", url, "--n", 2, "--dry-run", 2)
+    assert shown.count('"expert_plan"') == 2
+    assert not folder.exists()
+    shown = ran("label", rolled, SCENES, "--seed", 9, "--dry-run", 2)
+    assert shown.count('"reflection"') == 2
+    assert "several runs of label" in ran("export", rolled, "--to", tmp_path / "x.parquet", code=2)
+
+
+def test_a_batch_goes_out_and_its_results_come_in(
+    rolled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"KIND": "openai", "MODEL": "batched"}.items():
+        monkeypatch.setenv(f"LOOKTWICE_TEACHER_{name}", value)
+    asked = tmp_path / "asked.jsonl"
+    ran("export", rolled, "--form", "openai-batch", "--scenes", SCENES, "--to", asked)
+    lines = [json.loads(line) for line in asked.read_text().splitlines()]
+    assert len(lines) == COUNT
+    answered = tmp_path / "answered.jsonl"
+    body = {"choices": [{"message": {"content": GOOD}, "finish_reason": "stop"}]}
+    answered.write_text(
+        "".join(
+            json.dumps({"custom_id": line["custom_id"], "response": {"status_code": 200, "body": body}})
+            + "\n"
+            for line in lines
+        )
+    )
+    taken = told("take", rolled, SCENES, answered, "--json")
+    # The same words fit the change that some scenes want and not that of others.
+    asked_again = ran("export", rolled, "--form", "openai-batch", "--scenes", SCENES, "--to", asked)
+    assert f"{COUNT - taken['done']} written" in asked_again
+
+
+def test_mistakes_are_told_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "no service answers" in ran("rollout", tmp_path, SCENES, "--service", "http://127.0.0.1:9", code=2)
+    assert "no rollout yet" in ran("filter", tmp_path, code=2)
+    assert "no rollout yet" in ran("label", tmp_path, SCENES, code=2)
+    monkeypatch.setenv("LOOKTWICE_TEACHER_KIND", "openai")
+    arguments = ("--form", "openai-batch", "--scenes", SCENES, "--to", tmp_path / "x")
+    assert "LOOKTWICE_TEACHER" in ran("export", tmp_path, *arguments, code=2)
