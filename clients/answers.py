@@ -81,6 +81,7 @@ class PlannedDraw:
         think_probability: of a second look, 0..1.
         thinking, revised_plan: the second look; None where none was taken.
         trajectory: float32 [64, 4]: x, y, z in m and heading in rad at 10 Hz, ego frame, first row at +0.1 s.
+        draft_trajectory: where the first plan would have led; None without a second look or a deadline.
         tokens: tokens per section.
     """
 
@@ -91,6 +92,7 @@ class PlannedDraw:
     thinking: str | None
     revised_plan: Plan | None
     trajectory: FloatArray
+    draft_trajectory: FloatArray | None
     tokens: dict[str, int]
 
 
@@ -232,5 +234,8 @@ def _draw(draw: wire.Draw) -> PlannedDraw:
         thinking=draw.thinking,
         revised_plan=None if draw.revised_plan is None else parse_plan(draw.revised_plan.text),
         trajectory=check_trajectory(np.asarray(draw.trajectory, np.float32)),
+        draft_trajectory=None
+        if draw.draft_trajectory is None
+        else check_trajectory(np.asarray(draw.draft_trajectory, np.float32)),
         tokens=draw.tokens,
     )

@@ -184,6 +184,10 @@ class Draw(Answered):
     thinking: str | None = Field(description="The reasoning; null without a second look.")
     revised_plan: Plan | None = Field(description="The plan after reasoning; null without a second look.")
     trajectory: Trajectory
+    draft_trajectory: Trajectory | None = Field(
+        default=None,
+        description="Where the first plan would have led; made beside a second look under a deadline.",
+    )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
 
 

@@ -6,7 +6,7 @@ import asyncio
 import secrets
 import time
 from collections.abc import Awaitable, Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 import structlog
 
@@ -15,6 +15,7 @@ from model.driving.images import ImageError
 from model.driving.plan import Plan, PlanError, plan_changes, plan_iou
 from model.driving.scene import SceneError
 from model.engines.engine import (
+    DraftFinished,
     Draw,
     DrawFinished,
     Engine,
@@ -31,6 +32,13 @@ _DECIMALS: Final = 4
 """Of poses on the wire: a tenth of a millimetre."""
 
 log = structlog.stdlib.get_logger()
+
+
+class Drawn(NamedTuple):
+    """A draw, and the direct trajectory that was ready before its reflection was, if there was one."""
+
+    draw: Draw
+    draft: Draw | None
 
 
 class CallerLeft(Exception):
@@ -57,9 +65,9 @@ async def answer(
         ProblemError: the request cannot be served; the engine failed.
         CallerLeft: nobody waits for the answer.
     """
-    draws, timing = await _decode(asked, engine, metrics, request_id, caller_leaves)
+    drawn, timing = await _decode(asked, engine, metrics, request_id, caller_leaves)
     return wire.PlanResponse(
-        request_id=request_id, model=_model(engine), draws=[_draw(draw) for draw in draws], timing=timing()
+        request_id=request_id, model=_model(engine), draws=[_draw(*each) for each in drawn], timing=timing()
     )
 
 
@@ -71,8 +79,8 @@ async def reflect(
     caller_leaves: Callable[[], Awaitable[None]],
 ) -> wire.ReflectResponse:
     """Look at a given plan; see `answer`."""
-    draws, timing = await _decode(asked, engine, metrics, request_id, caller_leaves)
-    first = draws[0]
+    drawn, timing = await _decode(asked, engine, metrics, request_id, caller_leaves)
+    first = drawn[0].draw
     if first.plan is None or first.think_probability is None:
         raise ProblemError(REFUSED, f"responses in the format {asked.format} hold no plan to reflect upon")
     return wire.ReflectResponse(
@@ -80,7 +88,7 @@ async def reflect(
         model=_model(engine),
         plan=wire_plan(first.plan),
         think_probability=first.think_probability,
-        draws=[_reflection(first.plan, draw) for draw in draws],
+        draws=[_reflection(first.plan, draw) for draw, _ in drawn],
         timing=timing(),
     )
 
@@ -91,7 +99,7 @@ async def _decode(
     metrics: Metrics,
     request_id: str,
     caller_leaves: Callable[[], Awaitable[None]],
-) -> tuple[list[Draw], Callable[[], wire.Timing]]:
+) -> tuple[list[Drawn], Callable[[], wire.Timing]]:
     """The draws of a request, and what tells the time that it has taken when the answer is made."""
     began = time.perf_counter()
     engine_id = f"{request_id}/{secrets.token_hex(4)}"
@@ -99,10 +107,10 @@ async def _decode(
     request = await asyncio.to_thread(engine_request, asked, engine.card, engine_id)
     checked = time.perf_counter()
     with metrics.plans_in_flight.track_inprogress():
-        draws = await _while_wanted(_draws(engine, request), caller_leaves)
+        drawn = await _while_wanted(_draws(engine, request), caller_leaves)
     finished = time.perf_counter()
     endpoint = "reflect" if isinstance(asked, wire.ReflectRequest) else "plan"
-    for draw in draws:
+    for draw, _ in drawn:
         metrics.draw_finished(draw, request.controls.thinking, endpoint)
 
     def timing() -> wire.Timing:
@@ -112,7 +120,7 @@ async def _decode(
             engine_ms=_ms(finished - checked),
         )
 
-    return draws, timing
+    return drawn, timing
 
 
 def _model(engine: Engine) -> wire.ModelName:
@@ -133,9 +141,15 @@ def model_card(card: ModelCard) -> wire.ModelCard:
     )
 
 
-async def _draws(engine: Engine, request: PlanRequest) -> list[Draw]:
+async def _draws(engine: Engine, request: PlanRequest) -> list[Drawn]:
+    drafts: dict[int, Draw] = {}
+    draws: list[Draw] = []
     try:
-        draws = [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
+        async for event in engine.submit(request):
+            if isinstance(event, DraftFinished):
+                drafts[event.draw.index] = event.draw
+            elif isinstance(event, DrawFinished):
+                draws.append(event.draw)
     except ImageError as error:
         raise ProblemError(INVALID_IMAGE, str(error)) from error
     except (RequestError, SceneError, PlanError) as error:
@@ -146,12 +160,12 @@ async def _draws(engine: Engine, request: PlanRequest) -> list[Draw]:
     except asyncio.CancelledError:
         engine.cancel(request.request_id)
         raise
-    return sorted(draws, key=lambda draw: draw.index)
+    return [Drawn(draw, drafts.get(draw.index)) for draw in sorted(draws, key=lambda draw: draw.index)]
 
 
 async def _while_wanted(
-    work: Awaitable[list[Draw]], caller_leaves: Callable[[], Awaitable[None]]
-) -> list[Draw]:
+    work: Awaitable[list[Drawn]], caller_leaves: Callable[[], Awaitable[None]]
+) -> list[Drawn]:
     working = asyncio.ensure_future(work)
     leaving = asyncio.ensure_future(caller_leaves())
     try:
@@ -165,7 +179,7 @@ async def _while_wanted(
         await asyncio.gather(working, leaving, return_exceptions=True)
 
 
-def _draw(draw: Draw) -> wire.Draw:
+def _draw(draw: Draw, draft: Draw | None) -> wire.Draw:
     return wire.Draw(
         index=draw.index,
         plan=None if draw.plan is None else wire_plan(draw.plan),
@@ -174,6 +188,7 @@ def _draw(draw: Draw) -> wire.Draw:
         thinking=draw.thinking,
         revised_plan=None if draw.revised_plan is None else wire_plan(draw.revised_plan),
         trajectory=_trajectory(draw),
+        draft_trajectory=None if draft is None or draw.thinking is None else _trajectory(draft),
         tokens=dict(draw.tokens),
     )
 

@@ -77,9 +77,30 @@ async function openFile(file) {
   showView(views[0]);
 }
 
+const usesThreshold = () => byId("thinking").value === "adaptive" && byId("with-threshold").checked;
+
+// A threshold decides at the branch only where the model may decide at all.
+function showThreshold() {
+  byId("with-threshold").disabled = byId("thinking").value !== "adaptive";
+  byId("threshold").disabled = !usesThreshold();
+  byId("threshold-value").textContent = usesThreshold() ? byId("threshold").valueAsNumber.toFixed(2)
+    : byId("thinking").value === "adaptive" ? "sampled" : "unused";
+}
+
+let planSoon = 0;
+function replan() {
+  showThreshold();
+  if (!state.draws.length) return;
+  clearTimeout(planSoon);
+  planSoon = setTimeout(() => attempt(plan), 150); // while the slider moves, only its last place counts
+}
+
 function controls() {
+  const deadline = byId("deadline").valueAsNumber;
   return {
     thinking: byId("thinking").value,
+    think_threshold: usesThreshold() ? byId("threshold").valueAsNumber : null,
+    deadline_ms: Number.isNaN(deadline) ? null : deadline,
     n: byId("n").valueAsNumber,
     temperature: byId("temperature").valueAsNumber,
     seed: byId("seed").valueAsNumber,
@@ -163,6 +184,9 @@ function listen() {
     event.preventDefault();
     attempt(plan);
   });
+  byId("thinking").addEventListener("change", showThreshold);
+  byId("with-threshold").addEventListener("change", replan);
+  byId("threshold").addEventListener("input", replan);
   byId("file").addEventListener("change", (event) => {
     const [file] = event.target.files;
     event.target.value = ""; // the same file can be opened again
@@ -198,4 +222,5 @@ async function showModel() {
 }
 
 listen();
+showThreshold();
 attempt(begin);

@@ -33,6 +33,8 @@ export function drawBirdseye(view, draws, chosen) {
   for (const agent of view.agents) if (agent.poses[NOW]) box(map, agent.poses[NOW], agent, tint(agent), 1);
   draws.forEach((draw, index) => index !== chosen && line(map, start(draw.trajectory), "draw", 2, [], 0.5));
   if (view.future) line(map, start(view.future), "expert", 2.5, [7, 5]);
+  const draft = draws[chosen]?.draft_trajectory;
+  if (draft) line(map, start(draft), "draft", 3, [9, 5]);
   if (draws[chosen]) chosenDraw(map, draws[chosen].trajectory);
   box(map, [0, 0, 0], EGO, "ego", 1);
   canvas.setAttribute("aria-label", describe(view, draws, chosen));
@@ -123,6 +125,11 @@ function describe(view, draws, chosen) {
     const [x, y] = draws[chosen].trajectory.at(-1);
     const side = y >= 0 ? "left" : "right";
     parts.push(`${draws.length} draws; the chosen one ends ${x.toFixed(0)} m ahead and ${Math.abs(y).toFixed(1)} m to the ${side}`);
+    const draft = draws[chosen].draft_trajectory;
+    if (draft) {
+      const [dx, dy] = draft.at(-1);
+      parts.push(`its draft ended ${Math.hypot(dx - x, dy - y).toFixed(1)} m from there`);
+    }
   }
   return parts.join("; ");
 }

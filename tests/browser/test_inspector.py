@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from tests.service.scripted_engine import REASONING, ScriptedEngine
 from tests.service.serving import Served, body, serve
 
 CHOSEN_RGB = (29, 95, 209)  # --chosen of the light theme
+DRAFT_RGB = (194, 24, 127)  # --draft of the light theme
 DARK_PAGE_RGB = (18, 22, 28)  # --page of the dark theme
 
 
@@ -70,7 +72,7 @@ def test_shows_a_scene_before_anything_is_asked(inspector: Page, engine: Scripte
 
 
 def test_plans_with_the_controls(inspector: Page, engine: ScriptedEngine) -> None:
-    inspector.get_by_label("Thinking").select_option("always")
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
     inspector.get_by_role("spinbutton", name="Draws").fill("3")
     inspector.get_by_label("Temperature").fill("0.5")
     inspector.get_by_label("Seed").fill("42")
@@ -86,7 +88,7 @@ def test_plans_with_the_controls(inspector: Page, engine: ScriptedEngine) -> Non
 
 
 def test_a_second_look_is_shown_with_what_it_changed(inspector: Page) -> None:
-    inspector.get_by_label("Thinking").select_option("always")
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
     plan(inspector)
     panel = inspector.locator("#plan-panel")
     expect(panel.get_by_role("heading", name="Plan of draw 0")).to_be_visible()
@@ -111,11 +113,47 @@ def test_a_second_look_is_shown_with_what_it_changed(inspector: Page) -> None:
 
 
 def test_a_direct_draw_has_one_timeline(inspector: Page) -> None:
-    inspector.get_by_label("Thinking").select_option("never")
+    inspector.get_by_label("Thinking", exact=True).select_option("never")
     plan(inspector)
     expect(inspector.locator(".tracks")).to_have_count(1)
     expect(inspector.locator("blockquote")).to_have_count(0)
     expect(inspector.locator("#draws .branch")).to_have_text(["direct"] * 6)
+
+
+def test_the_threshold_slider_plans_again(inspector: Page, engine: ScriptedEngine) -> None:
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+    slider = inspector.get_by_role("slider", name="Think threshold")
+    expect(slider).to_be_disabled()
+    expect(inspector.locator("#threshold-value")).to_have_text("sampled")
+    inspector.get_by_label("Use a think threshold").check()
+    expect(inspector.locator("#threshold-value")).to_have_text("0.50")
+    slider.focus()
+    inspector.keyboard.press("Home")
+    expect(inspector.locator("#draws .branch")).to_have_text(["second look"] * 6)
+    inspector.keyboard.press("End")
+    expect(inspector.locator("#draws .branch")).to_have_text(["direct"] * 6)
+    assert engine.submitted[0].controls.think_threshold is None
+    assert engine.submitted[-1].controls.think_threshold == 1.0
+    inspector.get_by_label("Thinking", exact=True).select_option("never")
+    expect(slider).to_be_disabled()
+    expect(inspector.locator("#threshold-value")).to_have_text("unused")
+
+
+def test_a_draft_is_shown_beside_what_came_of_the_second_look(
+    inspector: Page, engine: ScriptedEngine
+) -> None:
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+    assert near(pixels(inspector, "#birdseye"), DRAFT_RGB).any()
+    expect(inspector.locator("#birdseye")).to_have_attribute("aria-label", re.compile("its draft ended"))
+    assert engine.submitted[-1].controls.deadline_ms == 3000
+    inspector.get_by_label("Deadline").fill("")
+    plan(inspector)
+    expect(inspector.locator("#birdseye")).not_to_have_attribute("aria-label", re.compile("draft"))
+    assert engine.submitted[-1].controls.deadline_ms is None
+    assert not near(pixels(inspector, "#birdseye"), DRAFT_RGB).any()
 
 
 def test_draws_are_chosen_by_keyboard(inspector: Page) -> None:
@@ -130,7 +168,7 @@ def test_draws_are_chosen_by_keyboard(inspector: Page) -> None:
 
 def test_the_birdseye_view_draws_ahead_upwards_and_left_to_the_left(inspector: Page) -> None:
     assert not near(pixels(inspector, "#birdseye"), CHOSEN_RGB).any()
-    inspector.get_by_label("Thinking").select_option("always")  # a lane change to the left
+    inspector.get_by_label("Thinking", exact=True).select_option("always")  # a lane change to the left
     inspector.get_by_role("spinbutton", name="Draws").fill("1")
     plan(inspector)
     expect(inspector.locator("#draws tbody tr")).to_have_count(1)
@@ -253,7 +291,7 @@ def test_needs_nothing_from_elsewhere(page: Page, served: Served) -> None:
 @pytest.mark.parametrize("width", [360, 820, 1800])
 def test_fits_any_width(inspector: Page, width: int) -> None:
     inspector.set_viewport_size({"width": width, "height": 800})
-    inspector.get_by_label("Thinking").select_option("always")
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
     plan(inspector)
     expect(inspector.locator("blockquote")).to_be_visible()
     page_width = inspector.locator("html").evaluate("page => page.scrollWidth")

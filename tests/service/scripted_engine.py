@@ -14,6 +14,7 @@ from model.driving.plan import GROUPS, Plan, parse_plan
 from model.driving.trajectory import FUTURE_STEPS, STEP_S, FloatArray, present_speed
 from model.engines.engine import (
     Branch,
+    DraftFinished,
     Draw,
     DrawFinished,
     Event,
@@ -91,6 +92,8 @@ class ScriptedEngine:
         for index in reversed(range(request.controls.n)):
             draw = _draw(request, index)
             yield SectionFinished(index, "plan", str(draw.plan))
+            if draw.thinking is not None and request.controls.deadline_ms is not None:
+                yield DraftFinished(_draft(request, draw))
             yield DrawFinished(draw)
 
     def cancel(self, request_id: str) -> None:
@@ -128,6 +131,13 @@ def _draw(request: PlanRequest, index: int) -> Draw:
         tokens=tokens,
     )
     return replace(direct, thinking=REASONING, revised_plan=SLOW_DOWN) if think else direct
+
+
+def _draft(request: PlanRequest, draw: Draw) -> Draw:
+    """Where a draw's first plan would have led."""
+    luck = random.Random(draw.index)
+    trajectory = _drive(draw.plan or KEEP_ON, present_speed(request.scene.history), luck)
+    return replace(draw, branch="Action:", thinking=None, revised_plan=None, trajectory=trajectory)
 
 
 def _drive(plan: Plan, speed: float, luck: random.Random) -> FloatArray:
