@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Annotated
@@ -12,9 +13,13 @@ from service.cli.options import told
 
 
 def train(
+    context: typer.Context,
     recipe: Annotated[
         str,
-        typer.Argument(help="create, language, ground, traj-only, meta-act, counterfactual or multi-round."),
+        typer.Argument(
+            help="create, language, ground, traj-only, meta-act, counterfactual, multi-round; "
+            "ladder: rollouts, labels and training round by round, then the table."
+        ),
     ],
     scenes: Annotated[Path, typer.Option(help="Training scenes: a file or a folder.")],
     target: Annotated[Path, typer.Option("--to", help="Checkpoint folder to write.")],
@@ -40,6 +45,9 @@ def train(
     bf16: Annotated[bool, typer.Option(help="Mixed precision.")] = True,
     compiled: Annotated[bool, typer.Option(help="Compile the decoder; pays on long runs.")] = False,
     gpu: Annotated[bool, typer.Option(help="Use the accelerators that are there.")] = False,
+    test: Annotated[Path | None, typer.Option(help="ladder: scenes for its table.")] = None,
+    every: Annotated[int, typer.Option(help="ladder: roll out every so many-th scene.", min=1)] = 6,
+    processes: Annotated[int, typer.Option(help="ladder: that train together.", min=1)] = 1,
 ) -> None:
     """Train a checkpoint by a recipe; started again after a kill, it goes on where it was."""
     from dataclasses import replace
@@ -51,6 +59,7 @@ def train(
     from model.training.recipes import NANO, PAPER
     from model.training.run import RunSettings, create, run
     from model.training.trainer import LOG_FILE
+    from service.cli.ladder import climb
 
     if threads is not None:
         torch.set_num_threads(threads)
@@ -61,9 +70,17 @@ def train(
             return
         recipes = PAPER if paper else NANO
         if recipe not in recipes:
-            raise ValueError(f"unknown recipe {recipe!r}; known are create, {', '.join(recipes)}")
+            raise ValueError(f"unknown recipe {recipe!r}; known are create, ladder, {', '.join(recipes)}")
         if source is None:
             raise ValueError("give the checkpoint to start from: --from FOLDER")
+        if recipe == "ladder":
+            if test is None:
+                raise ValueError("give the scenes for the table: --test FOLDER")
+            options = _options(
+                context, but=("recipe", "scenes", "target", "source", "test", "every", "processes")
+            )
+            climb(target, scenes, test, source, options, every=every, processes=processes)
+            return
         chosen = recipes[recipe]
         chosen = replace(
             chosen,
@@ -88,3 +105,19 @@ def train(
             reflections,
         )
         training_curves(target / LOG_FILE, target / "curves.png")
+
+
+def _options(context: typer.Context, but: Sequence[str]) -> list[str]:
+    """The options that were given on the command line, as they are given again."""
+    given = []
+    for parameter in context.command.params:
+        name, value = parameter.name or "", context.params.get(parameter.name or "")
+        given_where = context.get_parameter_source(name)
+        if name in but or given_where is None or given_where.name != "COMMANDLINE":
+            continue
+        option = parameter.opts[0]
+        if isinstance(value, bool):
+            given.append(option if value else parameter.secondary_opts[0])
+        else:
+            given += [option, str(value)]
+    return given

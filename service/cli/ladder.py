@@ -1,0 +1,163 @@
+"""`looktwice train ladder`: the whole of CF-VLA's ladder, from scenes to the table, in one command."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import httpx
+import typer
+
+from model.evaluation.ladder import COUNTERFACTUAL, META_ACT, MULTI_ROUND, ROUND_2, WHOLE_DATASET
+
+START_WITHIN_S: Final = 300.0
+_LOOKTWICE: Final = (sys.executable, "-m", "service.cli")
+_CHECKPOINT_FILE: Final = "looktwice.json"
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One checkpoint of the ladder.
+
+    Attributes:
+        name: its folder.
+        recipe: that makes it.
+        source: the rung that it is trained from.
+        build: the build whose reflections it learns from.
+    """
+
+    name: str
+    recipe: str
+    source: str
+    build: str
+
+
+@dataclass(frozen=True)
+class Build:
+    """A data set of the ladder: which rung is rolled out, and what is kept."""
+
+    name: str
+    rung: str
+    keep: tuple[str, ...]
+
+
+_KEEP: Final = ("--epsilon", "2", "--gain", "0.25")
+_BUILDS: Final = {
+    build.name: build
+    for build in (
+        Build("round-1", META_ACT, _KEEP),
+        Build("whole", META_ACT, ("--everything",)),
+        Build("round-2", COUNTERFACTUAL, _KEEP),
+    )
+}
+_RUNGS: Final = (
+    Rung(COUNTERFACTUAL, "counterfactual", META_ACT, "round-1"),
+    Rung(MULTI_ROUND, "multi-round", META_ACT, "round-1"),
+    Rung(WHOLE_DATASET, "counterfactual", META_ACT, "whole"),
+    Rung(ROUND_2, "counterfactual", COUNTERFACTUAL, "round-2"),
+)
+_PLANS_PER_SCENE: Final = 6
+
+
+def climb(
+    folder: Path,
+    scenes: Path,
+    test: Path,
+    meta_act: Path,
+    training: Sequence[str],
+    *,
+    every: int,
+    processes: int,
+) -> None:
+    """Roll out, label and train round by round, then print the table; started again, it goes on.
+
+    Args:
+        folder: where builds, checkpoints and plots go.
+        scenes, test: to train on and to test on.
+        meta_act: the checkpoint to begin with.
+        training: options of `looktwice train` for every rung.
+        every: so many-th scene is rolled out.
+        processes: that train together.
+
+    Raises:
+        RuntimeError: a step failed; what is done is kept.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / META_ACT).exists():
+        (folder / META_ACT).symlink_to(meta_act.resolve(), target_is_directory=True)
+    for rung in _RUNGS:
+        if (folder / rung.name / _CHECKPOINT_FILE).exists():
+            continue
+        reflections = folder / f"{rung.build}.parquet"
+        if not reflections.exists():
+            _make(_BUILDS[rung.build], folder, scenes, every, reflections)
+        _run(
+            [sys.executable, "-m", "torch.distributed.run", "--standalone"],
+            ["--nproc-per-node", str(processes), "-m", "service.cli", "train", rung.recipe],
+            ["--from", str(folder / rung.source), "--to", str(folder / rung.name)],
+            ["--scenes", str(scenes), "--reflections", str(reflections), *training],
+        )
+    _run(
+        _LOOKTWICE,
+        ["evaluate", "--preset", "ladder", "--checkpoint", str(folder / COUNTERFACTUAL)],
+        ["--ladder", str(folder), "--scenes", str(test), "--plots", str(folder / "plots")],
+    )
+
+
+def _make(build: Build, folder: Path, scenes: Path, every: int, reflections: Path) -> None:
+    """Everything from a checkpoint to a file of reflections on its plans."""
+    place = str(folder / f"build-{build.name}")
+    with _served(folder / build.rung) as url:
+        _run(
+            _LOOKTWICE,
+            ["build", "rollout", place, str(scenes), "--service", url, "--every", str(every)],
+        )
+    _run(_LOOKTWICE, ["build", "filter", place, *build.keep])
+    _run(_LOOKTWICE, ["build", "label", place, str(scenes), "--plans-per-scene", str(_PLANS_PER_SCENE)])
+    _run(_LOOKTWICE, ["build", "export", place, "--to", str(reflections)])
+
+
+@contextmanager
+def _served(checkpoint: Path) -> Iterator[str]:
+    """A service over a checkpoint on a port of its own, until the block ends."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    command = [*_LOOKTWICE, "serve", "--checkpoint", str(checkpoint), "--port", str(port), "--rows", "96"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    url = f"http://127.0.0.1:{port}"
+    try:
+        _wait_for(url, process)
+        yield url
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def _wait_for(url: str, process: subprocess.Popen[bytes]) -> None:
+    until_s = time.monotonic() + START_WITHIN_S
+    while time.monotonic() < until_s:
+        if process.poll() is not None:
+            raise RuntimeError(f"the service ended with code {process.returncode}")
+        try:
+            if httpx.get(f"{url}/readyz").status_code == 200:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.5)
+    raise RuntimeError(f"the service was not ready within {START_WITHIN_S:g} s")
+
+
+def _run(*parts: Sequence[str]) -> None:
+    """Run a command; raises RuntimeError when it fails."""
+    command = [word for part in parts for word in part]
+    typer.echo(f"$ {' '.join(command)}", err=True)
+    ended = subprocess.run(command, check=False)
+    if ended.returncode:
+        raise RuntimeError(f"{' '.join(command)} ended with code {ended.returncode}")
