@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,51 +16,80 @@ QUIET = "quiet"
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Which scenes are kept.
+    """Which scenes are kept, and which of the model's plans in them.
 
     Attributes:
-        epsilon_m: the free draws' minADE must be above it: what is mastered needs no label.
-        gain_m: by which the expert's plan must make minADE smaller.
+        epsilon_m: the error without the expert's plan must be above it: what is mastered needs no label.
+        gain_m: by which the expert's plan must make it smaller.
+        plan_iou: None asks so of a scene's best draw, as the paper does, and keeps all plans of such a scene.
+            Otherwise it is asked of every draw by itself, and a plan is kept whose IOU with the expert's is
+            below this: a plan that is wrong even where others of the same model are right.
         everything: keep all, as the paper's comparison "whole dataset" does.
     """
 
     epsilon_m: float = 0.5
     gain_m: float = 0.0
+    plan_iou: float | None = None
     everything: bool = False
 
-    def keep(self, free_m: float, prefilled_m: float) -> bool:
-        """Whether a scene with these minADE is kept."""
-        return self.everything or (free_m > self.epsilon_m and free_m - prefilled_m > self.gain_m)
+    def keep(self, free: Sequence[Mapping[str, Any]], prefilled_m: float) -> tuple[int, ...]:
+        """Which of the free draws of a scene are kept."""
+        every = tuple(range(len(free)))
+        if self.everything:
+            return every
+        if self.plan_iou is None:
+            return every if self._is_mended(min_ade_m(free), prefilled_m) else ()
+        return tuple(
+            place
+            for place, draw in enumerate(free)
+            if draw["plan_iou"] < self.plan_iou and self._is_mended(draw["ade_m"], prefilled_m)
+        )
+
+    def _is_mended(self, error_m: float, prefilled_m: float) -> bool:
+        return error_m > self.epsilon_m and error_m - prefilled_m > self.gain_m
 
 
 @dataclass(frozen=True)
 class Filtered:
-    """A rolled-out scene with what the filter looks at; ``plan_iou`` is the mean of the free draws."""
+    """A rolled-out scene with what the filter looks at.
+
+    Attributes:
+        entry: of the ledger.
+        free_m, prefilled_m: minADE without and with the expert's plan.
+        plan_iou: mean of the free draws.
+        draws: those that are kept.
+    """
 
     entry: Entry
     free_m: float
     prefilled_m: float
     plan_iou: float
-    kept: bool
+    draws: tuple[int, ...]
+
+    @property
+    def kept(self) -> bool:
+        """Whether anything of the scene is."""
+        return bool(self.draws)
 
 
 def filtered(entries: Iterable[Entry], thresholds: Thresholds) -> list[Filtered]:
     """Every rolled-out scene, kept or not."""
     found = []
     for entry in entries:
-        free, prefilled = entry.record["free"], entry.record["prefilled"]
-        free_m, prefilled_m = min_ade_m(free), min_ade_m(prefilled)
+        free, prefilled_m = entry.record["free"], min_ade_m(entry.record["prefilled"])
         overlap = sum(draw["plan_iou"] for draw in free) / len(free)
-        found.append(Filtered(entry, free_m, prefilled_m, overlap, thresholds.keep(free_m, prefilled_m)))
+        draws = thresholds.keep(free, prefilled_m)
+        found.append(Filtered(entry, min_ade_m(free), prefilled_m, overlap, draws))
     return found
 
 
 def summary(scenes: Iterable[Filtered]) -> dict[str, Any]:
-    """How many are kept, in all and per difficulty tag."""
+    """How many are kept, in all and per difficulty tag; and how many plans."""
     total, kept = Counter[str](), Counter[str]()
-    count = 0
+    count = plans = 0
     for scene in scenes:
         count += 1
+        plans += len(scene.draws)
         for tag in scene.entry.record["tags"] or [QUIET]:
             total[tag] += 1
             kept[tag] += scene.kept
@@ -68,5 +97,6 @@ def summary(scenes: Iterable[Filtered]) -> dict[str, Any]:
     return {
         "scenes": count,
         "kept": kept[""],
+        "plans": plans,
         "tags": {tag: {"scenes": total[tag], "kept": kept[tag]} for tag in sorted(total)},
     }

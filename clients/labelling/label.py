@@ -53,21 +53,23 @@ def config_of(rollout: Run, teacher: Teacher, seed: int) -> Record:
 def questions(
     ledger: Ledger, rollout: Run, scenes: Path, *, plans_per_scene: int = 1, seed: int = 0
 ) -> Iterator[Asked]:
-    """What a teacher is to be asked: each kept scene with some of the plans that the model made freely.
+    """What a teacher is to be asked: each kept scene with some of the plans that were kept of it.
 
     Which plans is left to chance, once and for all for a scene and a seed.
     """
     for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None):
-        entry = ledger.kept(hash_of(rollout.id, scene_hash(labelled)))
-        if entry is None:
+        kept = ledger.kept(hash_of(rollout.id, scene_hash(labelled)))
+        if kept is None:
             continue
-        for text in predicted_plans(entry, plans_per_scene, seed):
+        entry, draws = kept
+        for text in predicted_plans(entry, draws, plans_per_scene, seed):
             yield Asked(entry, _question(labelled, entry, text, seed))
 
 
-def predicted_plans(entry: Entry, count: int, seed: int) -> list[str]:
-    """Different ones of a scene's free draws, at random."""
-    texts = list(dict.fromkeys(draw["plan"] for draw in entry.record["free"]))
+def predicted_plans(entry: Entry, draws: Sequence[int], count: int, seed: int) -> list[str]:
+    """Different ones among the plans of some draws, at random."""
+    free = entry.record["free"]
+    texts = list(dict.fromkeys(free[draw]["plan"] for draw in draws))
     random.Random(f"{entry.key}/{seed}").shuffle(texts)
     return texts[:count]
 

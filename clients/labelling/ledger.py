@@ -11,7 +11,7 @@ import fcntl
 import hashlib
 import json
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -38,7 +38,7 @@ CREATE TABLE IF NOT EXISTS outcomes (
     ended_at TEXT NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ', 'now'))
 ) STRICT;
 CREATE INDEX IF NOT EXISTS outcomes_of_run ON outcomes (run, state);
-CREATE TABLE IF NOT EXISTS kept (key TEXT PRIMARY KEY REFERENCES outcomes) STRICT;
+CREATE TABLE IF NOT EXISTS kept (key TEXT PRIMARY KEY REFERENCES outcomes, draws TEXT NOT NULL) STRICT;
 CREATE TABLE IF NOT EXISTS answers (
     key TEXT NOT NULL,
     run TEXT NOT NULL REFERENCES runs,
@@ -243,25 +243,36 @@ class Ledger:
             gone = self._db.execute("DELETE FROM outcomes WHERE run = ? AND state = 'dead'", (run.id,))
         return gone.rowcount
 
-    def keep(self, run: Run, keys: Iterable[str]) -> None:
-        """Choose what the next stage works on; what was chosen of the run before is chosen no more."""
+    def keep(self, run: Run, draws: Iterable[tuple[str, Sequence[int]]]) -> None:
+        """Choose what the next stage works on: keys, each with some of its draws.
+
+        What was chosen of the run before is chosen no more.
+        """
         with self._all_or_nothing():
             self._db.execute(
                 "DELETE FROM kept WHERE key IN (SELECT key FROM outcomes WHERE run = ?)", (run.id,)
             )
-            self._db.executemany("INSERT INTO kept VALUES (?)", ((key,) for key in keys))
+            self._db.executemany(
+                "INSERT INTO kept VALUES (?, ?)", ((key, json.dumps(list(some))) for key, some in draws)
+            )
 
-    def kept(self, key: str) -> Entry | None:
-        """What is done under that key, if it was chosen."""
+    def kept(self, key: str) -> tuple[Entry, list[int]] | None:
+        """What is done under that key, with the draws that were chosen of it, if any were."""
         row = self._db.execute(
-            "SELECT scene_id, record, ended_at FROM outcomes JOIN kept USING (key) WHERE key = ?", (key,)
+            "SELECT scene_id, record, ended_at, draws FROM outcomes JOIN kept USING (key) WHERE key = ?",
+            (key,),
         ).fetchone()
-        return None if row is None else Entry(key, row[0], "done", json.loads(row[1]), row[2])
+        if row is None:
+            return None
+        scene_id, record, ended_at, draws = row
+        return Entry(key, scene_id, "done", json.loads(record), ended_at), json.loads(draws)
 
-    def count_kept(self, run: Run) -> int:
-        """How much of a run is chosen."""
+    def count_kept(self, run: Run, most: int) -> int:
+        """How many draws of a run are chosen, at most so many of each piece of work."""
         (count,) = self._db.execute(
-            "SELECT count(*) FROM outcomes JOIN kept USING (key) WHERE run = ?", (run.id,)
+            "SELECT coalesce(sum(min(json_array_length(draws), ?)), 0) "
+            "FROM outcomes JOIN kept USING (key) WHERE run = ?",
+            (most, run.id),
         ).fetchone()
         return int(count)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -130,6 +130,6 @@ def _without_route(scene: Scene) -> Scene:
     return Scene(scene.scene_id, scene.clips, scene.history)
 
 
-def min_ade_m(draws: list[dict[str, Any]]) -> float:
+def min_ade_m(draws: Sequence[Mapping[str, Any]]) -> float:
     """The smallest average displacement error of some draws."""
     return float(np.min([draw["ade_m"] for draw in draws]))

@@ -28,7 +28,8 @@ def scatter(scenes: Sequence[Filtered], thresholds: Thresholds, picture: Path) -
     else:
         axes.axvline(thresholds.epsilon_m, color="0.3", linewidth=0.8, linestyle="--")
         kept = f"{sum(scene.kept for scene in scenes)} of {len(scenes)}"
-    axes.set_title(f"{kept} scenes kept: below the diagonal, right of the line")
+    where = "" if thresholds.plan_iou is not None else ": below the diagonal, right of the line"
+    axes.set_title(f"{kept} scenes kept{where}")
     axes.set_xlabel("minADE of free draws, m")
     axes.set_ylabel("minADE with the expert's plan given, m")
     figure.colorbar(points, ax=axes, label="plan IOU of the free draws")

@@ -99,6 +99,12 @@ def choose(
     folder: Folder,
     epsilon: Annotated[float, typer.Option(help="minADE of free draws must be above it, m.", min=0)] = 0.5,
     gain: Annotated[float, typer.Option(help="By which the expert's plan must help, m.", min=0)] = 0.0,
+    plan_iou: Annotated[
+        float | None,
+        typer.Option(
+            help="Ask it of every draw by itself, whose plan must agree less with the expert's.", min=0
+        ),
+    ] = None,
     everything: Annotated[bool, typer.Option(help="Keep all scenes.")] = False,
     run: RunId = None,
     as_json: Json = False,
@@ -108,17 +114,18 @@ def choose(
     from clients.labelling.ledger import Ledger
     from clients.labelling.scatter import scatter
 
-    thresholds = Thresholds(epsilon, gain, everything)
+    thresholds = Thresholds(epsilon, gain, plan_iou, everything)
     with told(), Ledger(folder) as ledger:
         rollout = ledger.the_run("rollout", run)
         found = filtered(ledger.entries(rollout), thresholds)
-        ledger.keep(rollout, (scene.entry.key for scene in found if scene.kept))
+        ledger.keep(rollout, ((scene.entry.key, scene.draws) for scene in found if scene.kept))
         scatter(found, thresholds, folder / "filter.png")
         result = summary(found)
     if as_json:
         typer.echo(json.dumps(result))
         return
-    typer.echo(f"{result['kept']} of {result['scenes']} scenes kept ({folder / 'filter.png'})")
+    typer.echo(f"{result['kept']} of {result['scenes']} scenes kept, {result['plans']} plans")
+    typer.echo(f"see {folder / 'filter.png'}")
     for tag, counts in result["tags"].items():
         typer.echo(f"  {tag:<14} {counts['kept']:>7} of {counts['scenes']:>7}")
 
@@ -154,7 +161,7 @@ def label(
 
     async def work(ledger: Ledger) -> tuple[Run, Tally]:
         rollout = ledger.the_run("rollout", run)
-        if not ledger.count_kept(rollout):
+        if not ledger.count_kept(rollout, 1):
             raise RuntimeError("no scene is kept: run `looktwice build filter` first")
         try:
             asked = (
@@ -176,7 +183,7 @@ def label(
                 Limits(at_once, give_up_after, max_error_rate),
                 retry_dead=retry_dead,
                 limit=dry_run or limit,
-                total=ledger.count_kept(rollout) * plans_per_scene,
+                total=ledger.count_kept(rollout, plans_per_scene),
                 quiet=as_json,
             )
             after = ledger.spent(begun)

@@ -47,7 +47,7 @@ def rolled_out(folder: Path, count: int) -> Run:
             scene = named(one, f"scene-{number:04d}")
             keys.append(hash_of(run.id, scene_hash(scene)))
             ledger.finish(run, keys[-1], scene.scene.scene_id, rollout_record())
-        ledger.keep(run, keys)
+        ledger.keep(run, [(key, (0, 1)) for key in keys])
     return run
 
 

@@ -25,6 +25,19 @@ def test_kept_is_what_an_expert_s_plan_would_have_mended() -> None:
     assert kept(Thresholds(everything=True), *pairs) == [True] * 5
 
 
+def test_plans_can_be_kept_one_by_one() -> None:
+    one = entry(0.2, 0.1)
+    free = one.record["free"]
+    free[0] |= {"plan_iou": 0.9}
+    free[1] |= {"plan_iou": 0.3}  # and an error of 1.2 m
+    (scene,) = filtered([one], Thresholds(plan_iou=0.45))
+    assert scene.draws == (1,), "the other draw is right, and the scene itself is mastered"
+    assert filtered([one], Thresholds())[0].draws == ()
+    assert filtered([one], Thresholds(plan_iou=0.45, gain_m=1.2))[0].draws == ()
+    assert filtered([one], Thresholds(everything=True))[0].draws == (0, 1)
+    assert summary([scene])["plans"] == 1
+
+
 def test_the_smallest_error_of_the_draws_counts() -> None:
     (scene,) = filtered([entry(2.0, 0.5)], Thresholds())
     assert (scene.free_m, scene.prefilled_m, scene.plan_iou) == (2.0, 0.5, 0.5)
@@ -37,6 +50,7 @@ def test_scenes_are_counted_by_what_makes_them_difficult() -> None:
     assert summary(found) == {
         "scenes": 3,
         "kept": 2,
+        "plans": 4,
         "tags": {
             "pedestrian": {"scenes": 1, "kept": 1},
             "quiet": {"scenes": 1, "kept": 1},

@@ -86,14 +86,24 @@ def test_what_is_kept_can_be_chosen_anew(tmp_path: Path) -> None:
         for key in "abc":
             ledger.finish(run, key, f"scene {key}", {"key": key})
         ledger.finish(other, "d", "scene d", {})
-        ledger.keep(run, "ab")
-        ledger.keep(other, "d")
-        ledger.keep(run, "bc")
-        assert [ledger.kept(key) is not None for key in "abcd"] == [False, True, True, True]
-        assert (ledger.count_kept(run), ledger.count_kept(other)) == (2, 1)
+        ledger.keep(run, [("a", [0]), ("b", [0])])
+        ledger.keep(other, [("d", [0])])
+        ledger.keep(run, [("b", [0, 2, 3]), ("c", [1])])
+        kept = {key: ledger.kept(key) for key in "abcd"}
+        assert {key: found and found[1] for key, found in kept.items()} == {
+            "a": None,
+            "b": [0, 2, 3],
+            "c": [1],
+            "d": [0],
+        }
+        assert (ledger.count_kept(run, 1), ledger.count_kept(run, 9), ledger.count_kept(other, 9)) == (
+            2,
+            4,
+            1,
+        )
         with pytest.raises(sqlite3.IntegrityError):
-            ledger.keep(run, "aa")
-        assert ledger.count_kept(run) == 2, "a choice that fails changes nothing"
+            ledger.keep(run, [("a", [0]), ("a", [0])])
+        assert ledger.count_kept(run, 1) == 2, "a choice that fails changes nothing"
 
 
 def test_dead_letters_are_written_and_can_be_tried_again(tmp_path: Path) -> None:
