@@ -51,13 +51,19 @@ def config_of(rollout: Run, teacher: Teacher, seed: int) -> Record:
 
 
 def questions(
-    ledger: Ledger, rollout: Run, scenes: Path, *, plans_per_scene: int = 1, seed: int = 0
+    ledger: Ledger,
+    rollout: Run,
+    scenes: Path,
+    *,
+    plans_per_scene: int = 1,
+    seed: int = 0,
+    group: int | None = None,
 ) -> Iterator[Asked]:
     """What a teacher is to be asked: each kept scene with some of the plans that were kept of it.
 
     Which plans is left to chance, once and for all for a scene and a seed.
     """
-    for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None):
+    for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None, group=group):
         kept = ledger.kept(hash_of(rollout.id, scene_hash(labelled)))
         if kept is None:
             continue

@@ -38,6 +38,7 @@ CREATE TABLE IF NOT EXISTS outcomes (
     ended_at TEXT NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ', 'now'))
 ) STRICT;
 CREATE INDEX IF NOT EXISTS outcomes_of_run ON outcomes (run, state);
+CREATE INDEX IF NOT EXISTS outcomes_of_scene ON outcomes (scene_id);
 CREATE TABLE IF NOT EXISTS kept (key TEXT PRIMARY KEY REFERENCES outcomes, draws TEXT NOT NULL) STRICT;
 CREATE TABLE IF NOT EXISTS answers (
     key TEXT NOT NULL,
@@ -97,20 +98,36 @@ class Spent(NamedTuple):
     cost_usd: float
 
 
+class Entered(NamedTuple):
+    """Rows of a run: outcomes (key, scene, state, record) and answers (key, attempt, answer)."""
+
+    outcomes: list[tuple[str, str, str, str]]
+    answers: list[tuple[str, int, str]]
+
+
 class Ledger:
     """One folder's ledger, for one process at a time.
+
+    Args:
+        folder: None for a ledger in memory: what a helper enters until the folder's ledger takes it over.
 
     Raises:
         LedgerError: another process has it, or it is of another version.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path | None) -> None:
+        if folder is None:
+            self._lock = None
+            self._db = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+            self._open()
+            return
         folder.mkdir(parents=True, exist_ok=True)
-        self._lock = (folder / f"{FILE}.lock").open("w")
+        lock = (folder / f"{FILE}.lock").open("w")
+        self._lock = lock
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            self._lock.close()
+            lock.close()
             raise LedgerError(f"another build is at work in {folder}; wait until it has ended") from None
         # Every statement is a transaction of its own. Scenes are read, and looked up, on another thread;
         # the library takes one statement at a time.
@@ -142,7 +159,8 @@ class Ledger:
     def close(self) -> None:
         """Let others have it."""
         self._db.close()
-        self._lock.close()
+        if self._lock is not None:
+            self._lock.close()
 
     def __enter__(self) -> Self:
         return self
@@ -295,6 +313,35 @@ class Ledger:
         """What a teacher has answered so far, in order."""
         rows = self._db.execute("SELECT answer FROM answers WHERE key = ? ORDER BY attempt", (key,))
         return [Answer(**json.loads(answer)) for (answer,) in rows]
+
+    def entered(self, run: Run) -> Entered:
+        """All that was entered for a run, for another ledger to take over."""
+        return Entered(
+            self._db.execute(
+                "SELECT key, scene_id, state, record FROM outcomes WHERE run = ?", (run.id,)
+            ).fetchall(),
+            self._db.execute("SELECT key, attempt, answer FROM answers WHERE run = ?", (run.id,)).fetchall(),
+        )
+
+    def take_over(self, run: Run, entered: Entered) -> None:
+        """Enter what a helper has; what is there already stays as it is."""
+        with self._all_or_nothing():
+            self._db.executemany(
+                "INSERT OR IGNORE INTO answers (key, run, attempt, answer) VALUES (?, ?, ?, ?)",
+                ((key, run.id, attempt, answer) for key, attempt, answer in entered.answers),
+            )
+            self._db.executemany(
+                "INSERT OR IGNORE INTO outcomes (key, run, scene_id, state, record) VALUES (?, ?, ?, ?, ?)",
+                ((key, run.id, *rest) for key, *rest in entered.outcomes),
+            )
+
+    def keys_of(self, run: Run, scene_ids: Sequence[str]) -> list[str]:
+        """What ended in a run for some scenes."""
+        marks = ",".join("?" * len(scene_ids))
+        rows = self._db.execute(
+            f"SELECT key FROM outcomes WHERE run = ? AND scene_id IN ({marks})", (run.id, *scene_ids)
+        )
+        return [key for (key,) in rows]
 
     def spent(self, run: Run) -> Spent:
         """What a run's answers took, those that were no use included."""

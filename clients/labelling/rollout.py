@@ -60,9 +60,11 @@ def scene_hash(labelled: LabelledScene) -> str:
     return hash_of(scene.scene_id, *pictures, *(array.tobytes() for array in arrays))
 
 
-def jobs(run: Run, scenes: Path, unlabelled: Callable[[str], None]) -> Iterator[Job[LabelledScene]]:
+def jobs(
+    run: Run, scenes: Path, unlabelled: Callable[[str], None], group: int | None = None
+) -> Iterator[Job[LabelledScene]]:
     """The scenes of a file or folder as pieces of work; ``unlabelled`` is told of those without a future."""
-    for labelled in read_scenes(scenes, dense=False, unlabelled=unlabelled):
+    for labelled in read_scenes(scenes, dense=False, unlabelled=unlabelled, group=group):
         yield Job(hash_of(run.id, scene_hash(labelled)), labelled.scene.scene_id, labelled)
 
 

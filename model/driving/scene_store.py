@@ -124,8 +124,21 @@ def count_scenes(path: Path) -> int:
     return sum(_open(file).metadata.num_rows for file in scene_files(path))
 
 
+def row_groups(file: Path) -> list[list[str]]:
+    """The names of a file's scenes, row group by row group: parts that can be read by themselves."""
+    parquet = _open(file)
+    return [
+        parquet.read_row_group(group, columns=["scene_id"]).column(0).to_pylist()
+        for group in range(parquet.num_row_groups)
+    ]
+
+
 def read_scenes(
-    path: Path, *, dense: bool = True, unlabelled: Callable[[str], None] | None = None
+    path: Path,
+    *,
+    dense: bool = True,
+    unlabelled: Callable[[str], None] | None = None,
+    group: int | None = None,
 ) -> Iterator[LabelledScene]:
     """Yield the scenes of a file, or of a folder's files by name.
 
@@ -134,6 +147,7 @@ def read_scenes(
         dense: also read the dense targets, which planning and evaluation do not need.
         unlabelled: told the names of scenes without an expert's future, which are left out; such a scene
             is an error where nobody is to be told.
+        group: read only this row group of each file.
 
     Raises:
         SceneFileError: see the class.
@@ -142,8 +156,8 @@ def read_scenes(
     for file in scene_files(path):
         parquet = _open(file)
         try:
-            for group in range(parquet.num_row_groups):
-                for row in parquet.read_row_group(group, columns=columns).to_pylist():
+            for number in range(parquet.num_row_groups) if group is None else (group,):
+                for row in parquet.read_row_group(number, columns=columns).to_pylist():
                     if row["future"] is None and unlabelled is not None:
                         unlabelled(row["scene_id"])
                         continue

@@ -16,9 +16,10 @@ from service.cli.options import Json, told
 
 if TYPE_CHECKING:
     from clients.labelling.label import Asked
-    from clients.labelling.ledger import Ledger, Record, Run
+    from clients.labelling.ledger import Ledger, Record, Run, Spent
     from clients.labelling.pipeline import Job, Limits, Tally
     from clients.labelling.teachers.openai import OpenAiSettings
+    from clients.labelling.teachers.teacher import Teacher
 
 app = typer.Typer(
     help="Build a counterfactual data set: rollout, filter, label, export.", no_args_is_help=True
@@ -33,6 +34,9 @@ AtOnce = Annotated[int, typer.Option(help="Most requests under way; fewer while 
 GiveUp = Annotated[float, typer.Option(help="Stop when nothing answers for so many seconds.", min=0)]
 MaxErrorRate = Annotated[float, typer.Option(help="Stop when more than this share fails.", min=0, max=1)]
 RetryDead = Annotated[bool, typer.Option(help="Do dead letters again.")]
+OnRay = Annotated[
+    str | None, typer.Option("--ray", help="Address of a Ray cluster to work on; local starts one here.")
+]
 PlansPerScene = Annotated[int, typer.Option(help="Of the model's own plans, at random.", min=1)]
 LabelSeed = Annotated[int, typer.Option("--seed", help="Of that choice, and the teacher's.", min=0)]
 RunId = Annotated[str | None, typer.Option("--run", help="Which rollout, where there are several.")]
@@ -55,6 +59,7 @@ def rollout(
     every: Every = 1,
     limit: Limit = None,
     dry_run: DryRun = 0,
+    on_ray: OnRay = None,
     as_json: Json = False,
 ) -> None:
     """Roll a served model out over scenes: what it plans alone, and with the expert's plan given."""
@@ -64,9 +69,10 @@ def rollout(
     from clients.wire import ModelName
 
     sampling = Sampling(n, temperature, top_p, seed, route)
+    limits = Limits(at_once, give_up_after, max_error_rate)
     unlabelled: list[str] = []
 
-    async def work(ledger: Ledger) -> tuple[Run, Tally]:
+    async def roll(ledger: Ledger) -> tuple[Run, Tally]:
         async with AsyncPlannerClient(service, PATIENCE) as planner:
             try:
                 (card, *_) = await planner.models()
@@ -74,13 +80,18 @@ def rollout(
                 raise RuntimeError(f"no service answers at {service}: {error}") from error
             model = ModelName(name=card.name, revision=card.revision)
             run = ledger.run("rollout", config_of(model, sampling))
+            if on_ray is not None:
+                from clients.labelling.on_ray import RolloutWork, chunks, work_on_ray
+
+                work = RolloutWork(run, service, model, sampling, limits)
+                return run, work_on_ray(ledger, run, chunks(ledger, run, scenes), work, on_ray)
             found = islice(jobs(run, scenes, unlabelled.append), 0, None, every)
             return await _work(
                 ledger,
                 run,
                 found,
                 lambda job: roll_out(planner, job.subject, model, sampling),
-                Limits(at_once, give_up_after, max_error_rate),
+                limits,
                 retry_dead=retry_dead,
                 limit=dry_run or limit,
                 total=-(-_count(scenes) // every),
@@ -88,7 +99,8 @@ def rollout(
             )
 
     with told():
-        run, tally = _stage(folder, work, dry=dry_run > 0)
+        _check_ray(on_ray, every > 1, limit, dry_run)
+        run, tally = _stage(folder, roll, dry=dry_run > 0)
         for name in unlabelled:
             typer.echo(f"{name}: left out, it has no expert's future", err=True)
         _report(run, tally, as_json, left_out=len(unlabelled))
@@ -148,6 +160,7 @@ def label(
     retry_dead: RetryDead = False,
     limit: Limit = None,
     dry_run: DryRun = 0,
+    on_ray: OnRay = None,
     as_json: Json = False,
 ) -> None:
     """Have a teacher say, for every scene kept, what is less good about the model's plan."""
@@ -159,7 +172,7 @@ def label(
 
     spent: dict[str, Any] = {}
 
-    async def work(ledger: Ledger) -> tuple[Run, Tally]:
+    async def ask_all(ledger: Ledger) -> tuple[Run, Tally]:
         rollout = ledger.the_run("rollout", run)
         if not ledger.count_kept(rollout, 1):
             raise RuntimeError("no scene is kept: run `looktwice build filter` first")
@@ -174,26 +187,37 @@ def label(
         try:
             begun = ledger.run("label", config_of(rollout, asked, seed))
             before = ledger.spent(begun)
+            limits = Limits(at_once, give_up_after, max_error_rate)
+            if on_ray is not None:
+                from clients.labelling.on_ray import LabelWork, chunks, work_on_ray
+
+                work = LabelWork(begun, rollout, _teacher_here, plans_per_scene, seed, limits)
+                result = (
+                    begun,
+                    work_on_ray(ledger, begun, chunks(ledger, begun, scenes, rollout), work, on_ray),
+                )
+                spent.update(_spent(before, ledger.spent(begun)))
+                return result
             found = questions(ledger, rollout, scenes, plans_per_scene=plans_per_scene, seed=seed)
             result = await _work(
                 ledger,
                 begun,
                 jobs(begun, found),
                 labeller(ledger, begun, asked),
-                Limits(at_once, give_up_after, max_error_rate),
+                limits,
                 retry_dead=retry_dead,
                 limit=dry_run or limit,
                 total=ledger.count_kept(rollout, plans_per_scene),
                 quiet=as_json,
             )
-            after = ledger.spent(begun)
-            spent.update({name: after[i] - before[i] for i, name in enumerate(after._fields)})
+            spent.update(_spent(before, ledger.spent(begun)))
             return result
         finally:
             await asked.close()
 
     with told():
-        begun, tally = _stage(folder, work, dry=dry_run > 0)
+        _check_ray(on_ray, teacher == "service", limit, dry_run)
+        begun, tally = _stage(folder, ask_all, dry=dry_run > 0)
         _report(begun, tally, as_json, **spent)
 
 
@@ -268,6 +292,22 @@ def _batch(
     begun = ledger.run("label", config_of(rollout, OpenAiTeacher(settings), seed))
     found = questions(ledger, rollout, scenes, plans_per_scene=plans_per_scene, seed=seed)
     return settings, begun, jobs(begun, found)
+
+
+def _check_ray(on_ray: str | None, other: bool, limit: int | None, dry_run: int) -> None:
+    if on_ray is not None and (other or limit is not None or dry_run):
+        raise ValueError("--ray works on whole scene files, with the teacher that the settings name")
+
+
+def _teacher_here() -> Teacher:
+    """The teacher of the settings, made where it is needed."""
+    from service.settings import TeacherSettings
+
+    return TeacherSettings().teacher()
+
+
+def _spent(before: Spent, after: Spent) -> dict[str, float]:
+    return {name: after[place] - before[place] for place, name in enumerate(after._fields)}
 
 
 def _stage(
