@@ -55,7 +55,7 @@ $(VENV)/.dev: $(VENV)/.sim
 vllm: $(VLLM_VENV)/.made
 
 test-vllm: $(VLLM_VENV)/.made
-	$(VLLM_BIN)/python -m pytest tests/model/engines/vllm
+	$(VLLM_BIN)/python -m pytest tests/model/engines/vllm tests/clients/labelling/teachers/vllm
 
 $(VLLM_VENV)/.made: deploy/vllm/constraints.txt deploy/vllm/cpu_torchvision.py pyproject.toml
 	$(PYTHON) -m venv $(VLLM_VENV)
