@@ -93,6 +93,22 @@ class Shift:
 
 
 @dataclass
+class Drift:
+    """A vehicle that strays from its line by ``offset`` within ``out`` metres, and comes back in ``back``."""
+
+    start_s: float
+    offset: float
+    out: float
+    back: float
+
+    def at(self, s: float) -> tuple[float, float]:
+        """The stray to the left at ``s``, and its slope."""
+        away, away_rate = smooth_step((s - self.start_s) / self.out)
+        home, home_rate = smooth_step((s - self.start_s - self.out) / self.back)
+        return self.offset * (away - home), self.offset * (away_rate / self.out - home_rate / self.back)
+
+
+@dataclass
 class Vehicle(Body):
     """A vehicle that runs along a rail of its route, beside it by a smooth offset."""
 
@@ -100,6 +116,7 @@ class Vehicle(Body):
     s: float = 0.0
     acceleration: float = 0.0
     shift: Shift | None = None
+    drift: Drift | None = None
     wander_m: float = 0.0
     on_route: bool = True
     hazard_lights: bool = False
@@ -128,6 +145,9 @@ class Vehicle(Body):
             done, rate = smooth_step((s - self.shift.start_s) / self.shift.length)
             offset += self.shift.offset * (1 - done)
             slope -= self.shift.offset * rate / self.shift.length
+        if self.drift is not None:
+            stray, rate = self.drift.at(s)
+            offset, slope = offset + stray, slope + rate
         return offset, slope
 
     def offsets_at(self, s: Array) -> Array:
@@ -159,6 +179,8 @@ class Vehicle(Body):
         if self.shift is not None and self.s > self.shift.start_s + self.shift.length:
             self.shift = None
             self.indicator = 0
+        if self.drift is not None and self.s > self.drift.start_s + self.drift.out + self.drift.back:
+            self.drift = None
         self.place(rails)
         if self.s > rails[self.rail].length - 3.0:
             self.gone = True
@@ -169,5 +191,6 @@ class Vehicle(Body):
         s, offset = rails[rail].project(np.array([[self.x, self.y]]), near)
         sway, _ = self.wander(float(s[0]))
         self.rail, self.s = rail, float(s[0])
-        self.shift = Shift(self.s, float(offset[0]) - sway, length)
+        # A stray is taken along as a part of the way over.
+        self.shift, self.drift = Shift(self.s, float(offset[0]) - sway, length), None
         self.indicator = 1 if offset[0] < 0 else -1

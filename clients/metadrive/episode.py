@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from clients.metadrive.actors import STEP_S, VEHICLE_MODELS, Body, Pedestrian, Vehicle
+from clients.metadrive.drifts import Drifter
 from clients.metadrive.driver import SpeedLimits, Style
 from clients.metadrive.episode_log import EpisodeLog, Outcome, Recorder
 from clients.metadrive.expert import Expert, varied
@@ -24,15 +25,23 @@ _AHEAD_M: Final = 170.0
 _BEHIND_M: Final = 80.0
 
 
-def run_episode(seed: int, duration_s: float = 48.0) -> EpisodeLog:
+def run_episode(seed: int, duration_s: float = 48.0, *, drifts: bool = False) -> EpisodeLog:
     """Let the expert drive one episode; the same seed gives the same episode.
+
+    Args:
+        seed: of the episode.
+        duration_s: at most.
+        drifts: whether the expert strays from its line now and then, and comes back.
 
     Raises:
         MapError: no map fits the seed.
     """
     world = make_world(seed, duration_s)
+    drifter = Drifter(seed) if drifts else None
     near = world.remember()
     while not world.ended:
+        if drifter is not None:
+            drifter.step(world.now * STEP_S, world.ego)
         world.move(near, world.drive_as_expert)
         near = world.remember()
     return world.log()

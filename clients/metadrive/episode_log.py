@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from clients.metadrive.actors import Body, Vehicle
+from clients.metadrive.drifts import strays
 from clients.metadrive.roads import Array, RoadMap
 from model.driving.scene import AgentKind
 
@@ -49,6 +50,7 @@ class EpisodeLog:
         lanes: int64 [steps] the lane the ego's centre is in.
         lane_offsets: float64 [steps] metres to the left of that lane's centre.
         rails, progress: the rail followed and the place along the route.
+        strays: bool [steps], whether the ego is on its way off its line (`clients.metadrive.drifts`).
     """
 
     seed: int
@@ -59,6 +61,7 @@ class EpisodeLog:
     lane_offsets: Array
     rails: npt.NDArray[np.int64]
     progress: Array
+    strays: npt.NDArray[np.bool_]
     actors: tuple[ActorLog, ...]
 
 
@@ -87,6 +90,7 @@ class Recorder:
             np.zeros(steps),
             np.zeros(steps, np.int64),
             np.zeros(steps),
+            np.zeros(steps, np.bool_),
             tuple(
                 ActorLog(
                     body.actor_id,
@@ -108,6 +112,7 @@ class Recorder:
         log.ego[step] = ego.x, ego.y, ego.heading, ego.speed
         log.lanes[step], log.lane_offsets[step] = lane, lane_offset
         log.rails[step], log.progress[step] = ego.rail, ego.progress
+        log.strays[step] = strays(ego)
         for body in near:
             actor = log.actors[self._places[body.actor_id]]
             actor.poses[step] = body.x, body.y, body.heading
@@ -131,6 +136,7 @@ class Recorder:
             live.lane_offsets[past],
             live.rails[past],
             live.progress[past],
+            live.strays[past],
             actors,
         )
 

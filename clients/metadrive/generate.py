@@ -51,6 +51,7 @@ class GenerateConfig:
         block: seeds in one file; a worker process lives for one block, so its memory stays bounded.
         surround: also render the six surround cameras.
         dense: also store per-pixel targets.
+        drifts: the expert strays from its line now and then; scenes show how it comes back.
     """
 
     stride_s: float = 0.5
@@ -58,6 +59,7 @@ class GenerateConfig:
     block: int = 20
     surround: bool = False
     dense: bool = True
+    drifts: bool = False
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,8 @@ def _check_config(out_dir: Path, config: GenerateConfig) -> None:
     manifest = out_dir / MANIFEST
     if not manifest.exists():
         return
-    there = json.loads(manifest.read_text())["config"]
+    # What a folder's config does not name yet is as it always was.
+    there = asdict(GenerateConfig()) | json.loads(manifest.read_text())["config"]
     if there != asdict(config):
         raise GenerationError(f"{out_dir} was generated with another config {there}; choose another folder")
 
@@ -189,7 +192,7 @@ def run_seed(seed: int, rig: Rig, config: GenerateConfig) -> tuple[list[Labelled
     """One episode's scenes, and how it went."""
     started = time.monotonic()
     try:
-        log = run_episode(seed, config.duration_s)
+        log = run_episode(seed, config.duration_s, drifts=config.drifts)
         made = list(labelled_scenes(log, rig, config.stride_s, config.dense))
     except (MapError, shapely.errors.GEOSException) as error:
         return [], EpisodeOutcome(seed, type(error).__name__, "", 0, 0, time.monotonic() - started)

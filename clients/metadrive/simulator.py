@@ -7,6 +7,7 @@ import importlib
 import importlib.util
 import io
 import logging
+import sys
 import warnings
 from pathlib import Path
 from typing import Any, Final
@@ -28,11 +29,17 @@ garbage-collect-states-rate 1.0
 """
 
 
+_WAYMO: Final = "metadrive.utils.waymo_utils.protos"
+
+
 class SimulatorMissing(RuntimeError):
     """MetaDrive is not installed; the text says how to install it."""
 
 
 def _load(name: str) -> Any:
+    # Generated for a protobuf of long ago: with a present one its import fails otherwise than where there is
+    # none at all, which the simulator is ready for. Nothing here reads Waymo's recordings.
+    sys.modules.setdefault(_WAYMO, None)  # type: ignore[arg-type]  # "not to be imported", as the import system has it
     try:
         with (
             warnings.catch_warnings(),

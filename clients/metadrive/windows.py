@@ -47,7 +47,7 @@ def window_steps(log: EpisodeLog, stride_s: float) -> range:
 def labelled_scenes(
     log: EpisodeLog, rig: Rig, stride_s: float, with_dense: bool = True
 ) -> Iterator[LabelledScene]:
-    """Render and annotate the windows of ``log``, but none whose future collides or leaves the road."""
+    """Render and annotate the windows of ``log`` whose future does not collide, leave the road or stray."""
     moments = ((step, _Moment(log, step)) for step in window_steps(log, stride_s))
     usable = [(step, moment) for step, moment in moments if moment.is_safe]
     if not usable:
@@ -120,7 +120,9 @@ class _Moment:
 
     @property
     def is_safe(self) -> bool:
-        """Whether the expert's future neither collides nor leaves the road."""
+        """Whether the expert's future neither strays nor collides nor leaves the road."""
+        if self._log.strays[self._window][HISTORY_STEPS:].any():
+            return False
         future = self.future[None]
         return not (collides(future, self.agents, 6.4)[0] or leaves_road(future, self.drivable)[0])
 

@@ -23,12 +23,15 @@ def generate(
     workers: Annotated[int, typer.Option(help="Processes that render.", min=1)] = 2,
     stride: Annotated[float, typer.Option(help="Seconds between the scenes of an episode.")] = 0.5,
     surround: Annotated[bool, typer.Option(help="Render the six surround cameras too.")] = False,
+    drifts: Annotated[
+        bool, typer.Option(help="The expert strays now and then; scenes show how it comes back.")
+    ] = False,
 ) -> None:
     """Drive episodes in MetaDrive and store their scenes; run again after a kill, it resumes."""
     with told():
         from clients.metadrive.generate import GenerateConfig, generate
 
-        config = GenerateConfig(stride_s=stride, surround=surround)
+        config = GenerateConfig(stride_s=stride, surround=surround, drifts=drifts)
         report = generate(out, range(first_seed, first_seed + episodes), workers=workers, config=config)
         typer.echo(str(report))
 
