@@ -280,6 +280,7 @@ def test_types_are_stable() -> None:
         "internal": 500,
         "needs-annotations": 422,
         "label-refused": 502,
+        "teacher-away": 503,
         "scenes-unreadable": 500,
         "not-ready": 503,
         "engine-failed": 503,
