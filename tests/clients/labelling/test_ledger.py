@@ -128,3 +128,17 @@ def test_hashes_tell_parts_apart() -> None:
     assert hash_of("ab", "c") != hash_of("a", "bc") != hash_of("abc")
     assert hash_of(b"1") != hash_of("1")
     assert hash_of({"a": 1, "b": 2}) == hash_of({"b": 2, "a": 1})
+
+
+def test_what_a_helper_entered_is_taken_over_once(tmp_path: Path) -> None:
+    with Ledger(None) as helper, Ledger(tmp_path) as ledger:
+        run = ledger.run("label", {})
+        helper.run("label", {})
+        helper.finish(run, "a", "scene a", {"x": 1})
+        helper.answered(run, "a", 1, Answer("yes", 10, 5))
+        helper.bury(run, "b", "scene b", "no")
+        for _ in range(2):
+            ledger.take_over(run, helper.entered(run))
+        assert (ledger.count(run), ledger.count(run, "dead")) == (1, 1)
+        assert ledger.answers("a") == [Answer("yes", 10, 5)]
+        assert set(ledger.keys_of(run, ["scene a", "scene b", "scene c"])) == {"a", "b"}
