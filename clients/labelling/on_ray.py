@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -154,7 +155,7 @@ def work_on_ray(
         StageStopped: a worker stopped; what others have done is entered.
     """
     ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
-    tally = Tally()
+    tally, began_s = Tally(), time.monotonic()
     items = [{"chunk": chunk} for chunk in found]
     if not items:
         return tally
@@ -170,6 +171,7 @@ def work_on_ray(
         on_progress(replace(tally))
     if stopped:
         raise StageStopped(stopped)
+    tally.seconds = time.monotonic() - began_s
     return tally
 
 

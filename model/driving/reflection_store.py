@@ -6,16 +6,15 @@ to a temporary name beside its place and renamed, so a reader never meets half a
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from model.driving.parquet_rows import write_rows
 from model.driving.plan import Plan, PlanError, parse_plan
 
 REFLECTION_VERSION: Final = "1"
@@ -67,18 +66,7 @@ _SCHEMA: Final = pa.schema(
 def write_reflections(path: Path, reflections: Iterable[LabelledReflection]) -> int:
     """Write ``reflections`` to one file and return how many there were; see the module's first lines."""
     schema = _SCHEMA.with_metadata({_VERSION_KEY: REFLECTION_VERSION.encode()})
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    count, remaining = 0, iter(reflections)
-    try:
-        with pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True) as writer:
-            while rows := [_to_row(each) for each in islice(remaining, _ROW_GROUP)]:
-                writer.write_table(pa.Table.from_pylist(rows, schema=schema))
-                count += len(rows)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return count
+    return write_rows(path, map(_to_row, reflections), schema, _ROW_GROUP)
 
 
 def read_reflections(path: Path) -> Iterator[LabelledReflection]:

@@ -6,9 +6,7 @@ to a temporary name beside their place and renamed, so a reader never meets half
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from itertools import islice
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -17,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from model.driving.images import decode_image, encode_png
+from model.driving.parquet_rows import write_rows
 from model.driving.scene import (
     Agent,
     AgentKind,
@@ -92,19 +91,7 @@ def write_scenes(
         key.encode(): value.encode() for key, value in (metadata or {}).items()
     }
     schema = _SCHEMA.with_metadata(described)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    count = 0
-    remaining = iter(scenes)
-    try:
-        with pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True) as writer:
-            while rows := [_to_row(scene) for scene in islice(remaining, ROW_GROUP)]:
-                writer.write_table(pa.Table.from_pylist(rows, schema=schema))
-                count += len(rows)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return count
+    return write_rows(path, map(_to_row, scenes), schema, ROW_GROUP)
 
 
 def scene_files(path: Path) -> list[Path]:

@@ -8,7 +8,7 @@ order: ``language`` (history and plan language, no pictures), ``ground`` (the vi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final, Literal
 
@@ -59,9 +59,15 @@ NANO_WEIGHTS: Final[SectionWeights] = MappingProxyType(
 """A model from scratch learns trajectories too, which the paper's brings along. The tenths of a plan's times
 are next to unknowable: with the paper's weights their noise drowns what codes teach."""
 
+
+def _with_control(*recipes: Recipe) -> tuple[Recipe, ...]:
+    """Recipes, and the last one's control: its reflections' scenes once more, without the reflections."""
+    return (*recipes, replace(recipes[-1], name="multi-round", reflections="scenes"))
+
+
 NANO: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe
-    for recipe in (
+    for recipe in _with_control(
         Recipe(
             "language",
             "respond",
@@ -108,25 +114,13 @@ NANO: Final[Mapping[str, Recipe]] = {
             probe=True,
             reflections="learned",
         ),
-        Recipe(
-            "multi-round",
-            "respond",
-            steps=3000,
-            batch_size=16,
-            learning_rate=2.5e-4,
-            warmup_steps=200,
-            tasks={"traj_only": 0.25, "cf_vla": 0.75},
-            weights=NANO_WEIGHTS,
-            probe=True,
-            reflections="scenes",
-        ),
     )
 }
 """The stages of the shipped checkpoint, and the control of its last one."""
 
 PAPER: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe
-    for recipe in (
+    for recipe in _with_control(
         Recipe(
             "traj-only",
             "respond",
@@ -154,16 +148,6 @@ PAPER: Final[Mapping[str, Recipe]] = {
             warmup_steps=2000,
             tasks={"traj_only": 0.5, "cf_vla": 0.5},
             reflections="learned",
-        ),
-        Recipe(
-            "multi-round",
-            "respond",
-            steps=300_000,
-            batch_size=1,
-            learning_rate=5e-6,
-            warmup_steps=2000,
-            tasks={"traj_only": 0.5, "cf_vla": 0.5},
-            reflections="scenes",
         ),
     )
 }

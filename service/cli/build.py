@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import tempfile
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -16,7 +16,7 @@ from service.cli.options import Json, told
 
 if TYPE_CHECKING:
     from clients.labelling.label import Asked
-    from clients.labelling.ledger import Ledger, Record, Run, Spent
+    from clients.labelling.ledger import Ledger, Record, Run
     from clients.labelling.pipeline import Job, Limits, Tally
     from clients.labelling.teachers.openai import OpenAiSettings
     from clients.labelling.teachers.teacher import Teacher
@@ -80,19 +80,20 @@ def rollout(
                 raise RuntimeError(f"no service answers at {service}: {error}") from error
             model = ModelName(name=card.name, revision=card.revision)
             run = ledger.run("rollout", config_of(model, sampling))
+            if retry_dead:
+                ledger.forget_dead(run)
             if on_ray is not None:
                 from clients.labelling.on_ray import RolloutWork, chunks, work_on_ray
 
                 work = RolloutWork(run, service, model, sampling, limits)
                 return run, work_on_ray(ledger, run, chunks(ledger, run, scenes), work, on_ray)
             found = islice(jobs(run, scenes, unlabelled.append), 0, None, every)
-            return await _work(
+            return run, await _work(
                 ledger,
                 run,
                 found,
                 lambda job: roll_out(planner, job.subject, model, sampling),
                 limits,
-                retry_dead=retry_dead,
                 limit=dry_run or limit,
                 total=-(-_count(scenes) // every),
                 quiet=as_json,
@@ -186,32 +187,30 @@ def label(
             raise RuntimeError(str(error)) from error
         try:
             begun = ledger.run("label", config_of(rollout, asked, seed))
+            if retry_dead:
+                ledger.forget_dead(begun)
             before = ledger.spent(begun)
             limits = Limits(at_once, give_up_after, max_error_rate)
             if on_ray is not None:
                 from clients.labelling.on_ray import LabelWork, chunks, work_on_ray
 
                 work = LabelWork(begun, rollout, _teacher_here, plans_per_scene, seed, limits)
-                result = (
+                tally = work_on_ray(ledger, begun, chunks(ledger, begun, scenes, rollout), work, on_ray)
+            else:
+                found = questions(ledger, rollout, scenes, plans_per_scene=plans_per_scene, seed=seed)
+                tally = await _work(
+                    ledger,
                     begun,
-                    work_on_ray(ledger, begun, chunks(ledger, begun, scenes, rollout), work, on_ray),
+                    jobs(begun, found),
+                    labeller(ledger, begun, asked),
+                    limits,
+                    limit=dry_run or limit,
+                    total=ledger.count_kept(rollout, plans_per_scene),
+                    quiet=as_json,
                 )
-                spent.update(_spent(before, ledger.spent(begun)))
-                return result
-            found = questions(ledger, rollout, scenes, plans_per_scene=plans_per_scene, seed=seed)
-            result = await _work(
-                ledger,
-                begun,
-                jobs(begun, found),
-                labeller(ledger, begun, asked),
-                limits,
-                retry_dead=retry_dead,
-                limit=dry_run or limit,
-                total=ledger.count_kept(rollout, plans_per_scene),
-                quiet=as_json,
-            )
-            spent.update(_spent(before, ledger.spent(begun)))
-            return result
+            after = ledger.spent(begun)
+            spent.update({name: after[place] - before[place] for place, name in enumerate(after._fields)})
+            return begun, tally
         finally:
             await asked.close()
 
@@ -306,32 +305,25 @@ def _teacher_here() -> Teacher:
     return TeacherSettings().teacher()
 
 
-def _spent(before: Spent, after: Spent) -> dict[str, float]:
-    return {name: after[place] - before[place] for place, name in enumerate(after._fields)}
-
-
 def _stage(
-    folder: Path, work: Callable[[Ledger], Awaitable[tuple[Run, Tally]]], *, dry: bool
+    folder: Path, work: Callable[[Ledger], Coroutine[Any, Any, tuple[Run, Tally]]], *, dry: bool
 ) -> tuple[Run, Tally]:
     """Run a stage on a folder's ledger, or on a copy that is thrown away."""
     from clients.labelling.dead_letters import write_dead_letters
     from clients.labelling.ledger import FILE, Ledger
-
-    async def run(ledger: Ledger) -> tuple[Run, Tally]:
-        return await work(ledger)
 
     if dry:
         with tempfile.TemporaryDirectory(prefix="looktwice-") as scratch:
             if (folder / FILE).exists():
                 Ledger.copy(folder, Path(scratch))
             with Ledger(Path(scratch)) as ledger:
-                result = asyncio.run(run(ledger))
+                result = asyncio.run(work(ledger))
                 for entry in ledger.latest(result[0], result[1].done + result[1].dead):
                     typer.echo(json.dumps({"scene_id": entry.scene_id, entry.state: entry.record}, indent=1))
                 return result
     with Ledger(folder) as ledger:
         try:
-            return asyncio.run(run(ledger))
+            return asyncio.run(work(ledger))
         finally:
             write_dead_letters(ledger, folder)
 
@@ -343,29 +335,26 @@ async def _work(
     do: Callable[[Job[Any]], Awaitable[Record]],
     limits: Limits,
     *,
-    retry_dead: bool,
     limit: int | None,
-    total: int | None,
+    total: int,
     quiet: bool,
-) -> tuple[Run, Tally]:
+) -> Tally:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from clients.labelling.pipeline import work_through
 
-    if retry_dead:
-        ledger.forget_dead(run)
     columns = (TextColumn(run.stage), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bar = TextColumn("{task.description}")
     with Progress(*columns, bar, console=Console(stderr=True, quiet=quiet)) as progress:
-        task = progress.add_task("", total=min(limit or total or 0, total or limit or 0) or None)
+        task = progress.add_task("", total=min(total, limit or total))
 
         def show(tally: Tally) -> None:
             ended = tally.done + tally.dead + tally.earlier
             told = f"{tally.dead} dead letters" if tally.dead else ""
             progress.update(task, completed=ended, description=told)
 
-        return run, await work_through(ledger, run, islice(jobs, limit), do, limits, show)
+        return await work_through(ledger, run, islice(jobs, limit), do, limits, show)
 
 
 def _count(scenes: Path) -> int:

@@ -6,7 +6,7 @@ import asyncio
 import json
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
 
@@ -14,7 +14,7 @@ from service.cli.engines import Device, EngineName, Rows, VllmArguments, make_en
 from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, ScenePath, told
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Awaitable, Callable, Sequence
 
     from rich.progress import Progress
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from model.evaluation.open_loop import SceneResult
     from model.evaluation.report import Report
     from model.evaluation.variants import Variant
+
+_Found = TypeVar("_Found")
 
 
 def evaluate(
@@ -60,7 +62,13 @@ def evaluate(
         if preset == "ladder":
             report = _ladder(labelled, engine_of, checkpoint, ladder, n, rows, plots, quiet=as_json)
         else:
-            report = asyncio.run(_evaluate(labelled, engine_of(checkpoint), n, rows, quiet=as_json))
+            from model.evaluation.report import evaluate_checkpoint
+            from model.evaluation.variants import standard_variants
+
+            made = engine_of(checkpoint)
+            variants = standard_variants(made.card.formats, n=n)
+            run = _run(evaluate_checkpoint, labelled, made, variants, n, rows, quiet=as_json)
+            report = asyncio.run(run)
         typer.echo(json.dumps(report.to_json()) if as_json else str(report))
 
 
@@ -86,6 +94,7 @@ def _ladder(
         rung_variants,
         sweep_variants,
     )
+    from model.evaluation.report import evaluate_variants
 
     found = {} if folder is None else {rung: folder / rung for rung in RUNGS if (folder / rung).is_dir()}
     found.setdefault(COUNTERFACTUAL, checkpoint)
@@ -94,7 +103,8 @@ def _ladder(
         variants = [each for route in (False, True) for each in rung_variants(rung, n=n, route=route)]
         if rung == COUNTERFACTUAL:
             variants += sweep_variants(rung, n=n)
-        results |= asyncio.run(_results(scenes, engine_of(path), variants, n, rows, quiet=quiet))
+        run = _run(evaluate_variants, scenes, engine_of(path), variants, n, rows, quiet=quiet)
+        results |= asyncio.run(run)
     report = ladder_report(results)
     if plots is not None:
         plots.mkdir(parents=True, exist_ok=True)
@@ -113,7 +123,8 @@ def _ladder(
     return report
 
 
-async def _results(
+async def _run(
+    evaluate: Callable[..., Awaitable[_Found]],
     scenes: Sequence[LabelledScene],
     engine: Engine,
     variants: Sequence[Variant],
@@ -121,14 +132,13 @@ async def _results(
     rows: int,
     *,
     quiet: bool,
-) -> dict[Variant, list[SceneResult]]:
-    from model.evaluation.report import evaluate_variants
-
+) -> _Found:
+    """What ``evaluate`` makes of an engine that runs meanwhile."""
     await engine.start()
     try:
         with _progress(quiet) as progress:
             task = progress.add_task("scenes", total=len(scenes) * len(variants))
-            return await evaluate_variants(
+            return await evaluate(
                 engine,
                 scenes,
                 variants,
@@ -145,25 +155,3 @@ def _progress(quiet: bool) -> Progress:
 
     # Progress goes to stderr, so that stdout holds nothing but the table.
     return Progress(console=Console(stderr=True, quiet=quiet))
-
-
-async def _evaluate(
-    scenes: Sequence[LabelledScene], engine: Engine, n: int, rows: int, *, quiet: bool
-) -> Report:
-    from model.evaluation.report import evaluate_checkpoint
-    from model.evaluation.variants import standard_variants
-
-    await engine.start()
-    try:
-        variants = standard_variants(engine.card.formats, n=n)
-        with _progress(quiet) as progress:
-            task = progress.add_task("scenes", total=len(scenes) * len(variants))
-            return await evaluate_checkpoint(
-                engine,
-                scenes,
-                variants,
-                concurrency=max(1, rows // n) + 1,
-                on_result=lambda variant, _: progress.update(task, advance=1, description=variant.name),
-            )
-    finally:
-        await engine.stop()
