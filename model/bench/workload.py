@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from model.bench.scenes import fresh, moved
 from model.driving.scene import Scene
+from model.driving.variations import fresh, moved
 from model.engines.engine import Controls, PlanRequest, Thinking
 
 

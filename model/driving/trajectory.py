@@ -32,7 +32,8 @@ class GeometryError(ValueError):
 
 
 def _checked(array: npt.ArrayLike, shape: tuple[int, ...], name: str) -> FloatArray:
-    values = np.asarray(array, dtype=np.float32)
+    with np.errstate(over="ignore"):  # what is too large becomes infinite, and is refused as such
+        values = np.asarray(array, dtype=np.float32)
     if values.shape != shape:
         raise GeometryError(f"{name} must have shape {list(shape)}, got {list(values.shape)}")
     if not np.isfinite(values).all():
@@ -95,6 +96,22 @@ def to_ego_frame(poses: npt.ArrayLike, present: npt.ArrayLike) -> npt.NDArray[np
     )
 
 
+def from_ego_frame(poses: npt.ArrayLike, present: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """World poses [..., 4] of poses (x, y, z, heading) seen from ``present`` [4]: `to_ego_frame` undone."""
+    ego = np.asarray(poses, dtype=np.float64)
+    x0, y0, z0, heading0 = np.asarray(present, dtype=np.float64)
+    cos, sin = np.cos(heading0), np.sin(heading0)
+    return np.stack(
+        [
+            x0 + cos * ego[..., 0] - sin * ego[..., 1],
+            y0 + sin * ego[..., 0] + cos * ego[..., 1],
+            z0 + ego[..., 2],
+            wrap_angle(heading0 + ego[..., 3]),
+        ],
+        axis=-1,
+    )
+
+
 def present_speed(history: FloatArray) -> float:
     """Signed forward speed in m/s at the present, from the last 0.3 s of a history [16, 4]."""
     return float(-history[-4, 0] / (3 * STEP_S))
@@ -138,3 +155,9 @@ def constant_turn_rate(history: FloatArray) -> FloatArray:
     baseline[:, 1] = chord * np.sin(half)
     baseline[:, 3] = heading
     return baseline
+
+
+def agreed(trajectories: FloatArray) -> int:
+    """The place of the trajectory [n, 64, 4] that is nearest to all others on average: the draw to drive."""
+    apart = np.linalg.norm(trajectories[:, None, :, :2] - trajectories[None, :, :, :2], axis=-1)
+    return int(apart.mean(axis=(1, 2)).argmin())

@@ -5,7 +5,7 @@ Controls are part of the request, not of the engine; every engine gives them the
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -16,6 +16,8 @@ from model.formats.pieces import ACTION, THINKING
 
 Thinking = Literal["adaptive", "always", "never"]
 Branch = Literal["Action:", "Thinking:"]
+Cut = Literal["skipped", "shortened", "replaced"]
+"""What a deadline did to a second look: not begun, ended early, given up for the draft."""
 
 MAX_DRAWS = 64
 
@@ -91,12 +93,21 @@ class Controls:
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """One scene to plan for. ``format`` names a response format the checkpoint was trained on."""
+    """One scene to plan for.
+
+    Attributes:
+        request_id: unique among those that run.
+        scene: what the car sees.
+        format: a response format the checkpoint was trained on.
+        controls: what the caller decides.
+        live: tell of free text as it is written (`TextWritten`), not only when its section is finished.
+    """
 
     request_id: str
     scene: Scene
     format: str = "cf_vla"
     controls: Controls = field(default_factory=Controls)
+    live: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +124,8 @@ class Draw:
         codes: the trajectory codes it was decoded from.
         tokens: tokens per section, forced ones included.
         passes: how often the network was run for it, its prompt apart.
+        chosen: tokens at which the format left more than one; all others are forced.
+        cut: what the deadline did to its second look; None where it did nothing.
     """
 
     index: int
@@ -126,6 +139,22 @@ class Draw:
     codes: tuple[int, ...]
     tokens: Mapping[str, int]
     passes: int = 0
+    chosen: int = 0
+    cut: Cut | None = None
+
+
+@dataclass(frozen=True)
+class Started:
+    """The request has left the queue: memory is reserved for all its draws."""
+
+
+@dataclass(frozen=True)
+class TextWritten:
+    """A draw has written more of a section of free text."""
+
+    index: int
+    section: str
+    text: str
 
 
 @dataclass(frozen=True)
@@ -154,7 +183,7 @@ class DraftFinished:
     draw: Draw
 
 
-Event = SectionFinished | DraftFinished | DrawFinished
+Event = Started | TextWritten | SectionFinished | DraftFinished | DrawFinished
 
 
 @dataclass(frozen=True)
@@ -169,6 +198,7 @@ class ModelCard:
         cameras: cameras it looks at; a scene must have these.
         image_size: width, height in pixels that pictures are resized to.
         parameters: how many weights.
+        prompt_tokens: of a scene, with its route where it can have one.
         details: anything else worth showing, JSON-like.
     """
 
@@ -179,7 +209,21 @@ class ModelCard:
     cameras: tuple[str, ...]
     image_size: tuple[int, int]
     parameters: int
+    prompt_tokens: int = 0
     details: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Load:
+    """How full an engine is.
+
+    Attributes:
+        rows: draws that it has memory for.
+        rows_used: draws that memory is reserved for.
+    """
+
+    rows: int
+    rows_used: int
 
 
 class Engine(Protocol):
@@ -190,16 +234,28 @@ class Engine(Protocol):
         """What is loaded."""
         ...
 
+    @property
+    def load(self) -> Load:
+        """How full it is now."""
+        ...
+
     async def start(self) -> None:
-        """Load and warm up; returns when the engine can plan. Raises `EngineError`."""
+        """Load and warm up; returns when the engine can plan. Raises `EngineError`.
+
+        An engine that was stopped, or broke and was stopped, can be started again.
+        """
+        ...
+
+    async def wait(self) -> None:
+        """Wait until a started engine does not run any more; raises `EngineError` when it broke."""
         ...
 
     async def stop(self) -> None:
         """Cancel what is running and free everything."""
         ...
 
-    def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
-        """Queue a request and iterate over its events; ends after the n-th `DrawFinished`.
+    def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
+        """Queue a request and iterate over its events, `Started` first; ends after the n-th `DrawFinished`.
 
         Closing the iterator early cancels the request.
 

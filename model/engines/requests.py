@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 from model.driving.plan import Plan
 from model.engines.engine import Branch, Draw, ModelCard, PlanRequest, RequestError
+from model.engines.response import Response
 from model.formats.cf_vla import FORMATS
-from model.formats.cursor import CompiledFormat, Cursor, Token
+from model.formats.cursor import CompiledFormat, Cursor
 from model.formats.pieces import ACTION, BRANCH, THINKING, FormatError
 from model.formats.text import parse
 from model.network.codec import TrajectoryCodec
@@ -43,38 +44,39 @@ def branch_of(cursor: Cursor, token: int) -> Branch:
 
 def read(
     request: PlanRequest,
-    tokens: Sequence[Token],
-    think_probability: float | None,
+    response: Response,
     passes: int,
     draws: Iterable[int],
     vocabulary: Vocabulary,
     codec: TrajectoryCodec,
 ) -> list[Draw]:
-    """The draws that wrote ``tokens``: all the same, but for their index.
+    """The draws that wrote ``response``: all the same, but for their index.
 
     Raises:
         FormatError: the text is no response of the format.
     """
-    text = vocabulary.decode([token.id for token in tokens])
+    text = vocabulary.decode([token.id for token in response.tokens])
     values = parse(FORMATS[request.format], text)
     codes, branch, thinking = values["trajectory"], values.get(BRANCH), values.get("thinking")
     assert isinstance(codes, tuple)
     plan, revised = values.get("plan"), values.get("revised_plan")
     trajectory = codec.decode(request.scene.history[None], [codes])[0]
-    counts = dict(Counter(token.section for token in tokens))
+    counts = dict(Counter(token.section for token in response.tokens))
     return [
         Draw(
             index=index,
             text=text,
             plan=plan if isinstance(plan, Plan) else None,
             branch=THINKING if branch == THINKING else ACTION if branch == ACTION else None,
-            think_probability=think_probability,
+            think_probability=response.think_probability,
             thinking=thinking if isinstance(thinking, str) else None,
             revised_plan=revised if isinstance(revised, Plan) else None,
             trajectory=trajectory,
             codes=codes,
             tokens=counts,
             passes=passes,
+            chosen=response.chosen,
+            cut=response.cut,
         )
         for index in draws
     ]

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
+from model.engines.engine import Cut
 from model.formats.cursor import Cursor, Token
 from model.network.vocabulary import Vocabulary
 
+_HALF_A_CHARACTER: Final = "\ufffd"
 
-class FinishedSection(NamedTuple):
-    """A section's name and its text."""
+
+class SectionText(NamedTuple):
+    """A section's name, and its text or a part of it."""
 
     name: str
     text: str
@@ -24,35 +27,54 @@ class Response:
         cursor: where the response stands, behind everything in ``tokens``.
         tokens: the response so far.
         think_probability: at the branch, once that is decided.
+        chosen: how many tokens were chosen where the format left more than one.
+        cut: what a deadline did to the second look.
+        told: how many characters of the free text being written have been told of.
     """
 
     cursor: Cursor
     tokens: list[Token] = field(default_factory=list, kw_only=True)
     think_probability: float | None = field(default=None, kw_only=True)
+    chosen: int = field(default=0, kw_only=True)
+    cut: Cut | None = field(default=None, kw_only=True)
+    told: int = field(default=0, kw_only=True)
 
-    def append(self, token: int, vocabulary: Vocabulary) -> list[FinishedSection]:
+    def append(self, token: int, vocabulary: Vocabulary) -> list[SectionText]:
         """Write one token; returns the section that it finishes, if any.
 
         Raises:
             FormatError: the format does not allow it here.
         """
+        self.chosen += len(self.cursor.allowed().ids) > 1
         before, self.cursor = self.cursor.section, self.cursor.advance(token)
         self.tokens.append(Token(token, before))
         return self._finished(before, self.cursor.section, vocabulary)
 
-    def append_forced(self, vocabulary: Vocabulary) -> list[FinishedSection]:
+    def append_forced(self, vocabulary: Vocabulary) -> list[SectionText]:
         """Write the run that is forced from here; returns the sections that it finishes."""
         run, self.cursor = self.cursor.forced()
-        finished: list[FinishedSection] = []
+        finished: list[SectionText] = []
         sections = [*(token.section for token in run[1:]), self.cursor.section]
         for token, then in zip(run, sections[: len(run)], strict=True):
             self.tokens.append(token)
             finished += self._finished(token.section, then, vocabulary)
         return finished
 
-    def _finished(self, section: str, then: str, vocabulary: Vocabulary) -> list[FinishedSection]:
+    def new_text(self, vocabulary: Vocabulary) -> SectionText | None:
+        """What was written of a free text since this was last asked; None outside of free text."""
+        if self.cursor.stop_id is None:
+            self.told = 0
+            return None
+        section = self.cursor.section
+        text = vocabulary.decode([token.id for token in self.tokens if token.section == section])
+        if len(text) <= self.told or text.endswith(_HALF_A_CHARACTER):
+            return None
+        new, self.told = text[self.told :], len(text)
+        return SectionText(section, new)
+
+    def _finished(self, section: str, then: str, vocabulary: Vocabulary) -> list[SectionText]:
         """``section``, when the next token belongs to another."""
         if section == then:
             return []
         text = vocabulary.decode([token.id for token in self.tokens if token.section == section])
-        return [FinishedSection(section, text)]
+        return [SectionText(section, text)]

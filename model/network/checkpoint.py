@@ -147,10 +147,11 @@ def read_parts(folder: Path) -> Parts:
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{folder}: its tokenizer cannot be loaded: {error}") from error
     _check_sizes(codec, vocabulary)
+    inputs = InputBuilder(vocabulary, settings)
     return Parts(
         vocabulary=vocabulary,
         codec=codec,
-        inputs=InputBuilder(vocabulary, settings),
+        inputs=inputs,
         card=ModelCard(
             name=card["name"],
             revision=card["revision"],
@@ -159,6 +160,7 @@ def read_parts(folder: Path) -> Parts:
             cameras=settings.cameras,
             image_size=(settings.image_width, settings.image_height),
             parameters=card["parameters"],
+            prompt_tokens=len(inputs.prompt(settings.formats[0], route=settings.with_route).ids),
             details=card["details"],
         ),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
@@ -18,6 +18,7 @@ from model.engines.engine import (
     Event,
     PlanRequest,
     RequestError,
+    Started,
 )
 from model.engines.requests import begin, branch_of, read
 from model.engines.torch.ahead import GUESSES, Ahead
@@ -127,6 +128,11 @@ class Decoder:
         self.counts = Counts()
 
     @property
+    def rows_used(self) -> int:
+        """Draws that memory is reserved for."""
+        return self._runner.rows - self._schedule.free.rows
+
+    @property
     def idle(self) -> bool:
         """Whether there is nothing to do."""
         return self._schedule.idle
@@ -176,13 +182,17 @@ class Decoder:
         began_s = self._clock()
         for request in self._schedule.make_room(began_s):
             self._pause(request)
+        events: list[StepEvent] = []
         for request in self._schedule.admit(began_s):
-            rows = self._paused.pop(request.id, None) or self._first_rows(request)
+            rows = self._paused.pop(request.id, None)
+            if rows is None:
+                rows = self._first_rows(request)
+                events.append((request.id, Started()))
             groups: dict[int, list[Row]] = {}
             for row in rows:
                 groups.setdefault(row.draws[0] // self._schedule.draws_a_prompt(request), []).append(row)
             self._beginnings += [_Beginning(request, group) for group in groups.values()]
-        events = self._bring_prompts_on()
+        events += self._bring_prompts_on()
         if not self._rows:
             return events
         rows = list(self._rows)
@@ -347,8 +357,7 @@ class Decoder:
             try:
                 draws = read(
                     row.request.plan_request,
-                    row.tokens,
-                    row.think_probability,
+                    row,
                     row.passes,
                     row.draws,
                     self._runner.loaded.vocabulary,
@@ -383,7 +392,8 @@ class Decoder:
             row.draws = tuple(draw for draw in row.draws if draw not in ready)
             if not row.draws:
                 self._free_row(row)
-            events += self._answer(row.request, [self._drafts[row.request.id, draw] for draw in ready])
+            drafts = [self._drafts[row.request.id, draw] for draw in ready]
+            events += self._answer(row.request, [replace(draft, cut="replaced") for draft in drafts])
         return events
 
     def _answer(self, request: Request, draws: list[Draw]) -> list[StepEvent]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import queue
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +16,7 @@ from model.engines.engine import (
     DrawFinished,
     EngineError,
     Event,
+    Load,
     ModelCard,
     PlanRequest,
     RequestError,
@@ -83,7 +84,8 @@ class TorchEngine:
         loading = self._worker.submit(lambda: load(checkpoint, settings.dtype, settings.device))
         self._loaded = loading.result()
         self._decoding: Future[None] | None = None
-        self._counts = Counts()
+        self._counts, self._rows_used = Counts(), 0
+        self._broke: EngineError | None = None
         self._commands: queue.SimpleQueue[Callable[[Decoder], None] | None] = queue.SimpleQueue()
         self._listeners: dict[str, tuple[asyncio.AbstractEventLoop, asyncio.Queue[Event | Failed]]] = {}
 
@@ -91,6 +93,11 @@ class TorchEngine:
     def card(self) -> ModelCard:
         """What is loaded."""
         return self._loaded.card
+
+    @property
+    def load(self) -> Load:
+        """How full it is now."""
+        return Load(self._settings.rows, self._rows_used)
 
     @property
     def counts(self) -> Counts:
@@ -102,8 +109,19 @@ class TorchEngine:
         if self._decoding is not None:
             raise EngineError("the engine runs already")
         self._worker = self._worker or Worker(_THREAD)
+        self._broke = None
+        # What was asked of a thread that broke is answered already.
+        self._commands = queue.SimpleQueue()
         self._decoding = self._worker.submit(self._run)
         await warm_up(self)
+
+    async def wait(self) -> None:
+        """Wait until the thread has ended; raises `EngineError` when decoding failed."""
+        if self._decoding is not None:
+            # Shielded: who stops waiting must not cancel what the thread is about to answer.
+            await asyncio.shield(asyncio.wrap_future(self._decoding))
+        if self._broke is not None:
+            raise self._broke
 
     async def stop(self) -> None:
         """Cancel everything and end the thread; running requests get an `EngineError`."""
@@ -114,7 +132,7 @@ class TorchEngine:
         if worker is not None:
             await asyncio.to_thread(worker.close)
 
-    async def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
+    async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """Queue a request and iterate over its events; see `Engine.submit`."""
         if self._decoding is None or self._decoding.done():
             raise EngineError("the engine is not running")
@@ -153,24 +171,28 @@ class TorchEngine:
 
     def _run(self) -> None:
         settings = self._settings
-        runner = Runner(
-            self._loaded,
-            settings.rows,
-            prompts=settings.prompts or self._prompts(),
-            clip_bytes=settings.clip_bytes,
-            products=settings.products,
-        )
-        decoder = Decoder(runner, settings.shortcuts)
-        self._counts = decoder.counts
         reason: Exception = EngineError("the engine was stopped")
         try:
             with torch.inference_mode():
+                runner = Runner(
+                    self._loaded,
+                    settings.rows,
+                    prompts=settings.prompts or self._prompts(),
+                    clip_bytes=settings.clip_bytes,
+                    products=settings.products,
+                )
+                decoder = Decoder(runner, settings.shortcuts)
+                self._counts = decoder.counts
                 runner.warm_up(_WARM_TOKENS)
                 while self._obey(decoder):
-                    for request_id, event in decoder.step():
+                    events = decoder.step()
+                    # Before anybody hears of an end: who asks then must not find its rows in use.
+                    self._rows_used = decoder.rows_used
+                    for request_id, event in events:
                         self._tell(request_id, event)
         except Exception as error:  # the thread's last word: everyone who waits must hear of it
-            reason = EngineError.because("decoding failed", error)
+            reason = self._broke = EngineError.because("decoding failed", error)
+        self._rows_used = 0
         for request_id in list(self._listeners):
             self._tell(request_id, Failed(reason))
 
@@ -185,4 +207,5 @@ class TorchEngine:
             if command is None:
                 return False
             command(decoder)
+            self._rows_used = decoder.rows_used
         return True

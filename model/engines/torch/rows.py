@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.engine import Controls, Event, PlanRequest, SectionFinished
+from model.engines.engine import Controls, Event, PlanRequest, SectionFinished, TextWritten
 from model.engines.requests import branch_of
-from model.engines.response import FinishedSection, Response
+from model.engines.response import Response, SectionText
 from model.engines.torch.pace import TimeFor
 from model.engines.torch.sampler import choose, probabilities, uniforms
 from model.formats.cursor import Allowed, Cursor
@@ -130,7 +130,7 @@ class Row(Response):
 
     def write(self, ids: Sequence[int], vocabulary: Vocabulary) -> list[Event]:
         """Append tokens and the forced run behind them; returns the sections that they finish."""
-        written, finished = len(self.tokens), list[FinishedSection]()
+        written, finished = len(self.tokens), list[SectionText]()
         was_text = self.cursor.stop_id is not None
         for token in ids:
             finished += self.append(token, vocabulary)
@@ -140,7 +140,12 @@ class Row(Response):
         self.pending += [token.id for token in self.tokens[written:]]
         if self.draft:
             return []
-        return [SectionFinished(index, *section) for section in finished for index in self.draws]
+        events: list[Event] = [
+            SectionFinished(index, *section) for section in finished for index in self.draws
+        ]
+        if self.request.plan_request.live and (new := self.new_text(vocabulary)):
+            events += [TextWritten(index, *new) for index in self.draws]
+        return events
 
     def _controlled(
         self, allowed: Allowed, logits: npt.NDArray[np.float64], time_for: TimeFor
@@ -150,12 +155,15 @@ class Row(Response):
         everything = np.ones(len(allowed.ids), np.bool_)
         if allowed.choice != BRANCH:
             if self.cursor.stop_id in allowed.ids and self._ends(time_for):
+                self.cut = "shortened"
                 stops: npt.NDArray[np.bool_] = allowed.ids == self.cursor.stop_id
                 return stops
             return everything
         leads = np.array([branch_of(self.cursor, int(token)) == THINKING for token in allowed.ids])
         self.think_probability = float(probabilities(logits)[leads].sum())
-        wanted = ACTION if time_for is TimeFor.END_NOW else controls.branch(self.think_probability)
+        wanted = controls.branch(self.think_probability)
+        if time_for is TimeFor.END_NOW and wanted != ACTION:
+            self.cut, wanted = "skipped", ACTION
         if wanted is None:
             return everything
         return leads if wanted == THINKING else ~leads

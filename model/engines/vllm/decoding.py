@@ -11,9 +11,17 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from model.engines.engine import DrawFinished, EngineError, Event, PlanRequest, SectionFinished
+from model.engines.engine import (
+    DrawFinished,
+    EngineError,
+    Event,
+    PlanRequest,
+    SectionFinished,
+    Started,
+    TextWritten,
+)
 from model.engines.requests import branch_of, read
-from model.engines.response import FinishedSection, Response
+from model.engines.response import Response, SectionText
 from model.formats.cursor import Cursor
 from model.formats.pieces import ACTION, BRANCH, THINKING
 from model.network.checkpoint import Parts
@@ -67,11 +75,18 @@ class Decoding:
         self._tasks: set[asyncio.Task[None]] = set()
         self._requests = 0
 
+    @property
+    def draws(self) -> int:
+        """How many are asked for."""
+        return self._request.controls.n
+
     async def events(self, prompt: VllmPrompt) -> AsyncGenerator[Event]:
         """What happens, up to the last `DrawFinished`; closing it early frees everything."""
         self._prompt = prompt
         draws = [_Walk(self._start, index) for index in range(self._request.controls.n)]
         try:
+            # vLLM keeps its queue to itself.
+            yield Started()
             for draw in draws:
                 self._tell(draw, draw.append_forced(self._parts.vocabulary))
             self._go_on(draws)
@@ -159,6 +174,8 @@ class Decoding:
             fits = wanted in allowed.ids
             if fits:
                 self._tell(draw, draw.append(wanted, self._parts.vocabulary))
+                if self._request.live and (new := draw.new_text(self._parts.vocabulary)):
+                    self._happened.put_nowait(TextWritten(draw.index, *new))
             if fits and wanted == token and not draw.cursor.ending:
                 continue
             self._tell(draw, draw.append_forced(self._parts.vocabulary))
@@ -180,8 +197,7 @@ class Decoding:
     def _finish(self, draw: _Walk) -> None:
         for finished in read(
             self._request,
-            draw.tokens,
-            draw.think_probability,
+            draw,
             draw.passes,
             [draw.index],
             self._parts.vocabulary,
@@ -189,6 +205,6 @@ class Decoding:
         ):
             self._happened.put_nowait(DrawFinished(finished))
 
-    def _tell(self, draw: _Walk, sections: Iterable[FinishedSection]) -> None:
+    def _tell(self, draw: _Walk, sections: Iterable[SectionText]) -> None:
         for section in sections:
             self._happened.put_nowait(SectionFinished(draw.index, *section))

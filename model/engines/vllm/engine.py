@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import os
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, Mapping
 from contextlib import aclosing
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from model.driving.scene import Scene
-from model.engines.engine import EngineError, Event, ModelCard, PlanRequest, RequestError
+from model.engines.engine import EngineError, Event, Load, ModelCard, PlanRequest, RequestError
 from model.engines.requests import begin
 from model.engines.vllm.decoding import Decoding, VllmPrompt
 from model.engines.warm_up import warm_up
@@ -27,6 +27,8 @@ from model.network.vocabulary import VIDEO_PAD
 
 _ENVIRONMENT: Final = {"VLLM_NO_USAGE_STATS": "1", "HF_HUB_OFFLINE": "1", "VLLM_CPU_KVCACHE_SPACE": "2"}
 """Unless set otherwise: nothing is sent or fetched; 2 GiB of keys and values where there is no GPU."""
+_LOOK_AGAIN_S: Final = 0.5
+"""vLLM tells nobody that its processes have died; whoever asks is told."""
 _GRAMMARS: Final = 256
 """Kept, some 40 kB each: those of formats and branches, and of the latest places where draws went on."""
 
@@ -80,6 +82,12 @@ class VllmEngine:
         return self._card
 
     @property
+    def load(self) -> Load:
+        """How full it is now; what waits within vLLM counts as far as there would be room."""
+        asked = sum(decoding.draws for decoding in self._running.values())
+        return Load(self._settings.rows, min(asked, self._settings.rows))
+
+    @property
     def llm(self) -> Any:
         """vLLM's own ``AsyncLLM``; raises `EngineError` while the engine does not run."""
         if self._llm is None:
@@ -98,6 +106,13 @@ class VllmEngine:
             raise EngineError.because("vLLM did not start", error) from error
         await warm_up(self)
 
+    async def wait(self) -> None:
+        """Wait until vLLM does not run any more; raises `EngineError` when it died."""
+        while self._llm is not None:
+            if self._llm.errored:
+                raise EngineError.because("vLLM died", self._llm.dead_error)
+            await asyncio.sleep(_LOOK_AGAIN_S)
+
     async def stop(self) -> None:
         """Cancel everything and end vLLM's processes; running requests get an `EngineError`."""
         if self._llm is None:
@@ -113,7 +128,7 @@ class VllmEngine:
         del llm
         gc.collect()
 
-    async def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
+    async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """Queue a request and iterate over its events; see `Engine.submit`."""
         llm = self.llm
         if request.request_id in self._running:

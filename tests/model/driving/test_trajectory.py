@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from model.driving.trajectory import (
     GeometryError,
+    agreed,
     check_history,
     check_route,
     check_trajectory,
@@ -88,3 +89,10 @@ def test_what_is_no_history_trajectory_or_route_is_refused() -> None:
         check_trajectory(np.full((64, 4), 1e4))
     with pytest.raises(GeometryError, match=r"route must have shape \[20, 2\]"):
         check_route(np.zeros((20, 3)))
+
+
+def test_the_draw_that_the_others_agree_with_is_followed() -> None:
+    draws = np.zeros((4, 64, 4), np.float32)
+    draws[:, :, 1] = np.array([0.0, 1.0, 1.2, 9.0])[:, None]
+    assert agreed(draws) == 1
+    assert agreed(draws[:1]) == 0

@@ -18,6 +18,8 @@ from model.engines.engine import (
     PlanRequest,
     RequestError,
     SectionFinished,
+    Started,
+    TextWritten,
 )
 from model.engines.torch.decoder import Counts, Decoder, Failed, Shortcuts
 from model.engines.torch.pace import Pace
@@ -179,7 +181,7 @@ class Clock:
 
 def test_a_passed_deadline_leaves_thinking_out(exact: Loaded) -> None:
     draws = decode(Decoder(Runner(exact, 4)), request("a", n=2, thinking="always", deadline_ms=0))
-    assert all(draw.branch == "Action:" for draw in draws.values())
+    assert {(draw.branch, draw.cut) for draw in draws.values()} == {("Action:", "skipped")}
 
 
 def test_in_time_a_reflection_replaces_its_draft(exact: Loaded) -> None:
@@ -200,6 +202,7 @@ def test_in_time_a_reflection_replaces_its_draft(exact: Loaded) -> None:
     for index in range(2):
         assert order.index(("draft", index)) < order.index(("draw", index))
         assert draws[index].text == unhurried["a", index].text
+        assert draws[index].cut is None
         assert drafts[index].text == direct["a", index].text
 
 
@@ -217,8 +220,8 @@ def test_at_the_deadline_the_draft_is_the_answer(exact: Loaded) -> None:
         decoder.check_integrity()
         if len(drafts) == 2:
             clock.now_s = 101.0
-    assert draws == drafts
-    assert {draw.branch for draw in draws.values()} == {"Action:"}
+    assert [draws[index].text for index in range(2)] == [drafts[index].text for index in range(2)]
+    assert {(draw.branch, draw.cut) for draw in draws.values()} == {("Action:", "replaced")}
 
 
 class Steady(Pace):
@@ -291,6 +294,38 @@ def test_events_name_sections_in_order(exact: Loaded) -> None:
     while not decoder.idle:
         sections += [event.section for _, event in decoder.step() if isinstance(event, SectionFinished)]
     assert sections == ["plan", "branch", "thinking", "revised_plan", "trajectory"]
+
+
+def test_text_is_told_as_it_is_written(exact: Loaded) -> None:
+    decoder = Decoder(Runner(exact, 2))
+    decoder.add(replace(request("a", n=2, seed=3, thinking="always", temperature=1.2), live=True))
+    told = {0: "", 1: ""}
+    finished: dict[int, str] = {}
+    parts = 0
+    while not decoder.idle:
+        for _, event in decoder.step():
+            if isinstance(event, TextWritten):
+                assert event.section == "thinking"
+                assert event.index not in finished
+                told[event.index] += event.text
+                parts += 1
+            elif isinstance(event, SectionFinished) and event.section == "thinking":
+                finished[event.index] = event.text
+    assert parts > 4
+    for index in range(2):
+        assert finished[index].startswith(told[index])
+        assert len(told[index]) > len(finished[index]) // 2
+
+
+def test_a_request_starts_once_even_when_it_gives_way(exact: Loaded) -> None:
+    clock = Clock()
+    decoder = Decoder(Runner(exact, 2), clock=clock)
+    decoder.add(request("patient", n=2))
+    events = decoder.step()
+    decoder.add(request("urgent", 1, n=1, thinking="never", deadline_ms=50))
+    while not decoder.idle:
+        events += decoder.step()
+    assert [name for name, event in events if isinstance(event, Started)] == ["patient", "urgent"]
 
 
 def test_requests_beyond_the_rows_wait_and_are_served(exact: Loaded) -> None:

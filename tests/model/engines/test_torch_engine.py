@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from model.driving.scene import Clip, Scene
 from model.engines.engine import Controls, Draw, DrawFinished, EngineError, PlanRequest, RequestError
 from model.engines.torch.engine import TorchEngine, TorchSettings
+from model.engines.torch.runner import Runner
 from tests.checkpoints import noisy_scene
 
 
@@ -58,7 +60,7 @@ def test_leaving_early_frees_the_rows(untrained_checkpoint: Path) -> None:
             waiting = PlanRequest("slow", noisy_scene(), controls=Controls(n=2, thinking="always"))
             async for _ in (events := engine.submit(waiting)):
                 break
-            await events.aclose()  # type: ignore[attr-defined]
+            await events.aclose()
             assert len(await plan(engine, direct("next", n=2))) == 2
 
     run(test)
@@ -124,5 +126,46 @@ def test_stopping_tells_those_who_wait(untrained_checkpoint: Path) -> None:
                 await waiting
             with pytest.raises(EngineError, match="not running"):
                 await plan(engine, direct("late"))
+
+    run(test)
+
+
+def test_an_engine_that_broke_says_so_and_can_be_started_again(
+    untrained_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    feed = Runner.feed
+
+    def out_of_memory(runner: Runner, feeds: object) -> object:
+        raise torch.OutOfMemoryError("no room for this batch")
+
+    async def test() -> None:
+        async with running(untrained_checkpoint) as engine:
+            broken = asyncio.create_task(engine.wait())
+            monkeypatch.setattr(Runner, "feed", out_of_memory)
+            with pytest.raises(EngineError, match="no room for this batch"):
+                await plan(engine, direct("doomed", n=2))
+            with pytest.raises(EngineError, match="no room for this batch"):
+                await broken
+            with pytest.raises(EngineError, match="not running"):
+                await plan(engine, direct("late"))
+            await engine.stop()
+            monkeypatch.setattr(Runner, "feed", feed)
+            await engine.start()
+            assert len(await plan(engine, direct("after", n=2))) == 2
+            assert engine.load.rows_used == 0
+
+    run(test)
+
+
+def test_who_stops_watching_does_not_disturb_the_engine(untrained_checkpoint: Path) -> None:
+    async def test() -> None:
+        async with running(untrained_checkpoint) as engine:
+            watching = asyncio.create_task(engine.wait())
+            await asyncio.sleep(0)
+            watching.cancel()
+            assert len(await plan(engine, direct("after", n=2))) == 2
+            watching = asyncio.create_task(engine.wait())
+            await engine.stop()
+            await watching
 
     run(test)

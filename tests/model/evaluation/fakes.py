@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from model.engines.engine import (
     DrawFinished,
     EngineError,
     Event,
+    Load,
     ModelCard,
     PlanRequest,
     SectionFinished,
@@ -60,6 +61,13 @@ class FakeEngine:
         self._company = company
 
     @property
+    def load(self) -> Load:
+        return Load(rows=64, rows_used=0)
+
+    async def wait(self) -> None:
+        await asyncio.Event().wait()
+
+    @property
     def card(self) -> ModelCard:
         return ModelCard("fake", "1", "torch", ("cf_vla",), (), (1, 1), 0)
 
@@ -72,7 +80,7 @@ class FakeEngine:
     def cancel(self, request_id: str) -> None:
         return None
 
-    async def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
+    async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         self.requests.append(request)
         self.under_way += 1
         self.most_under_way = max(self.most_under_way, self.under_way)

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +32,7 @@ OWN_PICTURE = {labelled.scene.scene_id: labelled.scene.clip(FRONT_WIDE) for labe
 class LookingEngine(FakeEngine):
     """Plans as far off as what it lacks: the right pictures, the expert's plan, a plan at all."""
 
-    async def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
+    async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         looks_right = request.scene.clip(FRONT_WIDE) == OWN_PICTURE[request.scene.scene_id]
         plain = 1.0 if request.format == "traj_only" else 0.8
         metres = plain * (0.5 if request.controls.prefill else 1.0) * (1.0 if looks_right else 2.0)

@@ -24,6 +24,8 @@ from model.engines.engine import (
     PlanRequest,
     RequestError,
     SectionFinished,
+    Started,
+    TextWritten,
 )
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.vllm.engine import VllmEngine, VllmSettings
@@ -172,15 +174,19 @@ def test_draws_are_valid_and_repeat_with_their_seed(
 
 
 def test_sections_come_before_their_draw(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
-    request = PlanRequest("stream", BUNDLED[3], controls=Controls(n=2, thinking="always"))
+    request = PlanRequest("stream", BUNDLED[3], controls=Controls(n=2, thinking="always"), live=True)
     events = loop.run_until_complete(events_of(vllm, request))
+    assert isinstance(events[0], Started)
     for index in range(2):
-        mine = [
-            event.section if isinstance(event, SectionFinished) else "done"
+        sections = {
+            event.section: event.text
             for event in events
-            if (event.index if isinstance(event, SectionFinished) else event.draw.index) == index
-        ]
-        assert mine == ["plan", "branch", "thinking", "revised_plan", "trajectory", "done"]
+            if isinstance(event, SectionFinished) and event.index == index
+        }
+        assert list(sections) == ["plan", "branch", "thinking", "revised_plan", "trajectory"]
+        told = [event.text for event in events if isinstance(event, TextWritten) and event.index == index]
+        assert len(told) > 1
+        assert sections["thinking"].startswith("".join(told))
 
 
 def test_leaving_early_frees_vllm(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
@@ -188,7 +194,7 @@ def test_leaving_early_frees_vllm(loop: asyncio.AbstractEventLoop, vllm: VllmEng
         request = PlanRequest("early", BUNDLED[4], controls=Controls(n=4, thinking="always"))
         async for _ in (events := vllm.submit(request)):
             break
-        await events.aclose()  # type: ignore[attr-defined]
+        await events.aclose()
         assert vllm.llm.get_num_unfinished_requests() == 0
         waiting = asyncio.create_task(plan(vllm, request))
         while not vllm.llm.get_num_unfinished_requests():
