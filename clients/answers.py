@@ -12,6 +12,7 @@ from typing import Final, TypeVar
 
 import httpx
 import numpy as np
+from httpx_sse import ServerSentEvent
 from pydantic import BaseModel, ValidationError
 
 from clients import wire
@@ -83,6 +84,7 @@ class PlannedDraw:
         trajectory: float32 [64, 4]: x, y, z in m and heading in rad at 10 Hz, ego frame, first row at +0.1 s.
         draft_trajectory: where the first plan would have led; None without a second look or a deadline.
         tokens: tokens per section.
+        cut: what the deadline did to the second look: skipped, shortened, replaced; else None.
     """
 
     index: int
@@ -94,6 +96,7 @@ class PlannedDraw:
     trajectory: FloatArray
     draft_trajectory: FloatArray | None
     tokens: dict[str, int]
+    cut: wire.Cut | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +107,7 @@ class PlanResult:
     model: wire.ModelName
     draws: tuple[PlannedDraw, ...]
     timing: wire.Timing
+    deadline: wire.Deadline | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +144,7 @@ class ReflectResult:
     think_probability: float
     draws: tuple[LookedAt, ...]
     timing: wire.Timing
+    deadline: wire.Deadline | None = None
 
 
 def unreachable(error: httpx.HTTPError) -> PlannerUnreachable:
@@ -177,30 +182,89 @@ def _problem(response: httpx.Response) -> PlannerError:
         problem = wire.Problem.model_validate_json(response.content)
     except ValidationError:
         return BadAnswer(f"{response.url} answered {response.status_code} without a problem document")
+    return _typed(problem, retry_after_s(response))
+
+
+def _typed(problem: wire.Problem, wait_s: float | None = None) -> PlannerProblem:
     kind: type[PlannerProblem] = ServiceFailed
-    if response.status_code in BUSY_STATUSES:
+    if problem.status in BUSY_STATUSES:
         kind = ServiceBusy
-    elif response.status_code < 500:
+    elif problem.status < 500:
         kind = RequestRefused
-    return kind(problem, retry_after_s(response))
+    return kind(problem, wait_s)
 
 
 def plan_result(response: httpx.Response) -> PlanResult:
     """The typed result of POST /v1/plan; raises `PlannerError`."""
-    answered = read(response, wire.PlanResponse)
+    return _planned(read(response, wire.PlanResponse), response)
+
+
+def batch_results(response: httpx.Response) -> list[PlanResult | PlannerProblem]:
+    """The typed results of POST /v1/plan/batch; raises `PlannerError`."""
+    results: list[PlanResult | PlannerProblem] = []
+    for result in read(response, wire.BatchResponse).results:
+        if result.response is not None:
+            results.append(_planned(result.response, response))
+        elif result.problem is not None:
+            results.append(_typed(result.problem))
+        else:
+            raise BadAnswer(f"{response.url} gave a result without an answer and without a problem")
+    return results
+
+
+def _planned(answered: wire.PlanResponse, response: httpx.Response) -> PlanResult:
     with _contract(response):
         draws = tuple(_draw(draw) for draw in answered.draws)
-    return PlanResult(answered.request_id, answered.model, draws, answered.timing)
+    return PlanResult(answered.request_id, answered.model, draws, answered.timing, answered.deadline)
+
+
+Told = (
+    wire.PlanWritten
+    | wire.BranchTaken
+    | wire.ThinkingWritten
+    | wire.TrajectoryWritten
+    | PlanResult
+    | ReflectResult
+)
+"""What a stream tells; see `clients.wire.EVENTS`."""
+
+
+def told(event: ServerSentEvent, response: httpx.Response) -> Told | None:
+    """What an event of a stream tells; None for one of a later version.
+
+    Args:
+        event: of the stream.
+        response: that it came in; its path decides what the last event holds.
+
+    Raises:
+        PlannerError: the event is an error, or not of the contract.
+    """
+    name, data = event.event, event.data
+    try:
+        if name == "error":
+            raise _typed(wire.Problem.model_validate_json(data))
+        if name == "done" and response.url.path == "/v1/reflect":
+            return _reflected(wire.ReflectResponse.model_validate_json(data), response)
+        if name == "done":
+            return _planned(wire.PlanResponse.model_validate_json(data), response)
+        kind = wire.EVENTS.get(name)
+        return None if kind is None else kind.model_validate_json(data)  # type: ignore[return-value]
+    except ValidationError as error:
+        raise BadAnswer(f"{response.url} told of something else than {name}: {error}") from error
 
 
 def reflect_result(response: httpx.Response) -> ReflectResult:
     """The typed result of POST /v1/reflect; raises `PlannerError`."""
-    answered = read(response, wire.ReflectResponse)
+    return _reflected(read(response, wire.ReflectResponse), response)
+
+
+def _reflected(answered: wire.ReflectResponse, response: httpx.Response) -> ReflectResult:
     with _contract(response):
         plan = parse_plan(answered.plan.text)
         draws = tuple(_looked_at(draw) for draw in answered.draws)
+    probability, deadline = answered.think_probability, answered.deadline
     return ReflectResult(
-        answered.request_id, answered.model, plan, answered.think_probability, draws, answered.timing
+        answered.request_id, answered.model, plan, probability, draws, answered.timing, deadline
     )
 
 
@@ -238,4 +302,5 @@ def _draw(draw: wire.Draw) -> PlannedDraw:
         if draw.draft_trajectory is None
         else check_trajectory(np.asarray(draw.draft_trajectory, np.float32)),
         tokens=draw.tokens,
+        cut=draw.cut,
     )

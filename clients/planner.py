@@ -10,12 +10,18 @@
 from __future__ import annotations
 
 import asyncio
+import base64
+import os
 import time
+from collections.abc import AsyncGenerator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Any, Self, TypedDict
 
 import httpx
+import msgpack
+from httpx_sse import EventSource
 from pydantic import BaseModel
 
 from clients import wire
@@ -33,18 +39,22 @@ from clients.answers import (
     RequestRefused,
     ServiceBusy,
     ServiceFailed,
+    Told,
+    batch_results,
     plan_result,
     read,
     reflect_result,
     retry_after_s,
+    told,
     unreachable,
 )
 from clients.labelling.teachers.view import Surroundings
-from clients.wire_values import rows, wire_agents, wire_scene
+from clients.requests import label_request, plan_request, reflect_request
 from model.driving.plan import Plan
 from model.driving.scene import Scene
 
 __all__ = [
+    "Access",
     "AsyncPlannerClient",
     "BadAnswer",
     "LookedAt",
@@ -60,6 +70,7 @@ __all__ = [
     "RequestRefused",
     "ServiceBusy",
     "ServiceFailed",
+    "Told",
     "label_request",
     "plan_request",
     "reflect_request",
@@ -82,14 +93,38 @@ class Patience:
     longest_wait_s: float = 5.0
 
 
+@dataclass(frozen=True)
+class Access:
+    """How a client speaks to the service.
+
+    Attributes:
+        api_key: sent as a bearer token; None where the service asks for none.
+        packed: send bodies in msgpack, pictures as they are: smaller and quicker to read than JSON.
+    """
+
+    api_key: str | None = None
+    packed: bool = False
+
+    @classmethod
+    def from_environment(cls) -> Self:
+        """With the key in ``LOOKTWICE_API_KEY``, where one is set."""
+        return cls(os.environ.get("LOOKTWICE_API_KEY") or None)
+
+
 class PlannerClient:
     """Blocking client; safe to share between threads, as its httpx client is."""
 
     def __init__(
-        self, base_url: str, patience: Patience = Patience(), transport: httpx.BaseTransport | None = None
+        self,
+        base_url: str,
+        patience: Patience = Patience(),
+        transport: httpx.BaseTransport | None = None,
+        access: Access = Access(),
     ) -> None:
-        self._patience = patience
-        self._http = httpx.Client(base_url=base_url, timeout=patience.timeout_s, transport=transport)
+        self._patience, self._packed = patience, access.packed
+        self._http = httpx.Client(
+            base_url=base_url, timeout=patience.timeout_s, transport=transport, headers=_headers(access)
+        )
 
     def plan(
         self,
@@ -113,8 +148,34 @@ class PlannerClient:
             PlannerError: see its subclasses.
         """
         asked = plan_request(scene, controls, prefill=prefill, format=format)
-        answered = self._send(_call(self._http, "/v1/plan", asked, request_id), controls.deadline_ms)
-        return plan_result(answered)
+        return plan_result(self._ask("/v1/plan", asked, request_id, controls.deadline_ms))
+
+    def plan_batch(self, asked: Sequence[wire.PlanRequest]) -> list[PlanResult | PlannerProblem]:
+        """Plan for many scenes in one request (`plan_request` makes them); a scene that fails does so alone.
+
+        Raises:
+            PlannerError: the batch as a whole failed.
+        """
+        batch = wire.BatchRequest(requests=list(asked))
+        return batch_results(self._ask("/v1/plan/batch", batch))
+
+    def stream(self, asked: wire.PlanRequest | wire.ReflectRequest) -> Iterator[tuple[str, Told]]:
+        """What a draw writes, as it is written: names and data of `clients.wire.EVENTS`, at last ``done``.
+
+        Args:
+            asked: see `plan_request` and `reflect_request`.
+
+        Raises:
+            PlannerError: before the first event or at the place of the one that failed.
+        """
+        asked = asked.model_copy(update={"stream": True})
+        with _told_errors(), self._http.stream("POST", _path_of(asked), **self._body(asked)) as response:
+            if response.status_code != 200:
+                response.read()
+                read(response, wire.PlanResponse)
+            for event in EventSource(response).iter_sse():
+                if (data := told(event, response)) is not None:
+                    yield event.event, data
 
     def reflect(
         self,
@@ -138,8 +199,7 @@ class PlannerClient:
             PlannerError: see its subclasses.
         """
         asked = reflect_request(scene, plan, controls, format=format)
-        answered = self._send(_call(self._http, "/v1/reflect", asked, request_id), controls.deadline_ms)
-        return reflect_result(answered)
+        return reflect_result(self._ask("/v1/reflect", asked, request_id, controls.deadline_ms))
 
     def label(
         self,
@@ -163,7 +223,7 @@ class PlannerClient:
             PlannerError: see its subclasses.
         """
         asked = label_request(scene, predicted, expert, surroundings, seed)
-        return read(self._send(_call(self._http, "/v1/label", asked, None)), wire.LabelResponse)
+        return read(self._ask("/v1/label", asked), wire.LabelResponse)
 
     def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""
@@ -172,9 +232,6 @@ class PlannerClient:
     def teacher(self) -> wire.TeacherName | None:
         """Who writes the service's labels, if anybody; raises `PlannerError`."""
         return self._model_list().teacher
-
-    def _model_list(self) -> wire.ModelList:
-        return read(self._send(self._http.build_request("GET", "/v1/models")), wire.ModelList)
 
     def close(self) -> None:
         """Close the connections."""
@@ -188,13 +245,24 @@ class PlannerClient:
     ) -> None:
         self.close()
 
+    def _model_list(self) -> wire.ModelList:
+        return read(self._send(self._http.build_request("GET", "/v1/models")), wire.ModelList)
+
+    def _ask(
+        self, path: str, asked: BaseModel, request_id: str | None = None, deadline_ms: int | None = None
+    ) -> httpx.Response:
+        return self._send(
+            self._http.build_request("POST", path, **self._body(asked, request_id)), deadline_ms
+        )
+
+    def _body(self, asked: BaseModel, request_id: str | None = None) -> _Body:
+        return _body(asked, request_id, packed=self._packed)
+
     def _send(self, request: httpx.Request, deadline_ms: int | None = None) -> httpx.Response:
         attempts = _Attempts(self._patience, deadline_ms)
         while True:
-            try:
+            with _told_errors():
                 response = self._http.send(request)
-            except httpx.HTTPError as error:
-                raise unreachable(error) from error
             wait_s = attempts.wait_after(response)
             if wait_s is None:
                 return response
@@ -209,9 +277,12 @@ class AsyncPlannerClient:
         base_url: str,
         patience: Patience = Patience(),
         transport: httpx.AsyncBaseTransport | None = None,
+        access: Access = Access(),
     ) -> None:
-        self._patience = patience
-        self._http = httpx.AsyncClient(base_url=base_url, timeout=patience.timeout_s, transport=transport)
+        self._patience, self._packed = patience, access.packed
+        self._http = httpx.AsyncClient(
+            base_url=base_url, timeout=patience.timeout_s, transport=transport, headers=_headers(access)
+        )
 
     async def plan(
         self,
@@ -224,8 +295,25 @@ class AsyncPlannerClient:
     ) -> PlanResult:
         """Plan for ``scene``; see `PlannerClient.plan`."""
         asked = plan_request(scene, controls, prefill=prefill, format=format)
-        answered = await self._send(_call(self._http, "/v1/plan", asked, request_id), controls.deadline_ms)
-        return plan_result(answered)
+        return plan_result(await self._ask("/v1/plan", asked, request_id, controls.deadline_ms))
+
+    async def plan_batch(self, asked: Sequence[wire.PlanRequest]) -> list[PlanResult | PlannerProblem]:
+        """Plan for many scenes; see `PlannerClient.plan_batch`."""
+        batch = wire.BatchRequest(requests=list(asked))
+        return batch_results(await self._ask("/v1/plan/batch", batch))
+
+    async def stream(self, asked: wire.PlanRequest | wire.ReflectRequest) -> AsyncGenerator[tuple[str, Told]]:
+        """What a draw writes, as it is written; see `PlannerClient.stream`."""
+        asked = asked.model_copy(update={"stream": True})
+        body = self._body(asked)
+        with _told_errors():
+            async with self._http.stream("POST", _path_of(asked), **body) as response:
+                if response.status_code != 200:
+                    await response.aread()
+                    read(response, wire.PlanResponse)
+                async for event in EventSource(response).aiter_sse():
+                    if (data := told(event, response)) is not None:
+                        yield event.event, data
 
     async def reflect(
         self,
@@ -238,8 +326,7 @@ class AsyncPlannerClient:
     ) -> ReflectResult:
         """Have ``plan`` looked at; see `PlannerClient.reflect`."""
         asked = reflect_request(scene, plan, controls, format=format)
-        call = _call(self._http, "/v1/reflect", asked, request_id)
-        return reflect_result(await self._send(call, controls.deadline_ms))
+        return reflect_result(await self._ask("/v1/reflect", asked, request_id, controls.deadline_ms))
 
     async def label(
         self,
@@ -252,7 +339,7 @@ class AsyncPlannerClient:
     ) -> wire.LabelResponse:
         """Have the service's teacher look at a plan; see `PlannerClient.label`."""
         asked = label_request(scene, predicted, expert, surroundings, seed)
-        return read(await self._send(_call(self._http, "/v1/label", asked, None)), wire.LabelResponse)
+        return read(await self._ask("/v1/label", asked), wire.LabelResponse)
 
     async def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""
@@ -261,9 +348,6 @@ class AsyncPlannerClient:
     async def teacher(self) -> wire.TeacherName | None:
         """Who writes the service's labels, if anybody; raises `PlannerError`."""
         return (await self._model_list()).teacher
-
-    async def _model_list(self) -> wire.ModelList:
-        return read(await self._send(self._http.build_request("GET", "/v1/models")), wire.ModelList)
 
     async def close(self) -> None:
         """Close the connections."""
@@ -277,59 +361,27 @@ class AsyncPlannerClient:
     ) -> None:
         await self.close()
 
+    async def _model_list(self) -> wire.ModelList:
+        return read(await self._send(self._http.build_request("GET", "/v1/models")), wire.ModelList)
+
+    async def _ask(
+        self, path: str, asked: BaseModel, request_id: str | None = None, deadline_ms: int | None = None
+    ) -> httpx.Response:
+        request = self._http.build_request("POST", path, **self._body(asked, request_id))
+        return await self._send(request, deadline_ms)
+
+    def _body(self, asked: BaseModel, request_id: str | None = None) -> _Body:
+        return _body(asked, request_id, packed=self._packed)
+
     async def _send(self, request: httpx.Request, deadline_ms: int | None = None) -> httpx.Response:
         attempts = _Attempts(self._patience, deadline_ms)
         while True:
-            try:
+            with _told_errors():
                 response = await self._http.send(request)
-            except httpx.HTTPError as error:
-                raise unreachable(error) from error
             wait_s = attempts.wait_after(response)
             if wait_s is None:
                 return response
             await asyncio.sleep(wait_s)
-
-
-def plan_request(
-    scene: Scene,
-    controls: wire.Controls = wire.Controls(),
-    *,
-    prefill: Plan | None = None,
-    format: str = "cf_vla",
-) -> wire.PlanRequest:
-    """The body of POST /v1/plan for ``scene``."""
-    if prefill is not None:
-        controls = controls.model_copy(update={"prefill": str(prefill)})
-    return wire.PlanRequest(scene=wire_scene(scene), controls=controls, format=format)
-
-
-def reflect_request(
-    scene: Scene,
-    plan: Plan,
-    controls: wire.ReflectControls = wire.ReflectControls(),
-    *,
-    format: str = "cf_vla",
-) -> wire.ReflectRequest:
-    """The body of POST /v1/reflect for ``plan`` in ``scene``."""
-    return wire.ReflectRequest(scene=wire_scene(scene), plan=str(plan), controls=controls, format=format)
-
-
-def label_request(
-    scene: Scene, predicted: Plan, expert: Plan, surroundings: Surroundings | None = None, seed: int = 0
-) -> wire.LabelRequest:
-    """The body of POST /v1/label for two plans in ``scene``."""
-    return wire.LabelRequest(
-        scene=wire_scene(scene),
-        predicted_plan=str(predicted),
-        expert_plan=str(expert),
-        annotations=None
-        if surroundings is None
-        else wire.Annotations(
-            agents=wire_agents(surroundings.agents),
-            lane_lines=[rows(line) for line in surroundings.lane_lines],
-        ),
-        seed=seed,
-    )
 
 
 class _Attempts:
@@ -351,10 +403,46 @@ class _Attempts:
         return wait_s
 
 
-def _call(
-    http: httpx.Client | httpx.AsyncClient, path: str, asked: BaseModel, request_id: str | None
-) -> httpx.Request:
-    headers = {"Content-Type": "application/json"}
+class _Body(TypedDict):
+    content: bytes
+    headers: dict[str, str]
+
+
+def _body(asked: BaseModel, request_id: str | None, *, packed: bool) -> _Body:
+    media_type = wire.MSGPACK_MEDIA_TYPE if packed else "application/json"
+    headers = {"Content-Type": media_type}
     if request_id is not None:
         headers[wire.REQUEST_ID_HEADER] = request_id
-    return http.build_request("POST", path, content=asked.model_dump_json(), headers=headers)
+    content = _packed(asked) if packed else asked.model_dump_json().encode()
+    return _Body(content=content, headers=headers)
+
+
+def _packed(asked: BaseModel) -> bytes:
+    content: bytes = msgpack.packb(_with_raw_images(asked.model_dump()))
+    return content
+
+
+def _with_raw_images(node: Any) -> Any:
+    """The document with its pictures as bytes instead of base64."""
+    if isinstance(node, dict):
+        return {
+            key: [base64.b64decode(image) for image in value] if key == "images" else _with_raw_images(value)
+            for key, value in node.items()
+        }
+    return [_with_raw_images(value) for value in node] if isinstance(node, list) else node
+
+
+def _headers(access: Access) -> dict[str, str]:
+    return {} if access.api_key is None else {"Authorization": f"Bearer {access.api_key}"}
+
+
+def _path_of(asked: wire.PlanRequest | wire.ReflectRequest) -> str:
+    return "/v1/reflect" if isinstance(asked, wire.ReflectRequest) else "/v1/plan"
+
+
+@contextmanager
+def _told_errors() -> Iterator[None]:
+    try:
+        yield
+    except httpx.HTTPError as error:
+        raise unreachable(error) from error

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, WithJsonSchema
 
 Camera = Literal[
     "front_wide_120",
@@ -22,10 +22,20 @@ Camera = Literal[
 ]
 Thinking = Literal["adaptive", "always", "never"]
 Branch = Literal["Action:", "Thinking:"]
+Cut = Literal["skipped", "shortened", "replaced"]
 Group = Literal["longitudinal", "lateral", "lane"]
 
 PROBLEM_MEDIA_TYPE: Final = "application/problem+json"
+MSGPACK_MEDIA_TYPE: Final = "application/msgpack"
+MULTIPART_MEDIA_TYPE: Final = "multipart/form-data"
+SSE_MEDIA_TYPE: Final = "text/event-stream"
 REQUEST_ID_HEADER: Final = "X-Request-ID"
+IDEMPOTENCY_KEY_HEADER: Final = "Idempotency-Key"
+PART_SCHEME: Final = "cid:"
+"""In a multipart body: where a picture would be, ``cid:NAME`` stands for the file part of that name."""
+REQUEST_PART: Final = "request"
+"""The part of a multipart body that holds the JSON."""
+MAX_BATCH: Final = 64
 MAX_SEED: Final = 2**53 - 1
 """The largest integer that every JSON reader keeps exact."""
 
@@ -67,15 +77,27 @@ class Answered(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="ignore")
 
 
+def _form_of_image(value: object) -> str:
+    return "bytes" if isinstance(value, bytes) else "base64"
+
+
+Image = Annotated[
+    Annotated[str, Tag("base64")] | Annotated[bytes, Tag("bytes")],
+    Discriminator(_form_of_image),
+    WithJsonSchema({"type": "string"}),
+]
+"""A picture: base64 in JSON, bytes in msgpack and multipart bodies."""
+
+
 class Clip(Asked):
     """Four pictures of one camera over the past 2 s."""
 
     camera: Camera = Field(description="Which camera.")
-    images: list[str] = Field(
+    images: list[Image] = Field(
         min_length=4,
         max_length=4,
-        description="4 pictures at 2 Hz, oldest first: JPEG, PNG or WebP in base64, no data: prefix, "
-        "at most 4 megapixels each.",
+        description="4 pictures at 2 Hz, oldest first: JPEG, PNG or WebP, at most 4 megapixels each; "
+        "in base64 without a data: prefix, in msgpack as bytes, in multipart bodies as cid:NAME of a part.",
     )
 
 
@@ -142,7 +164,7 @@ class ReflectControls(Asked):
         default=None,
         ge=1,
         le=600_000,
-        description="Milliseconds until the answer must be there; null for none.",
+        description="Milliseconds from the request's arrival until the answer must be there; null for none.",
     )
 
 
@@ -165,6 +187,7 @@ class PlanRequest(Asked):
         max_length=40,
         description="Response format; GET /v1/models lists what the model writes.",
     )
+    stream: bool = Field(default=False, description="Answer with server-sent events, as draws are written.")
 
 
 class Plan(Answered):
@@ -188,6 +211,10 @@ class Draw(Answered):
         default=None,
         description="Where the first plan would have led; made beside a second look under a deadline.",
     )
+    cut: Cut | None = Field(
+        default=None,
+        description="What the deadline did to the second look: skipped, shortened, or replaced by the draft.",
+    )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
 
 
@@ -201,12 +228,17 @@ class ModelName(Answered):
 class Timing(Answered):
     """Where the time went, in milliseconds."""
 
-    total_ms: Milliseconds = Field(description="From the parsed body to the finished answer.")
+    total_ms: Milliseconds = Field(description="From the request's arrival to the finished answer.")
     checks_ms: Milliseconds = Field(description="Base64, picture headers and geometry.")
     engine_ms: Milliseconds = Field(description="In the engine, waiting for a place in the batch included.")
-    queue_ms: Milliseconds | None = Field(
-        default=None, description="Waiting for admission; null where unmeasured."
-    )
+    queue_ms: Milliseconds = Field(default=0.0, description="Of these: waiting for a place in the batch.")
+
+
+class Deadline(Answered):
+    """What became of a deadline."""
+
+    met: bool = Field(description="Whether the answer was finished in time.")
+    cut: list[int] = Field(description="Draws whose second look was skipped, shortened or replaced.")
 
 
 class PlanResponse(Answered):
@@ -216,6 +248,15 @@ class PlanResponse(Answered):
     model: ModelName
     draws: list[Draw]
     timing: Timing
+    deadline: Deadline | None = Field(default=None, description="Null where none was set.")
+
+
+class BatchRequest(Asked):
+    """Body of POST /v1/plan/batch."""
+
+    requests: list[PlanRequest] = Field(
+        min_length=1, max_length=MAX_BATCH, description="Planned for together; none may stream."
+    )
 
 
 class ReflectRequest(Asked):
@@ -229,6 +270,7 @@ class ReflectRequest(Asked):
         max_length=40,
         description="Response format; GET /v1/models lists what the model writes.",
     )
+    stream: bool = Field(default=False, description="Answer with server-sent events, as draws are written.")
 
 
 class PlanChange(Answered):
@@ -255,6 +297,10 @@ class Reflection(Answered):
     )
     changes: list[PlanChange] = Field(description="Where they do not, track by track; empty when kept.")
     trajectory: Trajectory
+    cut: Cut | None = Field(
+        default=None,
+        description="What the deadline did to the second look: skipped, shortened, or replaced by the draft.",
+    )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
 
 
@@ -269,6 +315,7 @@ class ReflectResponse(Answered):
     )
     draws: list[Reflection]
     timing: Timing
+    deadline: Deadline | None = Field(default=None, description="Null where none was set.")
 
 
 class Agent(Answered):
@@ -343,8 +390,20 @@ class ModelCard(Answered):
     details: dict[str, Any] = Field(default_factory=dict)
 
 
+class NamedModel(Answered):
+    """A model as clients of OpenAI's API expect it."""
+
+    id: str
+    object: Literal["model"] = "model"
+    created: int = Field(description="When the service began, in s since 1970.")
+    owned_by: str = "looktwice"
+
+
 class ModelList(Answered):
-    """Answer of GET /v1/models."""
+    """Answer of GET /v1/models; `object` and `data` are for clients of OpenAI's API."""
+
+    object: Literal["list"] = "list"
+    data: list[NamedModel] = Field(default_factory=list)
 
     models: list[ModelCard]
     teacher: TeacherName | None = Field(
@@ -365,6 +424,14 @@ class LabelledScene(Answered):
     )
     lane_lines: list[list[Point]] = Field(description="Centre lines of the lanes around.")
     tags: list[str] = Field(description="What makes the scene difficult.")
+
+
+class LoadRequest(Asked):
+    """Body of POST /v1/models:load."""
+
+    checkpoint: str = Field(
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$", description="Name of a folder among the checkpoints."
+    )
 
 
 class SceneEntry(Answered):
@@ -406,3 +473,57 @@ class Problem(Answered):
     errors: list[Fault] = Field(
         default_factory=list, description="Every fault found, where there are places."
     )
+
+
+class BatchResult(Answered):
+    """What became of one request of a batch: its answer, or its problem."""
+
+    status: int = Field(description="That the request alone would have been answered with.")
+    response: PlanResponse | None = None
+    problem: Problem | None = None
+
+
+class BatchResponse(Answered):
+    """Answer of POST /v1/plan/batch: a result per request, in their order."""
+
+    results: list[BatchResult]
+
+
+class PlanWritten(Answered):
+    """Data of the events `plan` and `revised_plan`."""
+
+    index: int
+    plan: Plan
+
+
+class BranchTaken(Answered):
+    """Data of the event `branch`."""
+
+    index: int
+    branch: Branch
+
+
+class ThinkingWritten(Answered):
+    """Data of the event `thinking`: more of the reasoning, to be put behind what came before."""
+
+    index: int
+    text: str
+
+
+class TrajectoryWritten(Answered):
+    """Data of the events `draft_trajectory` and `trajectory`."""
+
+    index: int
+    trajectory: Trajectory
+
+
+EVENTS: Final[dict[str, type[Answered]]] = {
+    "plan": PlanWritten,
+    "branch": BranchTaken,
+    "draft_trajectory": TrajectoryWritten,
+    "thinking": ThinkingWritten,
+    "revised_plan": PlanWritten,
+    "trajectory": TrajectoryWritten,
+    "error": Problem,
+}
+"""Server-sent events and their data; `done` ends the stream with what the answer would have been without."""

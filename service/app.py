@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+import os
+import time
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
+from starlette.middleware.cors import CORSMiddleware
 
 from clients.labelling.teachers.rules import RuleTeacher
 from clients.labelling.teachers.teacher import Teacher
+from clients.wire import IDEMPOTENCY_KEY_HEADER, REQUEST_ID_HEADER
 from model.engines.engine import Engine
+from service.admission import Admission
+from service.auth import Guard
 from service.body_limit import BodyLimit
 from service.errors import install_error_handlers
+from service.idempotency import Idempotency
 from service.inspector.page import add_inspector
 from service.lifecycle import Lifecycle
 from service.logs import configure_logging
 from service.metrics import Metrics
 from service.middleware import Around
 from service.openapi import describe
-from service.routes import Parts, make_router
+from service.parts import Parts
+from service.planning import Limits, Planning
+from service.rates import Rates
+from service.routes import make_router
 from service.settings import Settings
+from service.traces import Traces, traces_from_environment
 
 DESCRIPTION = """Planning for driving models that look twice before they act.
 
@@ -33,18 +45,32 @@ def create_app(
     settings: Settings,
     registry: CollectorRegistry | None = None,
     teacher: Teacher = RuleTeacher(),
+    load: Callable[[Path], Engine] | None = None,
+    traces: Traces | None = None,
 ) -> FastAPI:
     """The service over ``engine``, which it starts and stops.
 
     Args:
         engine: not yet started.
         settings: see `Settings`.
-        teacher: writes the reflections of /v1/label.
         registry: where metrics are registered; a new one by default, so that apps do not share counts.
+        teacher: writes the reflections of /v1/label.
+        load: makes an engine like this one over another checkpoint; None where none may replace it.
+        traces: where spans go to; by default where the environment says.
+
+    Raises:
+        ValueError: settings that cannot be.
     """
     configure_logging(settings.log_format)
+    keys = settings.keys()
+    traces = traces or traces_from_environment(os.environ)
     metrics = Metrics(registry or CollectorRegistry())
     lifecycle = Lifecycle(engine, metrics)
+    admission = Admission(settings.max_draws, settings.max_scenes, time.monotonic)
+    metrics.watch(lambda: lifecycle.load, admission)
+    limits = Limits(settings.queue_timeout_s, settings.decode_timeout_s)
+    planning = Planning(lifecycle, admission, Rates(settings.rate_limit), metrics, traces, limits)
+    idempotency = Idempotency(settings.idempotency_s, time.monotonic)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -64,10 +90,22 @@ def create_app(
         docs_url=None,
         redoc_url=None,
     )
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
-    app.add_middleware(Around, metrics=metrics)
-    install_error_handlers(app)
-    app.include_router(make_router(Parts(engine, settings, metrics, lifecycle, teacher)))
+    # The last one added is the outermost.
+    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
+    app.add_middleware(Guard, keys=keys, metrics=metrics)
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=["Authorization", "Content-Type", IDEMPOTENCY_KEY_HEADER, REQUEST_ID_HEADER],
+            expose_headers=[REQUEST_ID_HEADER, "Retry-After"],
+        )
+    app.add_middleware(Around, metrics=metrics, traces=traces)
+    install_error_handlers(app, metrics)
+    parts = Parts(settings, metrics, lifecycle, planning, idempotency, teacher, load, int(time.time()))
+    app.include_router(make_router(parts))
     add_inspector(app)
-    describe(app)
+    describe(app, keys=bool(keys))
+    app.state.drain = lifecycle.drain
     return app

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from fastapi import FastAPI, Request
@@ -12,9 +12,11 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from clients.wire import PROBLEM_MEDIA_TYPE, Fault, Problem
+from service.metrics import Metrics
 from service.problems import (
+    BODY_TIMEOUT,
     BODY_TOO_LARGE,
-    ENGINE_FAILED,
+    DRAINING,
     INTERNAL,
     INVALID_CLIP,
     INVALID_CONTROLS,
@@ -25,8 +27,8 @@ from service.problems import (
     INVALID_ROUTE,
     METHOD_NOT_ALLOWED,
     NOT_FOUND,
-    NOT_READY,
-    RETRY_AFTER_S,
+    REJECTIONS,
+    UNAUTHORIZED,
     UNKNOWN_CAMERA,
     UNKNOWN_FIELD,
     UNSUPPORTED_MEDIA_TYPE,
@@ -49,45 +51,73 @@ _KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], Kind]]] = (
 )
 _KIND_BY_STATUS: Final = {
     kind.status: kind
-    for kind in (INVALID_JSON, NOT_FOUND, METHOD_NOT_ALLOWED, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE)
+    for kind in (
+        *(INVALID_JSON, NOT_FOUND, METHOD_NOT_ALLOWED, BODY_TIMEOUT, BODY_TOO_LARGE),
+        UNSUPPORTED_MEDIA_TYPE,
+    )
 }
 
 
-def install_error_handlers(app: FastAPI) -> None:
+def install_error_handlers(app: FastAPI, metrics: Metrics) -> None:
     """Answer every error of ``app`` with a problem document; what is not foreseen, the middleware answers."""
+
+    def answer(request: Request, problem: ProblemError, headers: dict[str, str] | None = None) -> Response:
+        if problem.kind in REJECTIONS:
+            metrics.rejected(problem.kind.slug)
+        # OpenAI's clients show their users this member, and no other.
+        chat = request.url.path.startswith("/v1/chat/")
+        extension = {"message": problem.detail} if chat else {}
+        return problem_response(problem, request.state.request_id, headers, extension)
 
     @app.exception_handler(ProblemError)
     async def _problem(request: Request, error: ProblemError) -> Response:
-        return problem_response(error, request.state.request_id)
+        return answer(request, error)
 
     @app.exception_handler(RequestValidationError)
     async def _validation(request: Request, error: RequestValidationError) -> Response:
-        return problem_response(_from_validation(error), request.state.request_id)
+        return answer(request, from_validation(error))
 
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> Response:
         kind = _KIND_BY_STATUS.get(error.status_code, INTERNAL)
         problem = ProblemError(kind, _http_detail(kind, request, error))
-        return problem_response(problem, request.state.request_id, dict(error.headers or {}))
+        return answer(request, problem, dict(error.headers or {}))
 
 
-def problem_response(error: ProblemError, request_id: str, headers: dict[str, str] | None = None) -> Response:
-    """The answer to a request that ended with ``error``."""
+def problem_response(
+    error: ProblemError,
+    request_id: str,
+    headers: Mapping[str, str] | None = None,
+    extension: Mapping[str, str] | None = None,
+) -> Response:
+    """The answer to a request that ended with ``error``, its document with ``extension``."""
     kind = error.kind
-    document = Problem(
-        type=kind.type,
-        title=kind.title,
-        status=kind.status,
+    extra = dict(headers or {})
+    if error.retry_after_s is not None:
+        extra["Retry-After"] = str(error.retry_after_s)
+    if kind in (DRAINING, BODY_TIMEOUT):
+        extra["Connection"] = "close"
+    # Plain ASCII: details quote what callers sent, which need not be encodable otherwise.
+    document = problem_document(error, request_id).model_dump(exclude_defaults=True)
+    content = json.dumps(document | dict(extension or {}))
+    response = Response(content, kind.status, extra, media_type=PROBLEM_MEDIA_TYPE)
+    if kind is UNAUTHORIZED:
+        # A line for each: browsers look at the first word of a line only.
+        for scheme in ("Bearer", "Basic"):
+            response.headers.append("WWW-Authenticate", f'{scheme} realm="LookTwice"')
+    return response
+
+
+def problem_document(error: ProblemError, request_id: str) -> Problem:
+    """``error`` for the wire."""
+    return Problem(
+        type=error.kind.type,
+        title=error.kind.title,
+        status=error.kind.status,
         detail=error.detail,
         request_id=request_id,
         errors=list(error.errors),
     )
-    extra = dict(headers or {})
-    if kind in (NOT_READY, ENGINE_FAILED):
-        extra["Retry-After"] = str(RETRY_AFTER_S)
-    # Plain ASCII: details quote what callers sent, which need not be encodable otherwise.
-    content = json.dumps(document.model_dump(exclude_defaults=True))
-    return Response(content, kind.status, extra, media_type=PROBLEM_MEDIA_TYPE)
 
 
 def _http_detail(kind: Kind, request: Request, error: HTTPException) -> str:
@@ -100,9 +130,13 @@ def _http_detail(kind: Kind, request: Request, error: HTTPException) -> str:
     return str(error.detail)
 
 
-def _from_validation(error: RequestValidationError) -> ProblemError:
+def from_validation(error: RequestValidationError) -> ProblemError:
+    """The problem that a body has which breaks its schema."""
     if isinstance(error.body, bytes):
-        return ProblemError(UNSUPPORTED_MEDIA_TYPE, "send the body as application/json")
+        return ProblemError(
+            UNSUPPORTED_MEDIA_TYPE,
+            "send the body as application/json, application/msgpack or multipart/form-data",
+        )
     found = error.errors()
     first = found[0]
     if first["type"] == "json_invalid":
@@ -121,6 +155,8 @@ def _from_validation(error: RequestValidationError) -> ProblemError:
 
 def _kind(fault: dict[str, Any]) -> Kind:
     place = tuple(part for part in fault["loc"][1:] if isinstance(part, str))
+    if place[:1] == ("requests",):
+        place = place[1:]
     if fault["type"] == "extra_forbidden":
         return UNKNOWN_FIELD
     if place[:3] == ("scene", "clips", "camera") and fault["type"] == "literal_error":

@@ -65,7 +65,7 @@ def engine_request(
         given = asked.controls.prefill
         prefill = None if given is None else plan_of(given, "/controls/prefill")
         controls = _controls(asked.controls, prefill)
-    return PlanRequest(engine_id, scene_of(asked.scene), asked.format, controls)
+    return PlanRequest(engine_id, scene_of(asked.scene), asked.format, controls, live=asked.stream)
 
 
 def scene_of(asked: wire.Scene) -> Scene:
@@ -85,10 +85,10 @@ def scene_of(asked: wire.Scene) -> Scene:
         raise at(INVALID_CLIP, "/scene/clips", str(error)) from None
 
 
-def _images(encoded: Iterable[str], pointer: str) -> Iterable[bytes]:
-    for number, text in enumerate(encoded):
+def _images(given: Iterable[str | bytes], pointer: str) -> Iterable[bytes]:
+    for number, each in enumerate(given):
         try:
-            image = base64.b64decode(text, validate=True)
+            image = each if isinstance(each, bytes) else base64.b64decode(each, validate=True)
             check_image(image)
         except (ImageError, binascii.Error, ValueError) as error:
             problem = str(error) if isinstance(error, ImageError) else f"not base64: {error}"

@@ -1,68 +1,204 @@
-"""The engine's life within the service: started in the background, watched, stopped."""
+"""The engine's life within the service: started, watched, restarted, replaced, drained, stopped."""
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable, Generator
+from contextlib import contextmanager
+from typing import Final
 
 import structlog
 
-from model.engines.engine import Engine
+from model.engines.engine import Engine, Load, ModelCard
 from service.metrics import Metrics
-from service.problems import ENGINE_FAILED, NOT_READY, ProblemError
+from service.problems import (
+    CHECKPOINT_FAILED,
+    DRAINING,
+    ENGINE_FAILED,
+    NOT_READY,
+    SWAP_UNDER_WAY,
+    ProblemError,
+)
+
+_FIRST_WAIT_S: Final = 0.5
+_LONGEST_WAIT_S: Final = 30.0
+_HOPELESS: Final = 3
+"""Starts in a row that fail before the process says that only a restart of it can help."""
 
 log = structlog.stdlib.get_logger()
 
 
 class Lifecycle:
-    """Starts the engine without holding up the server, so that probes are answered meanwhile."""
+    """Keeps an engine running without holding up the server, so that probes are answered meanwhile.
 
-    def __init__(self, engine: Engine, metrics: Metrics) -> None:
-        self._engine = engine
-        self._metrics = metrics
-        self._starting: asyncio.Task[None] | None = None
-        self._ready = False
+    Args:
+        engine: not yet started.
+        metrics: where it shows what it does.
+        sleep: waits so many seconds between attempts to start.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        metrics: Metrics,
+        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+    ) -> None:
+        self._engine, self._metrics, self._sleep = engine, metrics, sleep
+        self._keeping: asyncio.Task[None] | None = None
+        self._retiring: set[asyncio.Task[None]] = set()
+        self._users: dict[int, int] = {}
+        self._nobody = asyncio.Event()
+        self._nobody.set()
+        self._ready = self._draining = self._swapping = False
+        self._failures, self._failure = 0, ""
 
     @property
-    def failure(self) -> str | None:
-        """Why the engine could not start; None while it is starting or runs."""
-        task = self._starting
-        if task is None or not task.done() or task.cancelled() or task.exception() is None:
-            return None
-        return str(task.exception())
+    def card(self) -> ModelCard:
+        """Of the engine that answers."""
+        return self._engine.card
+
+    @property
+    def load(self) -> Load:
+        """Of the engine that answers."""
+        return self._engine.load
 
     def begin(self) -> None:
         """Start the engine in the background."""
-        self._starting = asyncio.create_task(self._start(), name="engine start")
+        self._keeping = asyncio.create_task(self._keep(self._engine), name="engine")
 
     async def end(self) -> None:
-        """Stop the engine, also one that is still starting."""
-        self._ready = False
-        self._metrics.ready.set(0)
-        if self._starting is not None:
-            self._starting.cancel()
-            await asyncio.gather(self._starting, return_exceptions=True)
+        """Stop every engine, also one that is still starting."""
+        self._set_ready(False)
+        tasks = {task for task in (self._keeping, *self._retiring) if task is not None}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
         await self._engine.stop()
 
+    @contextmanager
+    def engine(self) -> Generator[Engine]:
+        """The engine that answers now, kept until the block ends even when it is replaced.
+
+        Raises:
+            ProblemError: no engine can answer.
+        """
+        self.check_ready()
+        engine = self._engine
+        self._users[id(engine)] = self._users.get(id(engine), 0) + 1
+        self._nobody.clear()
+        try:
+            yield engine
+        finally:
+            self._users[id(engine)] -= 1
+            if not self._users[id(engine)]:
+                del self._users[id(engine)]
+            if not self._users:
+                self._nobody.set()
+
+    def check_accepting(self) -> None:
+        """Raise `ProblemError` once the service is about to stop."""
+        if self._draining:
+            raise ProblemError(DRAINING, "ask another replica; this one finishes what it has accepted")
+
     def check_ready(self) -> None:
-        """Raise `ProblemError` unless the engine can plan."""
-        if self.failure is not None:
-            raise ProblemError(ENGINE_FAILED, f"the engine did not start: {self.failure}")
-        if not self._ready:
-            raise ProblemError(NOT_READY, "the model is loading and warming up")
+        """Raise `ProblemError` unless the engine can plan for new requests."""
+        self.check_accepting()
+        if self._ready:
+            return
+        if self._failure:
+            raise ProblemError(ENGINE_FAILED, f"the engine is being started again; it broke: {self._failure}")
+        raise ProblemError(NOT_READY, "the model is loading and warming up")
 
     def check_alive(self) -> None:
-        """Raise `ProblemError` when only a restart can help."""
-        if self.failure is not None:
-            raise ProblemError(ENGINE_FAILED, f"the engine did not start: {self.failure}")
+        """Raise `ProblemError` when only a restart of the process can help."""
+        if self._failures >= _HOPELESS:
+            raise ProblemError(
+                ENGINE_FAILED, f"the engine did not start {self._failures} times in a row: {self._failure}"
+            )
 
-    async def _start(self) -> None:
+    async def drain(self) -> None:
+        """Accept nothing more; returns when everything that was accepted is finished."""
+        self._draining = True
+        self._metrics.draining.set(1)
+        self._metrics.ready.set(0)
+        log.info("draining", requests=sum(self._users.values()))
+        await self._nobody.wait()
+
+    @contextmanager
+    def _swap(self) -> Generator[None]:
+        if self._swapping:
+            raise ProblemError(SWAP_UNDER_WAY, "wait until it answers, then ask again")
+        self._swapping = True
         try:
-            await self._engine.start()
-        except Exception:
-            log.exception("engine did not start")
-            raise
-        card = self._engine.card
-        self._metrics.model_loaded(card)
-        self._metrics.ready.set(1)
-        self._ready = True
-        log.info("ready", model=card.name, revision=card.revision, engine=card.engine)
+            yield
+        finally:
+            self._swapping = False
+
+    async def replace(self, make: Callable[[], Engine]) -> ModelCard:
+        """Let another engine answer; requests that run are finished by the one that has them.
+
+        Args:
+            make: loads the engine; called on a thread.
+
+        Raises:
+            ProblemError: it cannot be loaded or started; the one that answered still does.
+        """
+        self.check_ready()
+        with self._swap():
+            engine: Engine | None = None
+            try:
+                engine = await asyncio.to_thread(make)
+                await engine.start()
+            except Exception as error:
+                if engine is not None:
+                    await engine.stop()
+                self._metrics.checkpoint_swapped("failed")
+                log.warning("checkpoint refused", reason=str(error))
+                raise ProblemError(CHECKPOINT_FAILED, str(error)) from error
+            assert self._keeping is not None
+            old, keeping = self._engine, self._keeping
+            self._engine = engine
+            self._keeping = asyncio.create_task(self._keep(engine, started=True), name="engine")
+            retiring = asyncio.create_task(self._retire(old, keeping), name="old engine")
+            self._retiring.add(retiring)
+            retiring.add_done_callback(self._retiring.discard)
+            self._metrics.checkpoint_swapped("done")
+            return engine.card
+
+    async def _retire(self, engine: Engine, keeping: asyncio.Task[None]) -> None:
+        keeping.cancel()
+        await asyncio.gather(keeping, return_exceptions=True)
+        try:
+            while self._users.get(id(engine)):
+                await asyncio.sleep(0.05)
+        finally:
+            await engine.stop()
+        log.info("old engine stopped", revision=engine.card.revision)
+
+    async def _keep(self, engine: Engine, *, started: bool = False) -> None:
+        """Start the engine, and again whenever it breaks."""
+        wait_s = _FIRST_WAIT_S
+        while True:
+            try:
+                if not started:
+                    await engine.start()
+                started, wait_s, self._failures = False, _FIRST_WAIT_S, 0
+                self._metrics.model_loaded(engine.card)
+                self._set_ready(True)
+                card = engine.card
+                log.info("ready", model=card.name, revision=card.revision, engine=card.engine)
+                await engine.wait()
+                return
+            except Exception as error:  # whatever an engine dies of
+                self._failure = str(error)
+                self._failures += not self._ready
+                log.error("engine broke", reason=str(error), ready=self._ready, exc_info=error)
+            self._set_ready(False)
+            await engine.stop()
+            await self._sleep(wait_s)
+            wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+            self._metrics.engine_restarted()
+
+    def _set_ready(self, ready: bool) -> None:
+        self._ready = ready
+        self._metrics.ready.set(ready and not self._draining)

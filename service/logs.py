@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import sys
-from typing import Literal
+from typing import Final, Literal
 
 import structlog
+
+_LIBRARIES: Final = ("uvicorn", "uvicorn.error", "asyncio", "opentelemetry")
 
 
 def configure_logging(log_format: Literal["json", "console"]) -> None:
@@ -23,7 +27,29 @@ def configure_logging(log_format: Literal["json", "console"]) -> None:
             structlog.processors.TimeStamper(fmt="iso", utc=True),
             *rendering,
         ],
-        # Looked up for each line, so that a redirected standard error is honoured.
-        logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),
+        logger_factory=lambda *_: _StandardError(),
         cache_logger_on_first_use=False,
     )
+    for name in _LIBRARIES:
+        logger = logging.getLogger(name)
+        logger.handlers, logger.propagate = [_Handler(logging.WARNING)], False
+
+
+class _StandardError:
+    """Writes lines; one that cannot be written is lost, since planning must go on when a disk is full."""
+
+    def msg(self, line: str) -> None:
+        # Looked up for each line, so that a redirected standard error is honoured.
+        with contextlib.suppress(OSError, ValueError):
+            print(line, file=sys.stderr, flush=True)
+
+    debug = info = warning = error = critical = exception = msg
+
+
+class _Handler(logging.Handler):
+    """What libraries log, as events of ours."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        structlog.get_logger().log(
+            record.levelno, record.getMessage(), logger=record.name, exc_info=record.exc_info
+        )

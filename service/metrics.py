@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
 from model.driving.plan import plan_iou
-from model.engines.engine import Draw, ModelCard, Thinking
+from model.engines.engine import Draw, Load, ModelCard, Thinking
+from service.admission import Admission
 
 LATENCY_BUCKETS_S: Final = (
     *(0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.75),
     *(1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0, 60.0),
 )
 """Planners ask for tens of milliseconds; small CPUs take seconds."""
+QUEUE_BUCKETS_S: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 TOKEN_BUCKETS: Final = (1, 2, 5, 10, 20, 40, 60, 80, 100, 150, 200, 300, 500)
 PROBABILITY_BUCKETS: Final = tuple(step / 10 for step in range(1, 11))
 
@@ -46,7 +48,56 @@ class Metrics:
         self.plans_in_flight = Gauge(
             "looktwice_plans_in_flight", "Scenes the engine is planning for.", registry=registry
         )
-        self.ready = Gauge("looktwice_ready", "1 once the engine has warmed up.", registry=registry)
+        self.ready = Gauge("looktwice_ready", "1 while requests can be served.", registry=registry)
+        self.draining = Gauge(
+            "looktwice_draining", "1 while the service finishes what it has accepted.", registry=registry
+        )
+        self._rejections = Counter(
+            "looktwice_rejections",
+            "Requests that were not served, by the problem that their callers were told.",
+            ["reason"],
+            registry=registry,
+        )
+        self._queue = Histogram(
+            "looktwice_queue_seconds",
+            "From a scene's acceptance to its place in the engine.",
+            buckets=QUEUE_BUCKETS_S,
+            registry=registry,
+        )
+        self._engine = Histogram(
+            "looktwice_engine_seconds",
+            "In the engine, its queue included.",
+            ["endpoint"],
+            buckets=LATENCY_BUCKETS_S,
+            registry=registry,
+        )
+        self._passes = Histogram(
+            "looktwice_response_passes",
+            "Passes through the network for a draw, its prompt apart.",
+            buckets=TOKEN_BUCKETS,
+            registry=registry,
+        )
+        self._response_tokens = Counter(
+            "looktwice_response_tokens",
+            "Tokens of draws: forced by the format, or free.",
+            ["choice"],
+            registry=registry,
+        )
+        self._deadlines = Counter(
+            "looktwice_deadlines",
+            "Answers with a deadline, by whether they were finished in time.",
+            ["outcome"],
+            registry=registry,
+        )
+        self._restarts = Counter(
+            "looktwice_engine_restarts", "Engines that broke and were started again.", registry=registry
+        )
+        self._swaps = Counter(
+            "looktwice_checkpoint_swaps",
+            "Checkpoints that were to replace the one that answers.",
+            ["outcome"],
+            registry=registry,
+        )
         self._model = Gauge(
             "looktwice_model_info", "What is loaded.", ["name", "revision", "engine"], registry=registry
         )
@@ -91,8 +142,56 @@ class Metrics:
         self._requests.labels(endpoint, method, str(status)).inc()
         self._latency.labels(endpoint).observe(seconds)
 
+    def watch(self, engine_load: Callable[[], Load], admission: Admission) -> None:
+        """Read what is full, and of what, whenever Prometheus asks."""
+
+        def gauge(name: str, text: str, value: Callable[[], float]) -> None:
+            Gauge(name, text, registry=self.registry).set_function(value)
+
+        gauge("looktwice_kv_rows", "Draws that the engine has memory for.", lambda: engine_load().rows)
+        gauge(
+            "looktwice_kv_rows_used",
+            "Draws that its memory is reserved for.",
+            lambda: engine_load().rows_used,
+        )
+        gauge(
+            "looktwice_capacity_draws",
+            "Draws that are accepted at once at most.",
+            lambda: admission.draws,
+        )
+        gauge(
+            "looktwice_queue_scenes",
+            "Scenes accepted that the engine has not begun with.",
+            lambda: len(admission.waiting),
+        )
+        gauge(
+            "looktwice_queue_draws",
+            "Draws accepted that the engine has not begun with.",
+            lambda: sum(place.draws for place in admission.waiting),
+        )
+
+    def rejected(self, reason: str) -> None:
+        """Count a request that was not served; ``reason`` is the problem's slug."""
+        self._rejections.labels(reason).inc()
+
+    def answered(self, endpoint: str, queue_s: float, engine_s: float, deadline_met: bool | None) -> None:
+        """Count one scene that was planned for."""
+        self._queue.observe(queue_s)
+        self._engine.labels(endpoint).observe(engine_s)
+        if deadline_met is not None:
+            self._deadlines.labels("met" if deadline_met else "missed").inc()
+
+    def engine_restarted(self) -> None:
+        """Count an engine that broke and runs again."""
+        self._restarts.inc()
+
+    def checkpoint_swapped(self, outcome: str) -> None:
+        """Count an attempt to replace the checkpoint."""
+        self._swaps.labels(outcome).inc()
+
     def model_loaded(self, card: ModelCard) -> None:
         """Show which weights answer."""
+        self._model.clear()
         self._model.labels(card.name, card.revision, card.engine).set(1)
 
     def label_asked(self, teacher: str, failed: Iterable[str], *, written: bool) -> None:
@@ -111,3 +210,6 @@ class Metrics:
             self._think_probability.observe(draw.think_probability)
         for section, tokens in draw.tokens.items():
             self._tokens.labels(section).observe(tokens)
+        self._passes.observe(draw.passes)
+        self._response_tokens.labels("free").inc(draw.chosen)
+        self._response_tokens.labels("forced").inc(sum(draw.tokens.values()) - draw.chosen)

@@ -14,7 +14,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from clients.wire import REQUEST_ID_HEADER
 from service.errors import problem_response
 from service.metrics import Metrics
-from service.problems import INTERNAL, ProblemError
+from service.problems import unforeseen
+from service.traces import Traces
 
 _SANE_REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._:-]{1,128}")
 _QUIET: Final = frozenset({"/healthz", "/readyz", "/metrics"})
@@ -27,9 +28,8 @@ log = structlog.stdlib.get_logger()
 class Around:
     """Pure ASGI, so that answers stream and the disconnect message reaches the routes."""
 
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        self._app = app
-        self._metrics = metrics
+    def __init__(self, app: ASGIApp, metrics: Metrics, traces: Traces) -> None:
+        self._app, self._metrics, self._traces = app, metrics, traces
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection; anything but HTTP passes through."""
@@ -38,9 +38,9 @@ class Around:
             return
         given = Headers(scope=scope).get(REQUEST_ID_HEADER, "")
         request_id = given if _SANE_REQUEST_ID.fullmatch(given) else secrets.token_hex(8)
-        scope.setdefault("state", {})["request_id"] = request_id
+        began_s = time.monotonic()
+        scope.setdefault("state", {}).update(request_id=request_id, since_s=began_s)
         status = 0
-        began = time.perf_counter()
 
         async def send_with_id(message: Message) -> None:
             nonlocal status
@@ -49,23 +49,25 @@ class Around:
                 MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
             await send(message)
 
-        with structlog.contextvars.bound_contextvars(request_id=request_id):
+        method = scope["method"] if scope["method"] in _METHODS else "other"
+        with (
+            structlog.contextvars.bound_contextvars(request_id=request_id),
+            self._traces.request(method, scope["path"], Headers(scope=scope)) as span,
+        ):
             try:
                 await self._app(scope, receive, send_with_id)
             except Exception:
                 log.exception("request failed")
                 if status:  # too late for another answer; the server breaks the connection
                     raise
-                problem = ProblemError(
-                    INTERNAL, "an unforeseen error; the service's log has it by request id"
-                )
-                await problem_response(problem, request_id)(scope, receive, send_with_id)
+                await problem_response(unforeseen(), request_id)(scope, receive, send_with_id)
             finally:
-                self._account(scope, status, time.perf_counter() - began)
+                if span is not None:
+                    span.set_attribute("http.response.status_code", status)
+                self._account(scope, method, status, time.monotonic() - began_s)
 
-    def _account(self, scope: Scope, status: int, seconds: float) -> None:
+    def _account(self, scope: Scope, method: str, status: int, seconds: float) -> None:
         endpoint = getattr(scope.get("route"), "path", _NO_ROUTE)
-        method = scope["method"] if scope["method"] in _METHODS else "other"
         self._metrics.request_answered(endpoint, method, status, seconds)
         if endpoint not in _QUIET:
             log.info(

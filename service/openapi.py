@@ -5,8 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import FastAPI
+from pydantic import BaseModel
 
-from clients.wire import PROBLEM_MEDIA_TYPE, Problem
+from clients.wire import (
+    MSGPACK_MEDIA_TYPE,
+    MULTIPART_MEDIA_TYPE,
+    PROBLEM_MEDIA_TYPE,
+    REQUEST_PART,
+    Problem,
+)
+from service.auth import OPEN_PATHS
 from service.problems import INTERNAL, Kind
 
 Responses = dict[int | str, dict[str, Any]]
@@ -29,16 +37,39 @@ def problems(*kinds: Kind) -> Responses:
     }
 
 
-def describe(app: FastAPI) -> None:
-    """Make ``app`` describe problems as ``application/problem+json``; FastAPI files models under JSON."""
+def payloads(body: type[BaseModel]) -> dict[str, Any]:
+    """What a route adds to its description for bodies that are not JSON."""
+    schema = {"$ref": f"#/components/schemas/{body.__name__}"}
+    parts = {
+        "type": "object",
+        "properties": {REQUEST_PART: schema},
+        "required": [REQUEST_PART],
+        "additionalProperties": {"type": "string", "format": "binary"},
+    }
+    content = {MSGPACK_MEDIA_TYPE: {"schema": schema}, MULTIPART_MEDIA_TYPE: {"schema": parts}}
+    return {"requestBody": {"content": content}}
+
+
+def describe(app: FastAPI, *, keys: bool) -> None:
+    """Make ``app`` describe problems as ``application/problem+json``; FastAPI files models under JSON.
+
+    Args:
+        app: with all its routes.
+        keys: whether it takes none but those with a key.
+    """
     generate = app.openapi
 
     def openapi() -> dict[str, Any]:
         if app.openapi_schema is None:
             description = generate()
-            for path in description["paths"].values():
-                for operation in path.values():
+            for path, operations in description["paths"].items():
+                for operation in operations.values():
                     _move_problems(operation["responses"])
+                    if keys and path not in OPEN_PATHS:
+                        operation["security"] = [{"key": []}]
+            if keys:
+                scheme = {"type": "http", "scheme": "bearer"}
+                description["components"]["securitySchemes"] = {"key": scheme}
             for unused in ("HTTPValidationError", "ValidationError"):
                 description["components"]["schemas"].pop(unused, None)
         return generate()

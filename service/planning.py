@@ -1,18 +1,20 @@
-"""One planning request, from the parsed body to the answer."""
+"""One scene on its way through the service: let in, checked, decoded, told of as it is written."""
 
 from __future__ import annotations
 
 import asyncio
 import secrets
 import time
-from collections.abc import Awaitable, Callable
-from typing import Final, NamedTuple
+from collections.abc import AsyncGenerator, Generator
+from contextlib import ExitStack, aclosing, contextmanager
+from dataclasses import dataclass, replace
+from typing import Final
 
 import structlog
 
 import clients.wire as wire
 from model.driving.images import ImageError
-from model.driving.plan import Plan, PlanError, plan_changes, plan_iou
+from model.driving.plan import PlanError
 from model.driving.scene import SceneError
 from model.engines.engine import (
     DraftFinished,
@@ -20,218 +22,220 @@ from model.engines.engine import (
     DrawFinished,
     Engine,
     EngineError,
+    Event,
     ModelCard,
     PlanRequest,
     RequestError,
+    Started,
 )
+from service.admission import Admission, Full, Place, whole_seconds
 from service.intake import engine_request
+from service.lifecycle import Lifecycle
 from service.metrics import Metrics
-from service.problems import ENGINE_FAILED, INVALID_IMAGE, REFUSED, ProblemError
+from service.problems import (
+    DECODE_TIMEOUT,
+    ENGINE_FAILED,
+    INVALID_IMAGE,
+    QUEUE_FULL,
+    QUEUE_TIMEOUT,
+    RATE_LIMITED,
+    REFUSED,
+    ProblemError,
+)
+from service.rates import RateLimited, Rates
+from service.traces import Traces
 
-_DECIMALS: Final = 4
-"""Of poses on the wire: a tenth of a millimetre."""
+_ANSWERING_MS: Final = 3
+"""Of a deadline, left for writing the answer."""
+
+Asked = wire.PlanRequest | wire.ReflectRequest
 
 log = structlog.stdlib.get_logger()
 
 
-class Drawn(NamedTuple):
-    """A draw, and the direct trajectory that was ready before its reflection was, if there was one."""
+@dataclass(frozen=True)
+class Arrival:
+    """When and as what a request came.
 
-    draw: Draw
-    draft: Draw | None
-
-
-class CallerLeft(Exception):
-    """The caller closed the connection before the answer was ready."""
-
-
-async def answer(
-    asked: wire.PlanRequest,
-    engine: Engine,
-    metrics: Metrics,
-    request_id: str,
-    caller_leaves: Callable[[], Awaitable[None]],
-) -> wire.PlanResponse:
-    """Plan for one scene.
-
-    Args:
-        asked: the parsed body.
-        engine: a started engine.
-        metrics: where draws are counted.
-        request_id: the caller's id for the request.
-        caller_leaves: returns when the caller has gone; the engine's work is then dropped.
-
-    Raises:
-        ProblemError: the request cannot be served; the engine failed.
-        CallerLeft: nobody waits for the answer.
+    Attributes:
+        request_id: the caller's, or made here.
+        owner: whose key it came with.
+        since_s: when its headers were there, on `time.monotonic`.
     """
-    drawn, timing = await _decode(asked, engine, metrics, request_id, caller_leaves)
-    return wire.PlanResponse(
-        request_id=request_id, model=_model(engine), draws=[_draw(*each) for each in drawn], timing=timing()
-    )
+
+    request_id: str
+    owner: str
+    since_s: float
 
 
-async def reflect(
-    asked: wire.ReflectRequest,
-    engine: Engine,
-    metrics: Metrics,
-    request_id: str,
-    caller_leaves: Callable[[], Awaitable[None]],
-) -> wire.ReflectResponse:
-    """Look at a given plan; see `answer`."""
-    drawn, timing = await _decode(asked, engine, metrics, request_id, caller_leaves)
-    first = drawn[0].draw
-    if first.plan is None or first.think_probability is None:
-        raise ProblemError(REFUSED, f"responses in the format {asked.format} hold no plan to reflect upon")
-    return wire.ReflectResponse(
-        request_id=request_id,
-        model=_model(engine),
-        plan=wire_plan(first.plan),
-        think_probability=first.think_probability,
-        draws=[_reflection(first.plan, draw) for draw, _ in drawn],
-        timing=timing(),
-    )
+@dataclass(frozen=True)
+class Planned:
+    """A scene that was planned for.
+
+    Attributes:
+        draws: in order.
+        drafts: direct trajectories that were ready before the reflections of their draws, by index.
+        card: the model that answered.
+        timing: where the time went.
+        deadline: what became of it; None where none was set.
+    """
+
+    draws: tuple[Draw, ...]
+    drafts: dict[int, Draw]
+    card: ModelCard
+    timing: wire.Timing
+    deadline: wire.Deadline | None
 
 
-async def _decode(
-    asked: wire.PlanRequest | wire.ReflectRequest,
-    engine: Engine,
-    metrics: Metrics,
-    request_id: str,
-    caller_leaves: Callable[[], Awaitable[None]],
-) -> tuple[list[Drawn], Callable[[], wire.Timing]]:
-    """The draws of a request, and what tells the time that it has taken when the answer is made."""
-    began = time.perf_counter()
-    engine_id = f"{request_id}/{secrets.token_hex(4)}"
-    # On a thread: megabytes of base64 must not hold up the answers of others.
-    request = await asyncio.to_thread(engine_request, asked, engine.card, engine_id)
-    checked = time.perf_counter()
-    with metrics.plans_in_flight.track_inprogress():
-        drawn = await _while_wanted(_draws(engine, request), caller_leaves)
-    finished = time.perf_counter()
-    endpoint = "reflect" if isinstance(asked, wire.ReflectRequest) else "plan"
-    for draw, _ in drawn:
-        metrics.draw_finished(draw, request.controls.thinking, endpoint)
+@dataclass(frozen=True)
+class Limits:
+    """How long a scene may take, in s: until it begins, and from then on."""
 
-    def timing() -> wire.Timing:
-        return wire.Timing(
-            total_ms=_ms(time.perf_counter() - began),
-            checks_ms=_ms(checked - began),
-            engine_ms=_ms(finished - checked),
-        )
-
-    return drawn, timing
+    queue_s: float
+    decode_s: float
 
 
-def _model(engine: Engine) -> wire.ModelName:
-    return wire.ModelName(name=engine.card.name, revision=engine.card.revision)
+class Planning:
+    """Takes scenes to the engine; one for the whole service."""
+
+    def __init__(
+        self,
+        lifecycle: Lifecycle,
+        admission: Admission,
+        rates: Rates,
+        metrics: Metrics,
+        traces: Traces,
+        limits: Limits,
+    ) -> None:
+        self._lifecycle, self._admission, self._rates = lifecycle, admission, rates
+        self._metrics, self._traces, self._limits = metrics, traces, limits
+
+    def check_open(self) -> None:
+        """Raise `ProblemError` where nothing could be accepted now; asked before a body is read."""
+        self._lifecycle.check_ready()
+        with _full_as_problem():
+            self._admission.check_open()
+
+    async def spend(self, owner: str, draws: int) -> None:
+        """Count what ``owner`` asks for; raises `ProblemError` where it is too much."""
+        try:
+            await self._rates.spend(owner, draws)
+        except RateLimited as error:
+            wait_s = None if error.retry_after_s is None else whole_seconds(error.retry_after_s)
+            raise ProblemError(RATE_LIMITED, str(error), retry_after_s=wait_s) from None
+
+    async def events(self, asked: Asked, arrival: Arrival) -> AsyncGenerator[Event | Planned]:
+        """What happens to a scene, at last the whole of it; closing it early frees everything.
+
+        Raises:
+            ProblemError: at the first iteration where it is not let in; later where it fails.
+        """
+        with ExitStack() as stack:
+            with _full_as_problem():
+                place = stack.enter_context(self._admission.place(asked.controls.n))
+            async with aclosing(self._plan(asked, arrival, place)) as events:
+                async for event in events:
+                    yield event
+
+    async def in_turn(self, asked: Asked, arrival: Arrival) -> Planned:
+        """A scene of a batch, which waits for its place; raises `ProblemError`."""
+        async with self._admission.place_in_turn(asked.controls.n) as place:
+            return await last(self._plan(asked, arrival, place))
+
+    async def _plan(self, asked: Asked, arrival: Arrival, place: Place) -> AsyncGenerator[Event | Planned]:
+        endpoint = "reflect" if isinstance(asked, wire.ReflectRequest) else "plan"
+        draws, drafts = list[Draw](), dict[int, Draw]()
+        with self._lifecycle.engine() as engine, self._traces.planning(asked, engine.card) as span:
+            checking_s = time.monotonic()
+            request = await self._checked(asked, engine.card, arrival)
+            submitted_s = began_s = time.monotonic()
+            with self._metrics.plans_in_flight.track_inprogress():
+                async with aclosing(self._decode(engine, request)) as events:
+                    async for event in events:
+                        if isinstance(event, Started):
+                            place.began()
+                            began_s = time.monotonic()
+                        elif isinstance(event, DraftFinished):
+                            drafts[event.draw.index] = event.draw
+                        elif isinstance(event, DrawFinished):
+                            draws.append(event.draw)
+                        yield event
+            finished_s = time.monotonic()
+            draws.sort(key=lambda draw: draw.index)
+            deadline_met = _met(asked.controls.deadline_ms, arrival)
+            for draw in draws:
+                self._metrics.draw_finished(draw, request.controls.thinking, endpoint)
+            self._metrics.answered(endpoint, began_s - submitted_s, finished_s - submitted_s, deadline_met)
+            span.drew(draws)
+            timing = wire.Timing(
+                total_ms=_ms(finished_s - arrival.since_s),
+                checks_ms=_ms(submitted_s - checking_s),
+                engine_ms=_ms(finished_s - submitted_s),
+                queue_ms=_ms(began_s - submitted_s),
+            )
+            deadline = None
+            if deadline_met is not None:
+                cut = [draw.index for draw in draws if draw.cut is not None]
+                deadline = wire.Deadline(met=deadline_met, cut=cut)
+            yield Planned(tuple(draws), drafts, engine.card, timing, deadline)
+
+    async def _checked(self, asked: Asked, card: ModelCard, arrival: Arrival) -> PlanRequest:
+        engine_id = f"{arrival.request_id}/{secrets.token_hex(4)}"
+        # On a thread: megabytes of base64 must not hold up the answers of others.
+        request = await asyncio.to_thread(engine_request, asked, card, engine_id)
+        if (deadline_ms := request.controls.deadline_ms) is None:
+            return request
+        left_ms = deadline_ms - round(1000 * (time.monotonic() - arrival.since_s)) - _ANSWERING_MS
+        return replace(request, controls=replace(request.controls, deadline_ms=max(1, left_ms)))
+
+    async def _decode(self, engine: Engine, request: PlanRequest) -> AsyncGenerator[Event]:
+        """The engine's events under the limits of time, its errors as problems."""
+        loop = asyncio.get_running_loop()
+        late, limit_s = QUEUE_TIMEOUT, self._limits.queue_s
+        ends_s = loop.time() + limit_s
+        try:
+            async with aclosing(engine.submit(request)) as events:
+                while True:
+                    async with asyncio.timeout_at(ends_s):
+                        event = await anext(events, None)
+                    if event is None:
+                        return
+                    if isinstance(event, Started):
+                        late, limit_s = DECODE_TIMEOUT, self._limits.decode_s
+                        ends_s = loop.time() + limit_s
+                    yield event
+        except TimeoutError:
+            raise ProblemError(late, f"it was given up after {limit_s:g} s") from None
+        except ImageError as error:
+            raise ProblemError(INVALID_IMAGE, str(error)) from error
+        except (RequestError, SceneError, PlanError) as error:
+            raise ProblemError(REFUSED, str(error)) from error
+        except EngineError as error:
+            log.error("engine failed", exc_info=error)
+            raise ProblemError(ENGINE_FAILED, str(error)) from error
 
 
-def model_card(card: ModelCard) -> wire.ModelCard:
-    """A model card for the wire."""
-    return wire.ModelCard(
-        name=card.name,
-        revision=card.revision,
-        engine=card.engine,
-        formats=list(card.formats),
-        cameras=list(card.cameras),
-        image_size=list(card.image_size),
-        parameters=card.parameters,
-        details=dict(card.details),
-    )
+async def last(events: AsyncGenerator[Event | Planned]) -> Planned:
+    """The whole of a scene, once it is there."""
+    async with aclosing(events):
+        async for event in events:
+            if isinstance(event, Planned):
+                return event
+    raise AssertionError("a scene ended without its draws")
 
 
-async def _draws(engine: Engine, request: PlanRequest) -> list[Drawn]:
-    drafts: dict[int, Draw] = {}
-    draws: list[Draw] = []
+@contextmanager
+def _full_as_problem() -> Generator[None]:
     try:
-        async for event in engine.submit(request):
-            if isinstance(event, DraftFinished):
-                drafts[event.draw.index] = event.draw
-            elif isinstance(event, DrawFinished):
-                draws.append(event.draw)
-    except ImageError as error:
-        raise ProblemError(INVALID_IMAGE, str(error)) from error
-    except (RequestError, SceneError, PlanError) as error:
-        raise ProblemError(REFUSED, str(error)) from error
-    except EngineError as error:
-        log.exception("engine failed")
-        raise ProblemError(ENGINE_FAILED, str(error)) from error
-    except asyncio.CancelledError:
-        engine.cancel(request.request_id)
-        raise
-    return [Drawn(draw, drafts.get(draw.index)) for draw in sorted(draws, key=lambda draw: draw.index)]
+        yield
+    except Full as full:
+        raise ProblemError(QUEUE_FULL, str(full), retry_after_s=whole_seconds(full.retry_after_s)) from None
 
 
-async def _while_wanted(
-    work: Awaitable[list[Drawn]], caller_leaves: Callable[[], Awaitable[None]]
-) -> list[Drawn]:
-    working = asyncio.ensure_future(work)
-    leaving = asyncio.ensure_future(caller_leaves())
-    try:
-        await asyncio.wait((working, leaving), return_when=asyncio.FIRST_COMPLETED)
-        if working.done():
-            return working.result()
-        raise CallerLeft
-    finally:
-        working.cancel()
-        leaving.cancel()
-        await asyncio.gather(working, leaving, return_exceptions=True)
-
-
-def _draw(draw: Draw, draft: Draw | None) -> wire.Draw:
-    return wire.Draw(
-        index=draw.index,
-        plan=None if draw.plan is None else wire_plan(draw.plan),
-        branch=draw.branch,
-        think_probability=draw.think_probability,
-        thinking=draw.thinking,
-        revised_plan=None if draw.revised_plan is None else wire_plan(draw.revised_plan),
-        trajectory=_trajectory(draw),
-        draft_trajectory=None if draft is None or draw.thinking is None else _trajectory(draft),
-        tokens=dict(draw.tokens),
-    )
-
-
-def _reflection(given: Plan, draw: Draw) -> wire.Reflection:
-    revised = draw.revised_plan or given
-    changes = [
-        wire.PlanChange(
-            group=change.group,
-            start_s=change.start / 10,
-            end_s=change.end / 10,
-            proposed=change.before,
-            revised=change.after,
-        )
-        for change in plan_changes(given, revised)
-    ]
-    return wire.Reflection(
-        index=draw.index,
-        decision="revise" if changes else "keep",
-        thinking=draw.thinking,
-        revised_plan=None if draw.revised_plan is None else wire_plan(draw.revised_plan),
-        plan_iou=plan_iou(given, revised),
-        changes=changes,
-        trajectory=_trajectory(draw),
-        tokens=dict(draw.tokens),
-    )
-
-
-def _trajectory(draw: Draw) -> list[list[float]]:
-    rows: list[list[float]] = draw.trajectory.astype(float).round(_DECIMALS).tolist()
-    return rows
-
-
-def wire_plan(plan: Plan) -> wire.Plan:
-    """A plan for the wire."""
-    tracks = {
-        group: [
-            wire.MetaAction(start_s=action.start / 10, end_s=action.end / 10, word=action.word)
-            for action in track
-        ]
-        for group, track in plan.tracks()
-    }
-    return wire.Plan(text=str(plan), tracks=wire.Tracks(**tracks))
+def _met(deadline_ms: int | None, arrival: Arrival) -> bool | None:
+    if deadline_ms is None:
+        return None
+    return 1000 * (time.monotonic() - arrival.since_s) <= deadline_ms
 
 
 def _ms(seconds: float) -> float:

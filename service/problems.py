@@ -26,9 +26,15 @@ class Kind:
 
 
 INVALID_JSON: Final = Kind("invalid-json", 400, "The body is not JSON")
+INVALID_BODY: Final = Kind("invalid-body", 400, "The body cannot be read")
+UNAUTHORIZED: Final = Kind("unauthorized", 401, "This needs a key")
 NOT_FOUND: Final = Kind("not-found", 404, "There is nothing here")
+FORBIDDEN: Final = Kind("forbidden", 403, "This key does not open this")
+UNKNOWN_CHECKPOINT: Final = Kind("unknown-checkpoint", 404, "There is no such checkpoint")
 UNKNOWN_SCENE: Final = Kind("unknown-scene", 404, "There is no such scene")
 METHOD_NOT_ALLOWED: Final = Kind("method-not-allowed", 405, "This method is not allowed here")
+BODY_TIMEOUT: Final = Kind("body-timeout", 408, "The body came too slowly")
+SWAP_UNDER_WAY: Final = Kind("swap-under-way", 409, "Another checkpoint is being loaded")
 BODY_TOO_LARGE: Final = Kind("body-too-large", 413, "The body is too large")
 UNSUPPORTED_MEDIA_TYPE: Final = Kind("unsupported-media-type", 415, "The body is of a type not taken here")
 INVALID_REQUEST: Final = Kind("invalid-request", 422, "The request breaks the contract")
@@ -44,18 +50,35 @@ INVALID_PLAN: Final = Kind("invalid-plan", 422, "The given plan breaks the plan 
 UNKNOWN_FORMAT: Final = Kind("unknown-format", 422, "The model does not write this response format")
 REFUSED: Final = Kind("request-refused", 422, "The model cannot serve this request")
 INVALID_SCENE_FILE: Final = Kind("invalid-scene-file", 422, "This is not a scene file of this version")
+IDEMPOTENCY_KEY_REUSED: Final = Kind(
+    "idempotency-key-reused", 422, "The idempotency key came with another request before"
+)
+QUEUE_FULL: Final = Kind("queue-full", 429, "The service has as much to do as it accepts")
+RATE_LIMITED: Final = Kind("rate-limited", 429, "The caller has asked for as much as is allowed")
 INTERNAL: Final = Kind("internal", 500, "The service failed")
 NEEDS_ANNOTATIONS: Final = Kind("needs-annotations", 422, "The teacher needs what the request lacks")
 LABEL_REFUSED: Final = Kind("label-refused", 502, "None of the teacher's answers passed the checks")
 TEACHER_AWAY: Final = Kind("teacher-away", 503, "The teacher does not answer")
 SCENES_UNREADABLE: Final = Kind("scenes-unreadable", 500, "The bundled scenes cannot be read")
 NOT_READY: Final = Kind("not-ready", 503, "The model is not ready")
+DRAINING: Final = Kind("draining", 503, "The service is about to stop")
 ENGINE_FAILED: Final = Kind("engine-failed", 503, "The engine failed")
+QUEUE_TIMEOUT: Final = Kind("queue-timeout", 503, "The request waited too long for its turn")
+DECODE_TIMEOUT: Final = Kind("decode-timeout", 504, "Decoding took too long")
+CHECKPOINT_FAILED: Final = Kind("checkpoint-failed", 422, "The checkpoint cannot be served")
 
 KINDS: Final = tuple(value for value in list(globals().values()) if isinstance(value, Kind))
 """All of them, in the table's order."""
 
 RETRY_AFTER_S: Final = 1
+"""Where nothing better is known."""
+REJECTIONS: Final = frozenset(
+    (
+        *(UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE, QUEUE_FULL, RATE_LIMITED),
+        *(NOT_READY, DRAINING, ENGINE_FAILED, QUEUE_TIMEOUT, DECODE_TIMEOUT),
+    )
+)
+"""Requests that may have been right and were not served."""
 
 
 class ProblemError(Exception):
@@ -65,11 +88,21 @@ class ProblemError(Exception):
         kind: which problem.
         detail: what is wrong here, and what to change.
         errors: the places in the body that are wrong.
+        retry_after_s: whole seconds after which the same request may succeed; None where it never will.
     """
 
-    def __init__(self, kind: Kind, detail: str, errors: Sequence[Fault] = ()) -> None:
+    def __init__(
+        self, kind: Kind, detail: str, errors: Sequence[Fault] = (), retry_after_s: int | None = None
+    ) -> None:
         super().__init__(detail)
         self.kind, self.detail, self.errors = kind, detail, tuple(errors)
+        waits = retry_after_s is None and kind.status == 503
+        self.retry_after_s = RETRY_AFTER_S if waits else retry_after_s
+
+
+def unforeseen() -> ProblemError:
+    """What a caller is told of a defect: nothing but where it is written down."""
+    return ProblemError(INTERNAL, "an unforeseen error; the service's log has it by request id")
 
 
 def at(

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import prometheus_client
-from fastapi import APIRouter, Body, Request
-from fastapi.openapi.models import Example
+from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 import clients.wire as wire
-from clients.labelling.teachers.teacher import Teacher
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
-from model.engines.engine import Engine
-from service.examples import example_reflection, example_request
+from service.answers import model_card
+from service.auth import NOBODY
 from service.labelling import label, teacher_name
-from service.lifecycle import Lifecycle
-from service.metrics import Metrics
-from service.openapi import Responses, problems
-from service.planning import CallerLeft, answer, model_card, reflect
+from service.openai_routes import openai_router
+from service.openapi import Responses, payloads, problems
+from service.parts import Parts
+from service.payloads import payload_route
+from service.planning_routes import arrival_of, planning_router, respond
 from service.problems import (
+    BODY_TIMEOUT,
     BODY_TOO_LARGE,
+    CHECKPOINT_FAILED,
+    DRAINING,
     ENGINE_FAILED,
+    FORBIDDEN,
+    INVALID_BODY,
     INVALID_CLIP,
-    INVALID_CONTROLS,
     INVALID_HISTORY,
     INVALID_IMAGE,
     INVALID_JSON,
@@ -35,107 +35,92 @@ from service.problems import (
     INVALID_ROUTE,
     INVALID_SCENE_FILE,
     LABEL_REFUSED,
-    MISSING_CAMERA,
     NEEDS_ANNOTATIONS,
     NOT_READY,
-    REFUSED,
+    RATE_LIMITED,
     SCENES_UNREADABLE,
+    SWAP_UNDER_WAY,
     TEACHER_AWAY,
+    UNAUTHORIZED,
     UNKNOWN_CAMERA,
+    UNKNOWN_CHECKPOINT,
     UNKNOWN_FIELD,
-    UNKNOWN_FORMAT,
     UNKNOWN_SCENE,
     UNSUPPORTED_MEDIA_TYPE,
     ProblemError,
 )
-from service.settings import Settings
 from service.views import BundledScenes, scenes_of_file, view
 
-CALLER_LEFT_STATUS = 499
-"""Nobody reads it; logs and metrics show it."""
+NOT_NOW = (NOT_READY, DRAINING, ENGINE_FAILED)
 METRICS_TEXT: Responses = {200: {"description": "Prometheus text", "content": {"text/plain": {}}}}
-EXAMPLES: dict[str, Example] = {"straight on": {"value": example_request((FRONT_WIDE, FRONT_TELE))}}
-
-
-REFLECT_EXAMPLES: dict[str, Example] = {
-    "is it right to go on?": {"value": example_reflection((FRONT_WIDE, FRONT_TELE))}
-}
-
-_Asked = TypeVar("_Asked")
-_Work = Callable[[_Asked, Engine, Metrics, str, Callable[[], Awaitable[None]]], Awaitable[Any]]
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What the endpoints work with."""
-
-    engine: Engine
-    settings: Settings
-    metrics: Metrics
-    lifecycle: Lifecycle
-    teacher: Teacher
 
 
 def make_router(parts: Parts) -> APIRouter:
     """All endpoints but the inspector page."""
     router = APIRouter()
-    _add_planning(router, parts)
+    router.include_router(planning_router(parts))
+    router.include_router(openai_router(parts))
+    _add_labelling(router, parts)
+    _add_models(router, parts)
     _add_probes(router, parts)
     _add_scenes(router, parts)
     return router
 
 
-def _add_planning(router: APIRouter, parts: Parts) -> None:
-    refusals = problems(
-        *(INVALID_JSON, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE, INVALID_REQUEST, UNKNOWN_FIELD),
-        *(INVALID_CLIP, UNKNOWN_CAMERA, MISSING_CAMERA, INVALID_IMAGE, INVALID_HISTORY, INVALID_ROUTE),
-        *(INVALID_CONTROLS, INVALID_PLAN, UNKNOWN_FORMAT, REFUSED, NOT_READY, ENGINE_FAILED),
-    )
+def _add_labelling(router: APIRouter, parts: Parts) -> None:
+    labelling = APIRouter(route_class=payload_route(parts.lifecycle.check_accepting))
 
-    @router.post("/v1/plan", tags=["planning"], response_model=wire.PlanResponse, responses=refusals)
-    async def plan(request: Request, asked: wire.PlanRequest = Body(openapi_examples=EXAMPLES)) -> Any:
-        """One scene: per draw a plan, the branch, a second look where one was taken, a trajectory."""
-        return await _while_connected(request, parts, asked, answer)
-
-    @router.post("/v1/reflect", tags=["planning"], response_model=wire.ReflectResponse, responses=refusals)
-    async def look_at(
-        request: Request, asked: wire.ReflectRequest = Body(openapi_examples=REFLECT_EXAMPLES)
-    ) -> Any:
-        """A second look at a given plan: keep it or revise it, why, and the trajectory that follows."""
-        return await _while_connected(request, parts, asked, reflect)
-
-    @router.post(
+    @labelling.post(
         "/v1/label",
         tags=["labelling"],
+        response_model=wire.LabelResponse,
         responses=problems(
-            *(INVALID_JSON, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE, INVALID_REQUEST, UNKNOWN_FIELD),
+            *(INVALID_JSON, INVALID_BODY, UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE),
+            *(UNSUPPORTED_MEDIA_TYPE, INVALID_REQUEST, UNKNOWN_FIELD),
             *(INVALID_CLIP, UNKNOWN_CAMERA, INVALID_IMAGE, INVALID_HISTORY, INVALID_ROUTE, INVALID_PLAN),
-            *(NEEDS_ANNOTATIONS, LABEL_REFUSED, TEACHER_AWAY),
+            *(NEEDS_ANNOTATIONS, LABEL_REFUSED, RATE_LIMITED, TEACHER_AWAY, DRAINING),
         ),
+        openapi_extra=payloads(wire.LabelRequest),
     )
-    async def write_label(request: Request, asked: wire.LabelRequest) -> wire.LabelResponse:
+    async def write_label(request: Request, asked: wire.LabelRequest) -> Any:
         """Why a plan is less good than another: a teacher's paragraph, checked, to train on."""
-        return await label(asked, parts.teacher, parts.metrics, request.state.request_id)
+        arrival = arrival_of(request)
+        await parts.planning.spend(arrival.owner, 1)
+        return respond(request, await label(asked, parts.teacher, parts.metrics, arrival.request_id))
 
-    @router.get("/v1/models", tags=["planning"], responses=problems(NOT_READY, ENGINE_FAILED))
+    router.include_router(labelling)
+
+
+def _add_models(router: APIRouter, parts: Parts) -> None:
+    @router.get("/v1/models", tags=["planning"], responses=problems(UNAUTHORIZED, *NOT_NOW))
     async def models() -> wire.ModelList:
         """The models that answer here."""
         parts.lifecycle.check_ready()
-        return wire.ModelList(models=[model_card(parts.engine.card)], teacher=teacher_name(parts.teacher))
+        card = model_card(parts.lifecycle.card)
+        named = wire.NamedModel(id=card.name, created=parts.began_s)
+        return wire.ModelList(models=[card], teacher=teacher_name(parts.teacher), data=[named])
 
-
-async def _while_connected(request: Request, parts: Parts, asked: _Asked, work: _Work[_Asked]) -> Any:
-    """What ``work`` makes of a request, or nothing once its caller has left."""
-    parts.lifecycle.check_ready()
-
-    async def caller_leaves() -> None:
-        while (await request.receive())["type"] != "http.disconnect":
-            pass
-
-    try:
-        return await work(asked, parts.engine, parts.metrics, request.state.request_id, caller_leaves)
-    except CallerLeft:
-        return Response(status_code=CALLER_LEFT_STATUS)
+    @router.post(
+        "/v1/models:load",
+        tags=["operations"],
+        responses=problems(
+            *(INVALID_JSON, UNAUTHORIZED, FORBIDDEN, UNKNOWN_CHECKPOINT, BODY_TIMEOUT, SWAP_UNDER_WAY),
+            *(BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE, INVALID_REQUEST, UNKNOWN_FIELD),
+            *(CHECKPOINT_FAILED, *NOT_NOW),
+        ),
+    )
+    async def load(request: Request, asked: wire.LoadRequest) -> wire.ModelCard:
+        """Let another checkpoint answer; requests that run are finished by the one that has them."""
+        owner, settings = arrival_of(request).owner, parts.settings
+        if owner != NOBODY and owner not in settings.operators:
+            raise ProblemError(FORBIDDEN, "only operators' keys may replace the checkpoint")
+        make, folder = parts.load, settings.checkpoints
+        if make is None or folder is None:
+            raise ProblemError(UNKNOWN_CHECKPOINT, "set LOOKTWICE_CHECKPOINTS to the folder that holds them")
+        found = folder / asked.checkpoint
+        if not found.is_dir():
+            raise ProblemError(UNKNOWN_CHECKPOINT, f"there is no checkpoint {asked.checkpoint!r}")
+        return model_card(await parts.lifecycle.replace(lambda: make(found)))
 
 
 def _add_probes(router: APIRouter, parts: Parts) -> None:
@@ -145,7 +130,7 @@ def _add_probes(router: APIRouter, parts: Parts) -> None:
         parts.lifecycle.check_alive()
         return {"status": "alive"}
 
-    @router.get("/readyz", tags=["operations"], responses=problems(NOT_READY, ENGINE_FAILED))
+    @router.get("/readyz", tags=["operations"], responses=problems(*NOT_NOW))
     async def readyz() -> dict[str, str]:
         """Whether requests can be served now."""
         parts.lifecycle.check_ready()
@@ -155,7 +140,7 @@ def _add_probes(router: APIRouter, parts: Parts) -> None:
         "/metrics",
         tags=["operations"],
         response_class=Response,
-        responses=problems() | METRICS_TEXT,
+        responses=problems(UNAUTHORIZED) | METRICS_TEXT,
     )
     async def metrics() -> Response:
         """What Prometheus scrapes."""
@@ -166,7 +151,7 @@ def _add_probes(router: APIRouter, parts: Parts) -> None:
 def _add_scenes(router: APIRouter, parts: Parts) -> None:
     bundled = BundledScenes(parts.settings.bundled_scenes)
 
-    @router.get("/v1/scenes", tags=["scenes"], responses=problems(SCENES_UNREADABLE))
+    @router.get("/v1/scenes", tags=["scenes"], responses=problems(UNAUTHORIZED, SCENES_UNREADABLE))
     async def scenes() -> wire.SceneList:
         """The bundled scenes."""
         found = await asyncio.to_thread(bundled.all)
@@ -174,7 +159,9 @@ def _add_scenes(router: APIRouter, parts: Parts) -> None:
         return wire.SceneList(scenes=entries)
 
     @router.get(
-        "/v1/scenes/{scene_id:path}", tags=["scenes"], responses=problems(UNKNOWN_SCENE, SCENES_UNREADABLE)
+        "/v1/scenes/{scene_id:path}",
+        tags=["scenes"],
+        responses=problems(UNAUTHORIZED, UNKNOWN_SCENE, SCENES_UNREADABLE),
     )
     async def scene(scene_id: str) -> wire.LabelledScene:
         """One bundled scene with its annotations; its `scene` can be sent to /v1/plan as it is."""
@@ -183,7 +170,7 @@ def _add_scenes(router: APIRouter, parts: Parts) -> None:
     @router.post(
         "/v1/scenes:read",
         tags=["scenes"],
-        responses=problems(BODY_TOO_LARGE, INVALID_SCENE_FILE),
+        responses=problems(UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE, INVALID_SCENE_FILE),
         openapi_extra={
             "requestBody": {
                 "required": True,

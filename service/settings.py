@@ -12,6 +12,7 @@ from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
 from clients.labelling.teachers.rules import RuleTeacher
 from clients.labelling.teachers.teacher import Teacher
 from model.bundled import SCENES
+from service.keys import Keys
 
 
 class Settings(BaseSettings):
@@ -22,6 +23,24 @@ class Settings(BaseSettings):
         max_body_bytes: larger request bodies get a 413 problem.
         max_scene_file_bytes: the same for scene files dropped onto the page.
         log_format: ``json`` for machines, ``console`` for people.
+        api_keys_file: a line ``name:sha256`` for each key; without it everybody may ask.
+        open: listen beyond this machine although there are no keys.
+        rate_limit: draws per key, such as ``6000/minute``; None for no limit.
+        max_draws, max_scenes: accepted at once, those that wait included; the next one gets a 429 problem,
+            but a scene that would be alone is let in. Few keep answers quick under a burst, many keep a
+            device busy: docs/operations.md has figures.
+        max_connections: open at once; more are answered 503.
+        queue_timeout_s: a scene that has not begun by then gets a 503 problem.
+        decode_timeout_s: a scene that has begun and is not finished by then gets a 504 problem.
+        headers_timeout_s, body_timeout_s: a connection that takes longer to send them is closed, or gets a
+            408 problem.
+        write_timeout_s: a caller that takes nothing of its answer for so long is disconnected.
+        drain_s: after SIGTERM accepted requests have so long to finish.
+        drain_notice_s: after SIGTERM the service listens, and says that it is draining, at least so long.
+        idempotency_s: answers are kept for so long for callers that ask again with the same key.
+        checkpoints: folder whose checkpoints may replace the one that answers; None where none may.
+        operators: owners of keys that may replace it.
+        cors_origins: web pages of these origins may ask.
     """
 
     model_config = SettingsConfigDict(env_prefix="LOOKTWICE_", frozen=True, extra="ignore")
@@ -30,6 +49,27 @@ class Settings(BaseSettings):
     max_body_bytes: int = Field(default=24_000_000, gt=0)
     max_scene_file_bytes: int = Field(default=8_000_000, gt=0)
     log_format: Literal["json", "console"] = "json"
+    api_keys_file: Path | None = None
+    open: bool = False
+    rate_limit: str | None = None
+    max_draws: int = Field(default=24, gt=0)
+    max_scenes: int = Field(default=64, gt=0)
+    max_connections: int = Field(default=1024, gt=0)
+    queue_timeout_s: float = Field(default=10.0, gt=0)
+    decode_timeout_s: float = Field(default=60.0, gt=0)
+    headers_timeout_s: float = Field(default=10.0, gt=0)
+    body_timeout_s: float = Field(default=30.0, gt=0)
+    write_timeout_s: float = Field(default=30.0, gt=0)
+    drain_s: float = Field(default=25.0, gt=0)
+    drain_notice_s: float = Field(default=1.0, ge=0)
+    idempotency_s: float = Field(default=600.0, gt=0)
+    checkpoints: Path | None = None
+    operators: tuple[str, ...] = ("operator",)
+    cors_origins: tuple[str, ...] = ()
+
+    def keys(self) -> Keys:
+        """The keys that open the service; raises `ValueError` where their file is none."""
+        return Keys({}) if self.api_keys_file is None else Keys.read(self.api_keys_file)
 
 
 class TeacherSettings(BaseSettings):

@@ -15,11 +15,14 @@ PATIENCE_S = 30
 
 
 @contextmanager
-def listening(app: Any, port: int = 0) -> Iterator[tuple[str, asyncio.AbstractEventLoop]]:
-    """The application's URL and event loop, until the block ends."""
+def listening(
+    app: Any, port: int = 0, server: uvicorn.Server | None = None
+) -> Iterator[tuple[str, asyncio.AbstractEventLoop]]:
+    """The application's URL and event loop, until the block ends; behind ``server`` where one is given."""
     listener = socket.create_server(("127.0.0.1", port))
-    config = uvicorn.Config(app, log_config=None, ws="none", timeout_graceful_shutdown=5)
-    server = uvicorn.Server(config)
+    if server is None:
+        config = uvicorn.Config(app, log_config=None, ws="none", timeout_graceful_shutdown=5)
+        server = uvicorn.Server(config)
     loops: list[asyncio.AbstractEventLoop] = []
     begun = threading.Event()
 

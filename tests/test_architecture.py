@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("model", "service", "clients", "loadtests")
+PACKAGES = ("model", "service", "clients", "loadtests", "deploy")
 EVERYTHING = PACKAGES
 ALLOWED = {
     "model": ("model",),
@@ -21,10 +21,11 @@ ALLOWED = {
     "loadtests": ("loadtests", "clients", "model.driving"),
     "service": ("service", "clients.wire", "clients.wire_values", "clients.labelling.teachers", "model"),
     "service.cli": EVERYTHING,
+    "deploy": ("deploy", "service", "model.bundled"),
 }
 TORCH_FREE = ("model.driving", "model.formats", "clients", "loadtests")
 LIGHT = ("clients.wire", "clients.planner")
-LIGHT_IMPORTS = ("numpy", "PIL", "httpx", "pydantic", "model", "clients")
+LIGHT_IMPORTS = ("numpy", "PIL", "httpx", "httpx_sse", "msgpack", "pydantic", "model", "clients")
 
 
 def modules() -> Iterator[tuple[str, Path]]:

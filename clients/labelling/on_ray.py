@@ -22,7 +22,7 @@ from clients.labelling.ledger import Entered, Entry, Ledger, Run
 from clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
 from clients.labelling.rollout import PATIENCE, Sampling, roll_out
 from clients.labelling.teachers.teacher import Teacher
-from clients.planner import AsyncPlannerClient
+from clients.planner import Access, AsyncPlannerClient
 from model.driving.scene_store import row_groups, scene_files
 
 
@@ -61,6 +61,7 @@ class RolloutWork:
 
     run: Run
     service: str
+    access: Access
     model: wire.ModelName
     sampling: Sampling
     limits: Limits
@@ -69,7 +70,7 @@ class RolloutWork:
         """Roll the chunk's scenes out."""
         book.run(self.run.stage, self.run.config)
         found = rollout.jobs(self.run, chunk.file, lambda _: None, chunk.group)
-        async with AsyncPlannerClient(self.service, PATIENCE) as planner:
+        async with AsyncPlannerClient(self.service, PATIENCE, access=self.access) as planner:
             return await work_through(
                 book,
                 self.run,

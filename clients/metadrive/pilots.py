@@ -11,7 +11,7 @@ import numpy as np
 from clients import wire
 from clients.planner import PlannerClient
 from model.driving.scene import Scene
-from model.driving.trajectory import FloatArray, constant_velocity
+from model.driving.trajectory import FloatArray, agreed, constant_velocity
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +97,3 @@ class ServicePilot:
             milliseconds=milliseconds,
             late=controls.deadline_ms is not None and milliseconds > controls.deadline_ms,
         )
-
-
-def agreed(trajectories: FloatArray) -> int:
-    """The place of the trajectory [n, 64, 4] that is nearest to all others on average."""
-    apart = np.linalg.norm(trajectories[:, None, :, :2] - trajectories[None, :, :, :2], axis=-1)
-    return int(apart.mean(axis=(1, 2)).argmin())

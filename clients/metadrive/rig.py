@@ -3,84 +3,19 @@
 from __future__ import annotations
 
 import io
-import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from clients.cameras import FRONT_CAMERAS, CameraSpec
 from clients.metadrive import simulator
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
 
 JPEG_QUALITY: Final = 85
 NEAR_M: Final = 0.3
 FAR_M: Final = 320.0
-
-
-@dataclass(frozen=True)
-class CameraSpec:
-    """One camera: where it looks and how.
-
-    Attributes:
-        name: one of `model.driving.scene.CAMERAS`.
-        hfov_degrees: horizontal field of view.
-        horizon: where the horizon lies, as a share of the picture's height from the top; the lens is
-            shifted for it, not tilted, so upright things stay upright.
-        heading_degrees: direction of view, counter-clockwise from straight ahead.
-        forward_m, left_m, up_m: place relative to the ego's centre on the ground.
-    """
-
-    name: str
-    hfov_degrees: float
-    horizon: float
-    heading_degrees: float = 0.0
-    forward_m: float = 1.2
-    left_m: float = 0.0
-    up_m: float = 1.5
-    width: int = 224
-    height: int = 112
-
-    @cached_property
-    def focal_px(self) -> float:
-        """Focal length in pixels, both directions."""
-        return self.width / 2 / math.tan(math.radians(self.hfov_degrees) / 2)
-
-    def project(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-        """Column, row and depth [n, 3] of points [n, 3] in the ego frame; rows count downwards."""
-        turn = math.radians(self.heading_degrees)
-        moved = np.asarray(points, np.float64) - [self.forward_m, self.left_m, self.up_m]
-        depth = moved[:, 0] * math.cos(turn) + moved[:, 1] * math.sin(turn)
-        left = -moved[:, 0] * math.sin(turn) + moved[:, 1] * math.cos(turn)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            column = self.width / 2 - self.focal_px * left / depth
-            row = self.horizon * self.height - self.focal_px * moved[:, 2] / depth
-        return np.stack([column, row, depth], axis=1)
-
-    def unproject(self, column: Any, row: Any, depth: Any) -> npt.NDArray[np.float64]:
-        """Points [..., 3] in the ego frame seen at pixel positions with metric ``depth``."""
-        left = (self.width / 2 - column) / self.focal_px * depth
-        up = (self.horizon * self.height - row) / self.focal_px * depth
-        turn = math.radians(self.heading_degrees)
-        x = depth * math.cos(turn) - left * math.sin(turn) + self.forward_m
-        y = depth * math.sin(turn) + left * math.cos(turn) + self.left_m
-        return np.stack([x, y, up + self.up_m], axis=-1)
-
-
-FRONT_CAMERAS: Final = (
-    CameraSpec(FRONT_WIDE, 120.0, 0.30),
-    CameraSpec(FRONT_TELE, 30.0, 0.38),
-)
-SURROUND_CAMERAS: Final = (
-    CameraSpec("front", 70.0, 0.35),
-    CameraSpec("front_left", 70.0, 0.35, heading_degrees=55.0, left_m=0.5, forward_m=0.9),
-    CameraSpec("front_right", 70.0, 0.35, heading_degrees=-55.0, left_m=-0.5, forward_m=0.9),
-    CameraSpec("back", 110.0, 0.35, heading_degrees=180.0, forward_m=-1.6),
-    CameraSpec("back_left", 70.0, 0.35, heading_degrees=110.0, left_m=0.5, forward_m=0.0),
-    CameraSpec("back_right", 70.0, 0.35, heading_degrees=-110.0, left_m=-0.5, forward_m=0.0),
-)
 
 
 @dataclass(frozen=True, eq=False)

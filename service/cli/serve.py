@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -20,12 +21,12 @@ def serve(
     vllm_arguments: VllmArguments = "{}",
 ) -> None:
     """Serve a checkpoint over HTTP; the inspector page is at /."""
-    import uvicorn
-
     from service.app import create_app
+    from service.server import make_server
     from service.settings import Settings, TeacherSettings
 
     with told():
-        made = make_engine(checkpoint, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
-        app = create_app(made, Settings(), teacher=TeacherSettings().teacher())
-        uvicorn.run(app, host=host, port=port, log_config=None)
+        settings = Settings()
+        load = partial(make_engine, rows=rows, name=engine, device=device, vllm_arguments=vllm_arguments)
+        app = create_app(load(checkpoint), settings, teacher=TeacherSettings().teacher(), load=load)
+        make_server(app, settings, host, port).run()

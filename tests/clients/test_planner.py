@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from pathlib import Path
 
 import httpx
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from clients import wire
 from clients.planner import (
+    Access,
     AsyncPlannerClient,
     BadAnswer,
     Patience,
@@ -16,11 +18,17 @@ from clients.planner import (
     PlannerError,
     PlannerTimeout,
     PlannerUnreachable,
+    PlanResult,
     RequestRefused,
     ServiceBusy,
     ServiceFailed,
+    Told,
+    plan_request,
+    reflect_request,
 )
 from model.driving.plan import parse_plan
+from model.engines.engine import EngineError
+from service.keys import new_line
 from service.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
@@ -210,3 +218,72 @@ def test_a_plan_is_looked_at_over_a_real_connection() -> None:
     assert look.changes[0].proposed == "Wait"
     assert look.trajectory.shape == (64, 4)
     assert engine.submitted[0].controls.prefill == PREFILL
+
+
+def test_packed_bodies_and_a_key_change_nothing(tmp_path: Path) -> None:
+    key, line = new_line("car")
+    (tmp_path / "keys").write_text(line)
+    engine = ScriptedEngine()
+    with serve(
+        engine, Settings(api_keys_file=tmp_path / "keys"), headers={"Authorization": f"Bearer {key}"}
+    ) as served:
+        with PlannerClient(served.url, access=Access(api_key=key)) as planner:
+            plain = planner.plan(scene())
+        with PlannerClient(served.url, access=Access(api_key=key, packed=True)) as planner:
+            packed = planner.plan(scene())
+        with PlannerClient(served.url) as planner, pytest.raises(RequestRefused, match="needs a key"):
+            planner.plan(scene())
+    assert [draw.plan for draw in packed.draws] == [draw.plan for draw in plain.draws]
+    first, second = engine.submitted
+    assert first.scene.clips == second.scene.clips == scene().clips
+
+
+def test_a_stream_is_read_event_by_event() -> None:
+    asked = plan_request(scene(), wire.Controls(n=2, thinking="always"))
+
+    async def follow(url: str) -> list[tuple[str, Told]]:
+        async with AsyncPlannerClient(url) as planner:
+            return [event async for event in planner.stream(asked)]
+
+    with serve(ScriptedEngine(), Settings()) as served, PlannerClient(served.url) as planner:
+        events = list(planner.stream(asked))
+        plain = planner.plan(scene(), wire.Controls(n=2, thinking="always"))
+        later = asyncio.run(follow(served.url))
+        looks = list(planner.stream(reflect_request(scene(), KEEP_ON, wire.ReflectControls(n=1))))
+    assert [name for name, _ in later] == [name for name, _ in events]
+    texts = [data.text for _, data in events if isinstance(data, wire.ThinkingWritten) and data.index == 0]
+    assert "".join(texts) == REASONING
+    name, done = events[-1]
+    assert name == "done"
+    assert isinstance(done, PlanResult)
+    assert [draw.plan for draw in done.draws] == [draw.plan for draw in plain.draws]
+    assert looks[-1][0] == "done"
+
+
+def test_a_stream_that_fails_raises_what_the_service_said() -> None:
+    engine = ScriptedEngine()
+    asked = plan_request(scene())
+    with serve(engine, Settings()) as served, PlannerClient(served.url) as planner:
+        engine.failure_later = EngineError("broke")
+        stream = planner.stream(asked)
+        assert next(stream)[0] == "plan"
+        with pytest.raises(ServiceBusy, match="broke"):
+            list(stream)
+        engine.failure_later, engine.failure = None, EngineError("at once")
+        with pytest.raises(ServiceBusy, match="at once"):
+            next(planner.stream(asked))
+
+
+def test_a_batch_has_a_result_for_each() -> None:
+    good, bad = plan_request(scene("good")), plan_request(scene("bad"), format="haiku")
+
+    async def ask(url: str) -> int:
+        async with AsyncPlannerClient(url) as planner:
+            return len(await planner.plan_batch([good, bad]))
+
+    with serve(ScriptedEngine(), Settings()) as served, PlannerClient(served.url) as planner:
+        first, second = planner.plan_batch([good, bad])
+        assert asyncio.run(ask(served.url)) == 2
+    assert isinstance(second, RequestRefused)
+    assert second.type.endswith("unknown-format")
+    assert not isinstance(first, RequestRefused)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from dataclasses import replace
 from typing import Final
 
@@ -17,10 +17,14 @@ from model.engines.engine import (
     DraftFinished,
     Draw,
     DrawFinished,
+    EngineError,
     Event,
+    Load,
     ModelCard,
     PlanRequest,
     SectionFinished,
+    Started,
+    TextWritten,
 )
 
 CARD: Final = ModelCard(
@@ -53,21 +57,31 @@ class ScriptedEngine:
 
     Attributes:
         failure: raised at the first iteration of every request.
+        failure_later: raised behind the first plans.
         start_failure: raised by `start`.
         may_start: `start` returns when it is set.
-        may_finish: requests wait for it after they were noted.
+        may_begin: requests wait for it in the queue, after they were noted.
+        may_finish: requests wait for it behind their first plan.
+        breaks: what is put into it ends the engine.
+        starts: how often it was started.
         submitted, cancelled: what was asked, in order.
     """
 
     def __init__(self) -> None:
         self.failure: Exception | None = None
+        self.failure_later: Exception | None = None
         self.start_failure: Exception | None = None
         self.may_start = asyncio.Event()
         self.may_start.set()
         self.may_finish = asyncio.Event()
         self.may_finish.set()
+        self.may_begin = asyncio.Event()
+        self.may_begin.set()
+        self.breaks: asyncio.Queue[EngineError] = asyncio.Queue()
+        self.starts = 0
         self.submitted: list[PlanRequest] = []
         self.cancelled: list[str] = []
+        self.finished = 0
         self.stopped = False
         self.card_shown = CARD
 
@@ -75,7 +89,15 @@ class ScriptedEngine:
     def card(self) -> ModelCard:
         return self.card_shown
 
+    @property
+    def load(self) -> Load:
+        return Load(rows=64, rows_used=len(self.submitted) - self.finished)
+
+    async def wait(self) -> None:
+        raise await self.breaks.get()
+
     async def start(self) -> None:
+        self.starts += 1
         await self.may_start.wait()
         if self.start_failure is not None:
             raise self.start_failure
@@ -83,18 +105,35 @@ class ScriptedEngine:
     async def stop(self) -> None:
         self.stopped = True
 
-    async def submit(self, request: PlanRequest) -> AsyncIterator[Event]:
+    async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         self.submitted.append(request)
         if self.failure is not None:
             raise self.failure
-        await self.may_finish.wait()
-        # Later draws finish first, as they may in a batch.
-        for index in reversed(range(request.controls.n)):
-            draw = _draw(request, index)
-            yield SectionFinished(index, "plan", str(draw.plan))
-            if draw.thinking is not None and request.controls.deadline_ms is not None:
-                yield DraftFinished(_draft(request, draw))
-            yield DrawFinished(draw)
+        try:
+            await self.may_begin.wait()
+            yield Started()
+            draws = [_draw(request, index) for index in range(request.controls.n)]
+            for draw in draws:
+                yield SectionFinished(draw.index, "plan", str(draw.plan))
+            await self.may_finish.wait()
+            if self.failure_later is not None:
+                raise self.failure_later
+            # Later draws finish first, as they may in a batch.
+            for draw in reversed(draws):
+                yield SectionFinished(draw.index, "branch", draw.branch or "")
+                if draw.thinking is not None:
+                    if request.controls.deadline_ms is not None:
+                        yield DraftFinished(_draft(request, draw))
+                    for word in draw.thinking.split(" ")[:-1] if request.live else ():
+                        yield TextWritten(draw.index, "thinking", f" {word}")
+                    yield SectionFinished(draw.index, "thinking", f" {draw.thinking}\n")
+                    yield SectionFinished(draw.index, "revised_plan", str(draw.revised_plan))
+                yield DrawFinished(draw)
+        except (GeneratorExit, asyncio.CancelledError):
+            self.cancel(request.request_id)
+            raise
+        finally:
+            self.finished += 1
 
     def cancel(self, request_id: str) -> None:
         self.cancelled.append(request_id)
@@ -129,6 +168,8 @@ def _draw(request: PlanRequest, index: int) -> Draw:
         trajectory=_drive(followed, present_speed(request.scene.history), luck),
         codes=(1, 2, 3, 4, 5, 6),
         tokens=tokens,
+        passes=30,
+        chosen=20,
     )
     return replace(direct, thinking=REASONING, revised_plan=SLOW_DOWN) if think else direct
 

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic
 
 import httpx
@@ -20,6 +21,7 @@ from clients.labelling.teachers.teacher import Teacher
 from model.driving.scene import Scene
 from model.engines.engine import Engine
 from service.app import create_app
+from service.server import make_server
 from service.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
@@ -77,10 +79,15 @@ def serve(
     wait: bool = True,
     teacher: Teacher = RuleTeacher(),
     port: int = 0,
+    load: Callable[[Path], Engine] | None = None,
+    headers: dict[str, str] | None = None,
 ) -> Iterator[Served[ServedEngine]]:
-    """Serve ``engine`` over a real socket until the block ends."""
-    app = create_app(engine, settings, CollectorRegistry(), teacher)
-    with listening(app, port) as (url, loop), httpx.Client(base_url=url, timeout=PATIENCE_S) as http:
+    """Serve ``engine`` over a real socket until the block ends; ``headers`` come with every request."""
+    app = create_app(engine, settings, CollectorRegistry(), teacher, load)
+    with (
+        listening(app, port, make_server(app, settings)) as (url, loop),
+        httpx.Client(base_url=url, timeout=PATIENCE_S, headers=headers) as http,
+    ):
         assert http.get("/healthz").status_code in (200, 503)
         served = Served(engine, url, http, loop)
         if wait:

@@ -45,6 +45,7 @@ def test_an_engine_that_cannot_start_is_told_to_both_probes(
     engine.start_failure = EngineError("no weights")
     with serve(engine, settings, wait=False) as served:
         served.until(lambda: "no weights" in served.http.get("/readyz").text)
+        served.until(lambda: served.http.get("/healthz").status_code == 503)
         assert "no weights" in problem(served.http.get("/healthz"), "engine-failed").detail
         problem(served.http.post("/v1/plan", json=body()), "engine-failed")
 
@@ -79,3 +80,16 @@ def test_requests_are_logged_once_and_probes_not(served: Served, capfd: pytest.C
     assert [(line["path"], line["status"], line["request_id"]) for line in requests] == [
         ("/v1/plan", 200, "one")
     ]
+
+
+def test_other_pages_may_not_ask_unless_named(engine: ScriptedEngine) -> None:
+    asked = {"Origin": "https://dash.example", "Access-Control-Request-Method": "POST"}
+    with serve(engine, Settings()) as served:
+        answer = served.http.options("/v1/plan", headers=asked)
+        assert "Access-Control-Allow-Origin" not in answer.headers
+        assert answer.status_code == 405
+    with serve(ScriptedEngine(), Settings(cors_origins=("https://dash.example",))) as served:
+        answer = served.http.options("/v1/plan", headers=asked)
+        assert answer.headers["Access-Control-Allow-Origin"] == "https://dash.example"
+        stranger = served.http.options("/v1/plan", headers=asked | {"Origin": "https://evil.example"})
+        assert "Access-Control-Allow-Origin" not in stranger.headers

@@ -14,7 +14,7 @@ from clients.labelling.teachers.teacher import (
     TeacherClosed,
     TeacherError,
 )
-from clients.planner import AsyncPlannerClient, Patience
+from clients.planner import Access, AsyncPlannerClient, Patience
 from clients.wire import MAX_SEED, TeacherName
 
 PATIENCE = Patience(timeout_s=120.0, attempts=1)
@@ -29,13 +29,13 @@ class ServiceTeacher:
         self._planner, self._teacher = planner, teacher
 
     @classmethod
-    async def connect(cls, base_url: str) -> Self:
+    async def connect(cls, base_url: str, access: Access = Access()) -> Self:
         """The teacher of the service there, by the name it has now.
 
         Raises:
             TeacherClosed: nobody answers there, or nobody who labels.
         """
-        planner = AsyncPlannerClient(base_url, PATIENCE)
+        planner = AsyncPlannerClient(base_url, PATIENCE, access=access)
         try:
             teacher = await planner.teacher()
         except PlannerError as error:

@@ -15,7 +15,7 @@ from clients.metadrive.drive_table import driver_rows, format_table, to_json
 from clients.metadrive.episode import make_world, run_episode
 from clients.metadrive.episode_log import EpisodeLog
 from clients.metadrive.film import Film
-from clients.metadrive.pilots import ConstantVelocity, Planned, ServicePilot, agreed
+from clients.metadrive.pilots import ConstantVelocity, Planned, ServicePilot
 from clients.metadrive.rig import Rig
 from clients.metadrive.tracking import FreeVehicle, world_trajectory
 from clients.planner import PlannerClient
@@ -125,13 +125,6 @@ def test_a_car_stops_where_its_trajectory_ends() -> None:
         car.follow(way, 0.1 * step, world.live.road_map)
     assert abs(car.speed) < 0.3
     assert np.hypot(*(way[-1, :2] - [car.x, car.y])) < 1.0
-
-
-def test_the_draw_that_the_others_agree_with_is_followed() -> None:
-    draws = np.zeros((4, 64, 4), np.float32)
-    draws[:, :, 1] = np.array([0.0, 1.0, 1.2, 9.0])[:, None]
-    assert agreed(draws) == 1
-    assert agreed(draws[:1]) == 0
 
 
 def test_it_drives_through_the_api(rig: Rig, tmp_path: Path) -> None:

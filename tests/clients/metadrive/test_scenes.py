@@ -11,9 +11,10 @@ import pytest
 import shapely
 from PIL import Image
 
+from clients.cameras import FRONT_CAMERAS, SURROUND_CAMERAS, CameraSpec
 from clients.metadrive.episode import run_episode
 from clients.metadrive.maps import make_map
-from clients.metadrive.rig import FRONT_CAMERAS, SURROUND_CAMERAS, CameraSpec, Rig
+from clients.metadrive.rig import Rig
 from clients.metadrive.windows import labelled_scenes
 from clients.metadrive.y_flip import heading_from_metadrive, points_from_metadrive
 from model.driving.metrics import collides, leaves_road

@@ -1,0 +1,51 @@
+"""Bodies of requests, from the model's words to the wire's."""
+
+from __future__ import annotations
+
+from clients import wire
+from clients.labelling.teachers.view import Surroundings
+from clients.wire_values import rows, wire_agents, wire_scene
+from model.driving.plan import Plan
+from model.driving.scene import Scene
+
+
+def plan_request(
+    scene: Scene,
+    controls: wire.Controls = wire.Controls(),
+    *,
+    prefill: Plan | None = None,
+    format: str = "cf_vla",
+) -> wire.PlanRequest:
+    """The body of POST /v1/plan for ``scene``."""
+    if prefill is not None:
+        controls = controls.model_copy(update={"prefill": str(prefill)})
+    return wire.PlanRequest(scene=wire_scene(scene), controls=controls, format=format)
+
+
+def reflect_request(
+    scene: Scene,
+    plan: Plan,
+    controls: wire.ReflectControls = wire.ReflectControls(),
+    *,
+    format: str = "cf_vla",
+) -> wire.ReflectRequest:
+    """The body of POST /v1/reflect for ``plan`` in ``scene``."""
+    return wire.ReflectRequest(scene=wire_scene(scene), plan=str(plan), controls=controls, format=format)
+
+
+def label_request(
+    scene: Scene, predicted: Plan, expert: Plan, surroundings: Surroundings | None = None, seed: int = 0
+) -> wire.LabelRequest:
+    """The body of POST /v1/label for two plans in ``scene``."""
+    return wire.LabelRequest(
+        scene=wire_scene(scene),
+        predicted_plan=str(predicted),
+        expert_plan=str(expert),
+        annotations=None
+        if surroundings is None
+        else wire.Annotations(
+            agents=wire_agents(surroundings.agents),
+            lane_lines=[rows(line) for line in surroundings.lane_lines],
+        ),
+        seed=seed,
+    )

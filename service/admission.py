@@ -1,0 +1,161 @@
+"""Who is let in: places for draws, reserved before a request costs anything. No I/O."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections import deque
+from collections.abc import AsyncGenerator, Callable, Generator
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass, field
+from typing import Final
+
+_MEMORY: Final = 0.1
+"""Weight of the latest observation in a running mean."""
+_FIRST_DRAW_S: Final = 0.1
+"""That a draw keeps its place, before any was seen."""
+
+
+class Full(Exception):
+    """No place is free.
+
+    Attributes:
+        retry_after_s: when one probably will be.
+    """
+
+    def __init__(self, detail: str, retry_after_s: float) -> None:
+        super().__init__(detail)
+        self.retry_after_s = retry_after_s
+
+
+@dataclass(eq=False)
+class Place:
+    """What one scene has reserved.
+
+    Attributes:
+        draws: how many.
+        since_s: when, on the admission's clock.
+        waiting: whether the engine has not begun with it.
+    """
+
+    draws: int
+    since_s: float = 0.0
+    waiting: bool = True
+
+    def began(self) -> None:
+        """The engine has begun with it."""
+        self.waiting = False
+
+
+@dataclass(eq=False)
+class _Turn:
+    place: Place
+    come: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+class Admission:
+    """Bounds what is accepted and not yet answered.
+
+    Draws are what costs: memory in the engine and time in every pass, so a scene takes as many places as
+    it asks draws for. Scenes are bounded too, since each is held with its pictures.
+
+    Args:
+        draws: accepted at once, at most.
+        scenes: accepted at once, at most.
+        clock: seconds, ever growing.
+    """
+
+    def __init__(self, draws: int, scenes: int, clock: Callable[[], float]) -> None:
+        self.draws, self.scenes, self._clock = draws, scenes, clock
+        self._places: list[Place] = []
+        self._turns: deque[_Turn] = deque()
+        self._draw_s = _FIRST_DRAW_S
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """All that are taken."""
+        return tuple(self._places)
+
+    @property
+    def free(self) -> int:
+        """Draws that could be accepted beside those that are."""
+        return max(0, self.draws - self._held)
+
+    @property
+    def _held(self) -> int:
+        return sum(place.draws for place in self._places)
+
+    @property
+    def waiting(self) -> tuple[Place, ...]:
+        """Those that the engine has not begun with."""
+        return tuple(place for place in self._places if place.waiting)
+
+    def check_open(self) -> None:
+        """Raise `Full` where not even one draw could be accepted; asked before a body is read."""
+        self._check(1)
+
+    @contextmanager
+    def place(self, draws: int) -> Generator[Place]:
+        """Hold a place for a scene until the block ends.
+
+        Raises:
+            Full: it does not fit now.
+        """
+        self._check(draws)
+        place = self._enter(Place(draws))
+        try:
+            yield place
+        finally:
+            self._leave(place)
+
+    @asynccontextmanager
+    async def place_in_turn(self, draws: int) -> AsyncGenerator[Place]:
+        """The same, but wait for it; for scenes of a batch, which take what others leave."""
+        turn = _Turn(Place(draws))
+        self._turns.append(turn)
+        self._next_turns()
+        try:
+            await turn.come.wait()
+            yield turn.place
+        finally:
+            if turn in self._turns:
+                self._turns.remove(turn)
+            else:
+                self._leave(turn.place)
+
+    def _fits(self, draws: int) -> bool:
+        # Alone, a scene may be larger than what is accepted beside others.
+        return not self._places or (draws <= self.free and len(self._places) < self.scenes)
+
+    def _enter(self, place: Place) -> Place:
+        place.since_s = self._clock()
+        self._places.append(place)
+        return place
+
+    def _leave(self, place: Place) -> None:
+        # Places are left at the rate of those held side by side.
+        held_s = self._clock() - place.since_s
+        self._draw_s += _MEMORY * (held_s / self._held - self._draw_s)
+        self._places.remove(place)
+        self._next_turns()
+
+    def _next_turns(self) -> None:
+        while self._turns and self._fits(self._turns[0].place.draws):
+            turn = self._turns.popleft()
+            self._enter(turn.place)
+            turn.come.set()
+
+    def _check(self, draws: int) -> None:
+        if self._fits(draws):
+            return
+        missing = max(1, draws - self.free)
+        if len(self._places) >= self.scenes:
+            detail = f"{len(self._places)} scenes are being planned for, as many as are accepted at once"
+        else:
+            detail = f"{draws} draws were asked for; of {self.draws} at once {self.free} are free"
+        raise Full(detail, missing * self._draw_s)
+
+
+def whole_seconds(seconds: float) -> int:
+    """For ``Retry-After``, which knows no fractions; at least 1."""
+    return max(1, math.ceil(seconds))

@@ -1,0 +1,117 @@
+"""From the engine's draws to the wire's answers."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import clients.wire as wire
+from model.driving.plan import Plan, plan_changes, plan_iou
+from model.engines.engine import Draw, ModelCard
+from service.planning import Planned
+from service.problems import REFUSED, ProblemError
+
+_DECIMALS: Final = 4
+"""Of poses on the wire: a tenth of a millimetre."""
+
+
+def plan_answer(planned: Planned, request_id: str) -> wire.PlanResponse:
+    """The answer of POST /v1/plan."""
+    return wire.PlanResponse(
+        request_id=request_id,
+        model=_model(planned.card),
+        draws=[_draw(draw, planned.drafts.get(draw.index)) for draw in planned.draws],
+        timing=planned.timing,
+        deadline=planned.deadline,
+    )
+
+
+def reflect_answer(planned: Planned, request_id: str) -> wire.ReflectResponse:
+    """The answer of POST /v1/reflect; raises `ProblemError` where the format has no plan."""
+    first = planned.draws[0]
+    if first.plan is None or first.think_probability is None:
+        raise ProblemError(REFUSED, "responses in this format hold no plan to reflect upon")
+    return wire.ReflectResponse(
+        request_id=request_id,
+        model=_model(planned.card),
+        plan=wire_plan(first.plan),
+        think_probability=first.think_probability,
+        draws=[_reflection(first.plan, draw) for draw in planned.draws],
+        timing=planned.timing,
+        deadline=planned.deadline,
+    )
+
+
+def model_card(card: ModelCard) -> wire.ModelCard:
+    """A model card for the wire."""
+    return wire.ModelCard(
+        name=card.name,
+        revision=card.revision,
+        engine=card.engine,
+        formats=list(card.formats),
+        cameras=list(card.cameras),
+        image_size=list(card.image_size),
+        parameters=card.parameters,
+        details=dict(card.details),
+    )
+
+
+def wire_plan(plan: Plan) -> wire.Plan:
+    """A plan for the wire."""
+    tracks = {
+        group: [
+            wire.MetaAction(start_s=action.start / 10, end_s=action.end / 10, word=action.word)
+            for action in track
+        ]
+        for group, track in plan.tracks()
+    }
+    return wire.Plan(text=str(plan), tracks=wire.Tracks(**tracks))
+
+
+def wire_trajectory(draw: Draw) -> list[list[float]]:
+    """A draw's trajectory for the wire."""
+    rows: list[list[float]] = draw.trajectory.astype(float).round(_DECIMALS).tolist()
+    return rows
+
+
+def _model(card: ModelCard) -> wire.ModelName:
+    return wire.ModelName(name=card.name, revision=card.revision)
+
+
+def _draw(draw: Draw, draft: Draw | None) -> wire.Draw:
+    return wire.Draw(
+        index=draw.index,
+        plan=None if draw.plan is None else wire_plan(draw.plan),
+        branch=draw.branch,
+        think_probability=draw.think_probability,
+        thinking=draw.thinking,
+        revised_plan=None if draw.revised_plan is None else wire_plan(draw.revised_plan),
+        trajectory=wire_trajectory(draw),
+        draft_trajectory=None if draft is None or draw.thinking is None else wire_trajectory(draft),
+        cut=draw.cut,
+        tokens=dict(draw.tokens),
+    )
+
+
+def _reflection(given: Plan, draw: Draw) -> wire.Reflection:
+    revised = draw.revised_plan or given
+    changes = [
+        wire.PlanChange(
+            group=change.group,
+            start_s=change.start / 10,
+            end_s=change.end / 10,
+            proposed=change.before,
+            revised=change.after,
+        )
+        for change in plan_changes(given, revised)
+    ]
+    return wire.Reflection(
+        index=draw.index,
+        decision="revise" if changes else "keep",
+        thinking=draw.thinking,
+        revised_plan=None if draw.revised_plan is None else wire_plan(draw.revised_plan),
+        plan_iou=plan_iou(given, revised),
+        changes=changes,
+        trajectory=wire_trajectory(draw),
+        cut=draw.cut,
+        tokens=dict(draw.tokens),
+    )

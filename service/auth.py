@@ -1,0 +1,59 @@
+"""Nobody gets in without a key, but to the probes."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from typing import Final
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.errors import problem_response
+from service.keys import Keys
+from service.metrics import Metrics
+from service.problems import UNAUTHORIZED, ProblemError
+
+OPEN_PATHS: Final = frozenset({"/healthz", "/readyz"})
+NOBODY: Final = ""
+"""Whoever asks where no keys are set."""
+
+
+class Guard:
+    """Lets nobody in without a key, but to the probes. Pure ASGI.
+
+    The key comes as a bearer token; browsers, which cannot send one by themselves, may give it as the
+    password of basic authentication, whatever the user's name.
+    """
+
+    def __init__(self, app: ASGIApp, keys: Keys, metrics: Metrics) -> None:
+        self._app, self._keys, self._metrics = app, keys, metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection; anything but HTTP passes through."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        owner: str | None = NOBODY
+        if self._keys and scope["path"] not in OPEN_PATHS:
+            key = _key(Headers(scope=scope).get("authorization", ""))
+            owner = None if key is None else self._keys.owner(key)
+        if owner is None:
+            problem = ProblemError(UNAUTHORIZED, "send a key of this service: Authorization: Bearer …")
+            self._metrics.rejected(UNAUTHORIZED.slug)
+            await problem_response(problem, scope["state"]["request_id"])(scope, receive, send)
+            return
+        scope["state"]["owner"] = owner
+        await self._app(scope, receive, send)
+
+
+def _key(authorization: str) -> str | None:
+    scheme, _, given = authorization.partition(" ")
+    if scheme.lower() == "bearer":
+        return given.strip()
+    if scheme.lower() == "basic":
+        try:
+            return base64.b64decode(given.strip(), validate=True).decode().partition(":")[2]
+        except (binascii.Error, UnicodeDecodeError, ValueError):
+            return None
+    return None

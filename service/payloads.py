@@ -1,0 +1,144 @@
+"""Bodies in JSON, msgpack or multipart, all of the same structure."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Coroutine
+from typing import Any, Final
+
+import msgpack
+from fastapi import Request
+from fastapi.routing import APIRoute
+from starlette.datastructures import Headers, UploadFile
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from clients.wire import (
+    MSGPACK_MEDIA_TYPE,
+    MULTIPART_MEDIA_TYPE,
+    PART_SCHEME,
+    REQUEST_PART,
+)
+from service.problems import INVALID_BODY, INVALID_IMAGE, INVALID_JSON, ProblemError
+
+_JSON: Final = b"application/json"
+_MAX_PARTS: Final = 2048
+"""Pictures of a batch."""
+_MAX_JSON_BYTES: Final = 8_000_000
+"""Of the JSON part of a multipart body."""
+
+
+class _Decoded(Request):
+    """A request whose body was decoded; FastAPI takes it for JSON."""
+
+    def __init__(self, request: Request, document: Any) -> None:
+        headers = [each for each in request.scope["headers"] if each[0] != b"content-type"]
+        scope = {**request.scope, "headers": [*headers, (b"content-type", _JSON)]}
+        super().__init__(scope, request.receive)
+        self._document = document
+
+    async def body(self) -> bytes:
+        return b"{}"  # FastAPI only needs to know that there is one
+
+    async def json(self) -> Any:
+        return self._document
+
+
+def payload_route(check_open: Callable[[], None]) -> type[APIRoute]:
+    """A kind of route that takes all of them; the schema of each is that of the JSON body.
+
+    Args:
+        check_open: raises `ProblemError` where nothing can be accepted; asked before a body is decoded.
+    """
+
+    class PayloadRoute(APIRoute):
+        def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+            handle = super().get_route_handler()
+
+            async def decoded(request: Request) -> Response:
+                try:
+                    check_open()
+                except ProblemError:
+                    # Read, or a caller that is still sending would miss the answer.
+                    async for _ in request.stream():
+                        pass
+                    raise
+                media_type = media_type_of(request.headers)
+                if media_type == MSGPACK_MEDIA_TYPE:
+                    request = _Decoded(request, _msgpack(await request.body()))
+                elif media_type == MULTIPART_MEDIA_TYPE:
+                    request = _Decoded(request, await _multipart(request))
+                return await handle(request)
+
+            return decoded
+
+    return PayloadRoute
+
+
+def media_type_of(headers: Headers) -> str:
+    """The media type of a body, without parameters."""
+    return headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+def packed(value: Any) -> bytes:
+    """A JSON-like value as msgpack."""
+    content: bytes = msgpack.packb(value)
+    return content
+
+
+def _msgpack(body: bytes) -> Any:
+    try:
+        # Types beyond those of JSON are refused, but for bytes.
+        return msgpack.unpackb(body, ext_hook=_no_extension)
+    except (ValueError, msgpack.UnpackException) as error:
+        raise ProblemError(INVALID_BODY, f"not msgpack: {error or type(error).__name__}") from None
+
+
+def _no_extension(code: int, _: bytes) -> Any:
+    raise ValueError(f"extension type {code} is not taken here")
+
+
+async def _multipart(request: Request) -> Any:
+    try:
+        form = await request.form(max_files=_MAX_PARTS, max_fields=8, max_part_size=_MAX_JSON_BYTES)
+    except HTTPException as error:  # Starlette's own for what it cannot read
+        if error.status_code != 400:
+            raise
+        raise ProblemError(INVALID_BODY, f"not multipart: {error.detail}") from None
+    try:
+        asked = form.get(REQUEST_PART)
+        if asked is None:
+            raise ProblemError(INVALID_BODY, f"the multipart body lacks the part {REQUEST_PART!r}")
+        document = _json(await asked.read() if isinstance(asked, UploadFile) else asked)
+        parts = {name: await part.read() for name, part in form.items() if isinstance(part, UploadFile)}
+    finally:
+        await form.close()
+    return _with_parts(document, parts)
+
+
+def _json(text: str | bytes) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ProblemError(INVALID_JSON, f"part {REQUEST_PART!r} is not JSON: {error}") from None
+
+
+def _with_parts(node: Any, parts: dict[str, bytes]) -> Any:
+    """The document with pictures in the places where it names them."""
+    if isinstance(node, dict):
+        return {
+            key: [_part(image, parts) for image in value]
+            if key == "images" and isinstance(value, list)
+            else _with_parts(value, parts)
+            for key, value in node.items()
+        }
+    return [_with_parts(value, parts) for value in node] if isinstance(node, list) else node
+
+
+def _part(image: Any, parts: dict[str, bytes]) -> Any:
+    if not isinstance(image, str) or not image.startswith(PART_SCHEME):
+        return image
+    name = image.removeprefix(PART_SCHEME)
+    if name not in parts:
+        raise ProblemError(INVALID_IMAGE, f"the body has no file part {name!r}")
+    return parts[name]

@@ -1,0 +1,259 @@
+"""POST /v1/plan, /v1/plan/batch and /v1/reflect."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Annotated, Any, TypeVar
+
+from fastapi import APIRouter, Body, Header, Request
+from fastapi.openapi.models import Example
+from pydantic import BaseModel
+from starlette.responses import Response, StreamingResponse
+
+import clients.wire as wire
+from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from service.answers import plan_answer, reflect_answer
+from service.errors import problem_document
+from service.examples import example_reflection, example_request
+from service.openapi import Responses, payloads, problems
+from service.parts import Parts
+from service.payloads import packed, payload_route
+from service.planning import Arrival, Asked, Planned, last
+from service.problems import (
+    BODY_TIMEOUT,
+    BODY_TOO_LARGE,
+    DECODE_TIMEOUT,
+    DRAINING,
+    ENGINE_FAILED,
+    IDEMPOTENCY_KEY_REUSED,
+    INVALID_BODY,
+    INVALID_CLIP,
+    INVALID_CONTROLS,
+    INVALID_HISTORY,
+    INVALID_IMAGE,
+    INVALID_JSON,
+    INVALID_PLAN,
+    INVALID_REQUEST,
+    INVALID_ROUTE,
+    MISSING_CAMERA,
+    NOT_READY,
+    QUEUE_FULL,
+    QUEUE_TIMEOUT,
+    RATE_LIMITED,
+    REFUSED,
+    UNAUTHORIZED,
+    UNKNOWN_CAMERA,
+    UNKNOWN_FIELD,
+    UNKNOWN_FORMAT,
+    UNSUPPORTED_MEDIA_TYPE,
+    ProblemError,
+    at,
+)
+from service.streaming import server_sent, told_events
+
+CALLER_LEFT_STATUS = 499
+"""Nobody reads it; logs and metrics show it."""
+PLAN_EXAMPLES: dict[str, Example] = {"straight on": {"value": example_request((FRONT_WIDE, FRONT_TELE))}}
+REFLECT_EXAMPLES: dict[str, Example] = {
+    "is it right to go on?": {"value": example_reflection((FRONT_WIDE, FRONT_TELE))}
+}
+STREAM: Responses = {
+    200: {
+        "content": {
+            wire.MSGPACK_MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}},
+            wire.SSE_MEDIA_TYPE: {
+                "schema": {
+                    "type": "string",
+                    "description": "With stream: true. Events " + ", ".join((*wire.EVENTS, "done")) + ".",
+                }
+            },
+        }
+    }
+}
+NO_BUFFERING = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+"""Proxies must not hold events back."""
+REFUSALS = (
+    *(INVALID_JSON, INVALID_BODY, UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE),
+    *(INVALID_REQUEST, UNKNOWN_FIELD, INVALID_CLIP, UNKNOWN_CAMERA, MISSING_CAMERA, INVALID_IMAGE),
+    *(INVALID_HISTORY, INVALID_ROUTE, INVALID_CONTROLS, INVALID_PLAN, UNKNOWN_FORMAT, REFUSED),
+    *(IDEMPOTENCY_KEY_REUSED, QUEUE_FULL, RATE_LIMITED, NOT_READY, DRAINING, ENGINE_FAILED),
+    *(QUEUE_TIMEOUT, DECODE_TIMEOUT),
+)
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        alias=wire.IDEMPOTENCY_KEY_HEADER,
+        min_length=1,
+        max_length=255,
+        description="Asked again with the same key, the same request gets the answer that was made for it "
+        "before; not with stream: true.",
+    ),
+]
+
+_Done = TypeVar("_Done")
+
+
+class CallerLeft(Exception):
+    """The caller closed the connection before the answer was ready."""
+
+
+def planning_router(parts: Parts) -> APIRouter:
+    """The endpoints that the engine works for."""
+    router = APIRouter(route_class=payload_route(parts.planning.check_open), tags=["planning"])
+    refusals = problems(*REFUSALS)
+
+    @router.post(
+        "/v1/plan",
+        response_model=wire.PlanResponse,
+        responses=refusals | STREAM,
+        openapi_extra=payloads(wire.PlanRequest),
+    )
+    async def plan(
+        request: Request,
+        asked: Annotated[wire.PlanRequest, Body(openapi_examples=PLAN_EXAMPLES)],
+        idempotency_key: IdempotencyKey = None,
+    ) -> Any:
+        """One scene: per draw a plan, the branch, a second look where one was taken, a trajectory."""
+        return await _one(request, parts, asked, idempotency_key, plan_answer)
+
+    @router.post(
+        "/v1/reflect",
+        response_model=wire.ReflectResponse,
+        responses=refusals | STREAM,
+        openapi_extra=payloads(wire.ReflectRequest),
+    )
+    async def reflect(
+        request: Request,
+        asked: Annotated[wire.ReflectRequest, Body(openapi_examples=REFLECT_EXAMPLES)],
+        idempotency_key: IdempotencyKey = None,
+    ) -> Any:
+        """A second look at a given plan: keep it or revise it, why, and the trajectory that follows."""
+        return await _one(request, parts, asked, idempotency_key, reflect_answer)
+
+    @router.post(
+        "/v1/plan/batch",
+        response_model=wire.BatchResponse,
+        responses=refusals,
+        openapi_extra=payloads(wire.BatchRequest),
+    )
+    async def batch(
+        request: Request, asked: wire.BatchRequest, idempotency_key: IdempotencyKey = None
+    ) -> Any:
+        """Many scenes at once: each gets its answer or its problem; those that do not fit yet wait."""
+        for number, each in enumerate(asked.requests):
+            if each.stream:
+                raise at(INVALID_CONTROLS, f"/requests/{number}/stream", "a batch cannot stream")
+        arrival = arrival_of(request)
+        await parts.planning.spend(arrival.owner, sum(each.controls.n for each in asked.requests))
+
+        async def work() -> Response:
+            results = [_result(parts, each, arrival) for each in asked.requests]
+            return respond(request, wire.BatchResponse(results=await asyncio.gather(*results)))
+
+        return await _once(request, parts, arrival, idempotency_key, asked, work)
+
+    return router
+
+
+def arrival_of(request: Request) -> Arrival:
+    """When and as what ``request`` came."""
+    state = request.state
+    return Arrival(state.request_id, state.owner, state.since_s)
+
+
+def respond(request: Request, answer: BaseModel) -> Response:
+    """An answer in msgpack where the caller accepts it, else in JSON."""
+    if wire.MSGPACK_MEDIA_TYPE in request.headers.get("accept", ""):
+        return Response(packed(answer.model_dump()), media_type=wire.MSGPACK_MEDIA_TYPE)
+    return Response(answer.model_dump_json(), media_type="application/json")
+
+
+async def while_connected(request: Request, work: Awaitable[_Done]) -> _Done:
+    """What ``work`` comes to; raises `CallerLeft`, and ends it, once nobody waits for it."""
+
+    async def caller_leaves() -> None:
+        while (await request.receive())["type"] != "http.disconnect":
+            pass
+
+    working, leaving = asyncio.ensure_future(work), asyncio.ensure_future(caller_leaves())
+    try:
+        await asyncio.wait((working, leaving), return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            return working.result()
+        raise CallerLeft
+    finally:
+        working.cancel()
+        leaving.cancel()
+        await asyncio.gather(working, leaving, return_exceptions=True)
+
+
+async def _one(
+    request: Request,
+    parts: Parts,
+    asked: Asked,
+    idempotency_key: str | None,
+    made: Callable[[Planned, str], BaseModel],
+) -> Response:
+    arrival = arrival_of(request)
+    await parts.planning.spend(arrival.owner, asked.controls.n)
+
+    def answer(planned: Planned) -> BaseModel:
+        return made(planned, arrival.request_id)
+
+    if asked.stream:
+        if idempotency_key is not None:
+            raise ProblemError(INVALID_REQUEST, f"{wire.IDEMPOTENCY_KEY_HEADER} cannot go with stream: true")
+        return await _stream(request, parts, asked, arrival, answer)
+
+    async def work() -> Response:
+        return respond(request, answer(await last(parts.planning.events(asked, arrival))))
+
+    return await _once(request, parts, arrival, idempotency_key, asked, work)
+
+
+async def _once(
+    request: Request,
+    parts: Parts,
+    arrival: Arrival,
+    idempotency_key: str | None,
+    asked: BaseModel,
+    work: Callable[[], Awaitable[Response]],
+) -> Response:
+    if idempotency_key is not None:
+        same = request.url.path.encode() + packed(asked.model_dump())
+        return await parts.idempotency.once(arrival.owner, idempotency_key, same, work)
+    try:
+        return await while_connected(request, work())
+    except CallerLeft:
+        return Response(status_code=CALLER_LEFT_STATUS)
+
+
+async def _stream(
+    request: Request,
+    parts: Parts,
+    asked: Asked,
+    arrival: Arrival,
+    answer: Callable[[Planned], BaseModel],
+) -> Response:
+    events = parts.planning.events(asked, arrival)
+    try:
+        # With the first event at hand, a scene that is not let in gets a status of its own.
+        first = await while_connected(request, anext(events))
+    except CallerLeft:
+        await events.aclose()
+        return Response(status_code=CALLER_LEFT_STATUS)
+    return StreamingResponse(
+        server_sent(told_events(first, events), answer, arrival.request_id),
+        media_type=wire.SSE_MEDIA_TYPE,
+        headers=NO_BUFFERING,
+    )
+
+
+async def _result(parts: Parts, asked: wire.PlanRequest, arrival: Arrival) -> wire.BatchResult:
+    try:
+        planned = await parts.planning.in_turn(asked, arrival)
+    except ProblemError as error:
+        document = problem_document(error, arrival.request_id)
+        return wire.BatchResult(status=error.kind.status, problem=document)
+    return wire.BatchResult(status=200, response=plan_answer(planned, arrival.request_id))

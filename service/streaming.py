@@ -1,0 +1,112 @@
+"""Answers as server-sent events, while draws are being written."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncGenerator, Callable
+from contextlib import aclosing
+
+import structlog
+from fastapi.sse import format_sse_event
+from pydantic import BaseModel
+
+import clients.wire as wire
+from model.driving.plan import parse_plan
+from model.engines.engine import (
+    DraftFinished,
+    DrawFinished,
+    Event,
+    SectionFinished,
+    TextWritten,
+)
+from model.formats.pieces import BRANCH
+from service.answers import wire_plan, wire_trajectory
+from service.errors import problem_document
+from service.planning import Planned
+from service.problems import ProblemError, unforeseen
+
+log = structlog.stdlib.get_logger()
+
+
+Written = wire.PlanWritten | wire.BranchTaken | wire.ThinkingWritten | wire.TrajectoryWritten
+"""The data of an event."""
+Told = tuple[str, Written] | Planned
+"""An event of `clients.wire.EVENTS` with its data; at last the whole scene."""
+
+
+async def told_events(
+    first: Event | Planned, events: AsyncGenerator[Event | Planned]
+) -> AsyncGenerator[Told]:
+    """What happens to a scene in the wire's words; closing it early frees everything.
+
+    Args:
+        first: was asked for already, so that a scene that is not let in gets a plain problem.
+        events: what follows.
+
+    Raises:
+        ProblemError: whatever went wrong; the status is sent, so nothing but an event can tell.
+    """
+    told: dict[int, str] = {}
+    async with aclosing(events):
+        try:
+            event: Event | Planned | None = first
+            while event is not None:
+                if isinstance(event, Planned):
+                    yield event
+                    return
+                for each in _data(event, told):
+                    yield each
+                event = await anext(events, None)
+        except ProblemError:
+            raise
+        except Exception as error:
+            log.exception("stream failed")
+            raise unforeseen() from error
+
+
+async def server_sent(
+    told: AsyncGenerator[Told], answer: Callable[[Planned], BaseModel], request_id: str
+) -> AsyncGenerator[bytes]:
+    """The bytes of a stream; ``answer`` makes the last event's data."""
+    async with aclosing(told):
+        try:
+            async for event in told:
+                yield _event("done", answer(event)) if isinstance(event, Planned) else _event(*event)
+        except ProblemError as error:
+            yield _event("error", problem_document(error, request_id))
+
+
+def _data(event: Event, told: dict[int, str]) -> list[tuple[str, Written]]:
+    match event:
+        case TextWritten(index, section, text):
+            return _text(index, section, text, told)
+        case SectionFinished(index, section, text) if section == "thinking":
+            # What was not told yet; spaces around the text belong to the format.
+            rest = text.strip().removeprefix(told.get(index, ""))
+            return _text(index, section, rest, told)
+        case SectionFinished(index, section, text) if section == BRANCH:
+            branch: wire.Branch = "Thinking:" if "Thinking:" in text else "Action:"
+            return [("branch", wire.BranchTaken(index=index, branch=branch))]
+        case SectionFinished(index, section, text) if section in ("plan", "revised_plan"):
+            # The words that lead to a plan's first bullet belong to the format.
+            plan = parse_plan(text[text.index("- ") :])
+            return [(section, wire.PlanWritten(index=index, plan=wire_plan(plan)))]
+        case DraftFinished(draw):
+            trajectory = wire.TrajectoryWritten(index=draw.index, trajectory=wire_trajectory(draw))
+            return [("draft_trajectory", trajectory)]
+        case DrawFinished(draw):
+            trajectory = wire.TrajectoryWritten(index=draw.index, trajectory=wire_trajectory(draw))
+            return [("trajectory", trajectory)]
+    return []
+
+
+def _text(index: int, section: str, text: str, told: dict[int, str]) -> list[tuple[str, Written]]:
+    before = told.get(index, "")
+    new = text if before else text.lstrip()
+    if not new:
+        return []
+    told[index] = before + new
+    return [(section, wire.ThinkingWritten(index=index, text=new))]
+
+
+def _event(name: str, data: BaseModel) -> bytes:
+    return format_sse_event(event=name, data_str=data.model_dump_json())

@@ -1,0 +1,76 @@
+"""Schemathesis tries the whole described surface, with all its checks, over a real socket."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.keys import new_line
+from service.settings import Settings
+from tests.service.scripted_engine import ScriptedEngine
+from tests.service.serving import Served, body, serve
+
+ROOT = Path(__file__).parents[2]
+WITH_SCENES = "^/v1/(plan|plan/batch|reflect|label|chat/completions)$"
+CONFIG = """
+# That a picture is one, and that a history can be driven, no schema can say: such bodies get a 422.
+[checks]
+positive_data_acceptance.expected-statuses = ["2xx", "401", "403", "404", "409", "422", "429", "5xx"]
+"""
+
+
+@pytest.fixture(scope="module")
+def key_and_service(
+    tmp_path_factory: pytest.TempPathFactory, scene_file: Path
+) -> Iterator[tuple[str, Served]]:
+    folder = tmp_path_factory.mktemp("fuzz")
+    key, line = new_line("fuzzer")
+    (folder / "keys").write_text(line)
+    settings = Settings(bundled_scenes=scene_file, api_keys_file=folder / "keys", checkpoints=folder)
+    with serve(ScriptedEngine(), settings, headers={"Authorization": f"Bearer {key}"}) as served:
+        yield key, served
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--exclude-path-regex", WITH_SCENES, "--max-examples", "20"),
+        # Covering every bound of lists of lists of poses one by one takes hours.
+        (
+            "--include-path-regex",
+            WITH_SCENES,
+            "--max-examples",
+            "15",
+            "--phases",
+            "examples,fuzzing,stateful",
+        ),
+    ],
+    ids=["without scenes", "with scenes"],
+)
+def test_nothing_described_can_break_the_service(
+    key_and_service: tuple[str, Served], options: tuple[str, ...], tmp_path: Path
+) -> None:
+    key, served = key_and_service
+    (tmp_path / "schemathesis.toml").write_text(CONFIG)
+    command = [
+        str(Path(sys.executable).with_name("schemathesis")),
+        *("run", f"{served.url}/openapi.json", "--header", f"Authorization: Bearer {key}", *options),
+        *("--checks", "all", "--generation-deterministic"),
+        *("--suppress-health-check", "all", "--request-timeout", "20", "--no-color"),
+    ]
+    environment = os.environ | {
+        "SCHEMATHESIS_HOOKS": "tests.service.fuzz_hooks",
+        "PYTHONPATH": str(ROOT),
+        "PYTHONWARNINGS": "default",
+    }
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=300)
+    assert done.returncode == 0, re.sub(r"[A-Za-z0-9+/=]{200,}", "…", done.stdout)
+    assert served.http.post("/v1/plan", json=body()).status_code == 200
+    for status in ("500", "502", "503", "504"):
+        assert served.metric("looktwice_requests_total", status=status) == 0

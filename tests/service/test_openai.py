@@ -1,0 +1,143 @@
+"""OpenAI's own client against the service."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import openai
+import pytest
+from openai.types.chat import ChatCompletionContentPartParam, ChatCompletionMessageParam
+
+from tests.service.scenes import scene
+from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
+from tests.service.serving import Served, body
+from tests.service.test_errors import problem
+
+SCENE = body()["scene"]
+
+
+@pytest.fixture
+def client(served: Served) -> Iterator[openai.OpenAI]:
+    with openai.OpenAI(base_url=f"{served.url}/v1", api_key="none", max_retries=0) as made:
+        yield made
+
+
+def messages() -> list[ChatCompletionMessageParam]:
+    parts: list[ChatCompletionContentPartParam] = [{"type": "text", "text": "What next?"}]
+    for clip in scene().clips:
+        for image in clip.images:
+            url = "data:image/jpeg;base64," + base64.b64encode(image).decode()
+            parts.append({"type": "image_url", "image_url": {"url": url}})
+    return [{"role": "system", "content": "You drive."}, {"role": "user", "content": parts}]
+
+
+def extra(**fields: Any) -> dict[str, Any]:
+    return {"looktwice": {"history": SCENE["history"], "route": SCENE["route"]} | fields}
+
+
+def test_models_are_listed(client: openai.OpenAI) -> None:
+    (model,) = client.models.list().data
+    assert (model.id, model.object, model.owned_by) == ("scripted", "model", "looktwice")
+
+
+def test_a_chat_is_a_plan_request(client: openai.OpenAI, served: Served, engine: ScriptedEngine) -> None:
+    chat = client.chat.completions.create(
+        model="scripted", messages=messages(), n=2, seed=1, extra_body=extra(thinking="always")
+    )
+    plain = served.http.post("/v1/plan", json=body(thinking="always")).json()
+    asked, same = engine.submitted
+    assert asked.scene.clips == same.scene.clips
+    assert asked.scene.history.tolist() == same.scene.history.tolist()
+    assert asked.controls == same.controls
+    assert [choice.index for choice in chat.choices] == [0, 1]
+    first = chat.choices[0]
+    assert first.finish_reason == "stop"
+    content = first.message.content
+    assert content is not None
+    plan, rest = content.split("Thinking: ")
+    thinking, rest = rest.split("\n", 1)
+    revised, trajectory = rest.split("Trajectory: ")
+    assert (plan, thinking, revised) == (str(KEEP_ON), REASONING, str(SLOW_DOWN))
+    structured = first.message.model_extra
+    assert structured is not None
+    draw = structured["looktwice"]
+    assert draw["trajectory"] == plain["draws"][0]["trajectory"]
+    assert draw["assumed"] == []
+    rows = json.loads(trajectory)
+    assert len(rows) == 12
+    assert rows[0][:2] == pytest.approx(draw["trajectory"][4][:2], abs=0.01)
+    assert chat.usage is not None
+    assert chat.usage.completion_tokens == 2 * 149
+
+
+def test_a_stream_adds_up_to_the_message(client: openai.OpenAI) -> None:
+    whole = client.chat.completions.create(
+        model="scripted", messages=messages(), n=2, extra_body=extra(thinking="always")
+    )
+    told, done, usage = {0: "", 1: ""}, dict[int, Any](), None
+    with client.chat.completions.create(
+        model="scripted",
+        messages=messages(),
+        n=2,
+        stream=True,
+        stream_options={"include_usage": True},
+        extra_body=extra(thinking="always"),
+    ) as stream:
+        for chunk in stream:
+            usage = chunk.usage or usage
+            for choice in chunk.choices:
+                told[choice.index] += choice.delta.content or ""
+                if choice.finish_reason == "stop":
+                    assert choice.delta.model_extra is not None
+                    done[choice.index] = choice.delta.model_extra["looktwice"]
+    for each in whole.choices:
+        assert told[each.index] == each.message.content
+        assert done[each.index]["thinking"] == REASONING
+    assert usage == whole.usage
+
+
+def test_what_was_assumed_is_said(client: openai.OpenAI, engine: ScriptedEngine) -> None:
+    chat = client.chat.completions.create(model="scripted", messages=messages())
+    extras = chat.choices[0].message.model_extra
+    assert extras is not None
+    assert extras["looktwice"]["assumed"] == ["history"]
+    assert not engine.submitted[0].scene.history.any()
+    assert engine.submitted[0].controls.n == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "slug"),
+    [
+        ({"model": "gpt-4"}, "invalid-request"),
+        ({"messages": [{"role": "user", "content": "no pictures"}]}, "invalid-clip"),
+        ({"stop": ["."]}, "invalid-request"),
+        ({"tools": [{"type": "function"}]}, "invalid-request"),
+        ({"logprobs": True}, "invalid-request"),
+        ({"n": 65}, "invalid-request"),
+        ({"looktwice": {"speed": 3}}, "unknown-field"),
+        ({"looktwice": {"thinking": "never", "think_threshold": 0.5}}, "invalid-controls"),
+    ],
+)
+def test_what_cannot_be_obeyed_is_refused(
+    served: Served, engine: ScriptedEngine, change: dict[str, Any], slug: str
+) -> None:
+    document = {"model": "scripted", "messages": messages()} | change
+    problem(served.http.post("/v1/chat/completions", json=document), slug)
+    assert engine.submitted == []
+
+
+def test_nothing_is_fetched(served: Served, engine: ScriptedEngine) -> None:
+    document: dict[str, Any] = {"messages": messages()}
+    document["messages"][1]["content"][1]["image_url"]["url"] = "http://169.254.169.254/latest"
+    found = problem(served.http.post("/v1/chat/completions", json=document), "invalid-image")
+    assert found.errors[0].pointer == "/messages/1/content/1/image_url/url"
+    assert engine.submitted == []
+
+
+def test_refusals_reach_the_client_as_its_own_errors(client: openai.OpenAI) -> None:
+    with pytest.raises(openai.UnprocessableEntityError) as error:
+        client.chat.completions.create(model="gpt-4", messages=messages())
+    assert "scripted" in str(error.value)

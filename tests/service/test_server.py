@@ -1,0 +1,228 @@
+"""The server as a process: signals, keys, what it listens on."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import httpx
+import pytest
+
+from service.app import create_app
+from service.keys import new_line
+from service.server import make_server
+from service.settings import Settings
+from tests.service.scripted_engine import ScriptedEngine
+from tests.service.serving import Served, body, serve
+from tests.service.test_errors import problem
+
+WAIT_S = 120
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port: int = listener.getsockname()[1]
+        return port
+
+
+@contextmanager
+def process(stderr: int | IO[str] = subprocess.PIPE) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """`looktwice serve` with the bundled checkpoint, ready."""
+    port = free_port()
+    started = subprocess.Popen(
+        [sys.executable, "-m", "service.cli", "serve", "--port", str(port)],
+        env=os.environ | {"LOOKTWICE_DRAIN_NOTICE_S": "0.5"},
+        stderr=stderr,
+        text=True,
+    )
+    url = f"http://127.0.0.1:{port}"
+    try:
+        pause = threading.Event()
+        for _ in range(10 * WAIT_S):
+            assert started.poll() is None, started.communicate()
+            try:
+                if httpx.get(f"{url}/readyz").status_code == 200:
+                    break
+            except httpx.TransportError:
+                pass
+            pause.wait(0.1)
+        else:
+            raise AssertionError("it did not become ready")
+        yield started, url
+    finally:
+        started.kill()
+        started.communicate()
+
+
+def test_sigterm_under_load_loses_no_accepted_request() -> None:
+    with process() as (started, url):
+        answers: list[int] = []
+        lost: list[str] = []
+        stopping = threading.Event()
+
+        def planner(number: int) -> None:
+            with httpx.Client(base_url=url, timeout=60) as http:
+                request = 0
+                while not stopping.is_set():
+                    request += 1
+                    document = body(n=6, seed=100 * number + request)
+                    try:
+                        status = http.post("/v1/plan", json=document).status_code
+                    except httpx.ConnectError:
+                        return  # it listens no more
+                    except httpx.TransportError as error:
+                        lost.append(repr(error))
+                        return
+                    answers.append(status)
+                    if status == 503:
+                        return
+
+        threads = [threading.Thread(target=planner, args=(number,)) for number in range(4)]
+        for thread in threads:
+            thread.start()
+        while len(answers) < 8:
+            assert started.poll() is None
+        started.send_signal(signal.SIGTERM)
+        _, logged = started.communicate(timeout=WAIT_S)
+        stopping.set()
+        for thread in threads:
+            thread.join()
+        assert started.returncode == 0
+        assert lost == []
+        assert set(answers) == {200, 503}
+        lines = [json.loads(line) for line in logged.splitlines()]
+        assert [line["event"] for line in lines if line["event"] == "draining"] == ["draining"]
+        # What the server counts as answered, its callers have.
+        served = [line["status"] for line in lines if line.get("path") == "/v1/plan"]
+        assert sorted(served) == sorted(answers)
+
+
+def test_while_draining_it_says_so(engine: ScriptedEngine) -> None:
+    settings = Settings(drain_notice_s=0.0)
+    app = create_app(engine, settings)
+    server = make_server(app, settings)
+    from tests.sockets import listening
+
+    with listening(app, 0, server) as (url, loop), httpx.Client(base_url=url, timeout=30) as http:
+        served = Served(engine, url, http, loop)
+        served.until_ready()
+        served.in_loop(engine.may_finish.clear)
+        answers: list[int] = []
+        thread = threading.Thread(
+            target=lambda: answers.append(http.post("/v1/plan", json=body()).status_code)
+        )
+        thread.start()
+        served.until(lambda: len(engine.submitted) == 1)
+        served.in_loop(server.drain)
+        served.until(lambda: served.metric("looktwice_draining") == 1)
+        refused = http.post("/v1/plan", json=body())
+        problem(refused, "draining")
+        assert refused.headers["Connection"] == "close"
+        assert refused.headers["Retry-After"] == "1"
+        problem(http.get("/readyz"), "draining")
+        assert http.get("/healthz").status_code == 200
+        assert served.metric("looktwice_ready") == 0
+        assert answers == []
+        served.in_loop(engine.may_finish.set)
+        thread.join()
+        assert answers == [200]
+
+
+def test_it_does_not_open_itself_to_others_without_keys(engine: ScriptedEngine, tmp_path: Path) -> None:
+    app = create_app(engine, Settings())
+    for host in ("0.0.0.0", "::", "192.0.2.1", "looktwice.example"):
+        with pytest.raises(ValueError, match="LOOKTWICE_API_KEYS_FILE"):
+            make_server(app, Settings(), host)
+    for host in ("127.0.0.1", "::1", "localhost"):
+        make_server(app, Settings(), host)
+    make_server(app, Settings(open=True), "0.0.0.0")
+    (tmp_path / "keys").write_text(new_line("car")[1])
+    make_server(app, Settings(api_keys_file=tmp_path / "keys"), "0.0.0.0")
+
+
+def test_another_checkpoint_takes_over_without_dropping_a_request(
+    engine: ScriptedEngine, tmp_path: Path
+) -> None:
+    (tmp_path / "next").mkdir()
+    following = ScriptedEngine()
+    following.card_shown = engine.card.__class__(**{**vars(engine.card), "revision": "r2"})
+    loaded: list[Path] = []
+
+    def load(path: Path) -> ScriptedEngine:
+        loaded.append(path)
+        return following
+
+    with serve(engine, Settings(checkpoints=tmp_path), load=load) as served:
+        served.in_loop(engine.may_finish.clear)
+        answers: list[httpx.Response] = []
+        thread = threading.Thread(
+            target=lambda: answers.append(httpx.post(served.url + "/v1/plan", json=body(), timeout=30))
+        )
+        thread.start()
+        served.until(lambda: len(engine.submitted) == 1)
+        card = served.http.post("/v1/models:load", json={"checkpoint": "next"})
+        assert card.json()["revision"] == "r2"
+        assert loaded == [tmp_path / "next"]
+        after = served.http.post("/v1/plan", json=body())
+        assert after.json()["model"]["revision"] == "r2"
+        assert not engine.stopped
+        served.in_loop(engine.may_finish.set)
+        thread.join()
+        assert answers[0].json()["model"]["revision"] == "r1"
+        served.until(lambda: engine.stopped)
+        assert not following.stopped
+        assert served.metric("looktwice_checkpoint_swaps_total", outcome="done") == 1
+        assert served.metric("looktwice_model_info", revision="r2") == 1
+        assert served.metric("looktwice_model_info", revision="r1") == 0
+
+
+def test_a_checkpoint_that_cannot_be_served_changes_nothing(engine: ScriptedEngine, tmp_path: Path) -> None:
+    (tmp_path / "bad").mkdir()
+
+    def load(path: Path) -> ScriptedEngine:
+        raise ValueError("no weights in it")
+
+    with serve(engine, Settings(checkpoints=tmp_path), load=load) as served:
+        refused = served.http.post("/v1/models:load", json={"checkpoint": "bad"})
+        assert "no weights" in problem(refused, "checkpoint-failed").detail
+        problem(served.http.post("/v1/models:load", json={"checkpoint": "none"}), "unknown-checkpoint")
+        for strange in ("../bad", "", "/etc", ".hidden"):
+            problem(served.http.post("/v1/models:load", json={"checkpoint": strange}), "invalid-request")
+        assert served.http.post("/v1/plan", json=body()).json()["model"]["revision"] == "r1"
+
+
+def test_only_operators_replace_the_checkpoint(engine: ScriptedEngine, tmp_path: Path) -> None:
+    (key, line), (other, other_line) = new_line("operator"), new_line("car")
+    (tmp_path / "keys").write_text(f"{line}\n{other_line}\n")
+    (tmp_path / "next").mkdir()
+    settings = Settings(checkpoints=tmp_path, api_keys_file=tmp_path / "keys")
+    with serve(
+        engine, settings, load=lambda _: ScriptedEngine(), headers={"Authorization": f"Bearer {key}"}
+    ) as served:
+        car = {"Authorization": f"Bearer {other}"}
+        refused = served.http.post("/v1/models:load", json={"checkpoint": "next"}, headers=car)
+        problem(refused, "forbidden")
+        assert served.http.post("/v1/models:load", json={"checkpoint": "next"}).status_code == 200
+
+
+def test_keys_are_made_on_the_command_line() -> None:
+    made = subprocess.run(
+        [sys.executable, "-m", "service.cli", "keys", "new", "car-7"], capture_output=True, text=True
+    )
+    key, line = (text.split(": ", 1)[1].strip() for text in made.stdout.splitlines())
+    assert re.fullmatch(r"car-7:[0-9a-f]{64}", line)
+    assert key.startswith("lt_")
+    strange = subprocess.run(
+        [sys.executable, "-m", "service.cli", "keys", "new", "a b"], capture_output=True, text=True
+    )
+    assert strange.returncode == 2
