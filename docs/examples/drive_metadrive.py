@@ -1,0 +1,28 @@
+"""Drive a car in MetaDrive, and film it: python docs/examples/drive_metadrive.py [--service URL]
+
+Needs the simulator (`make sim`). `looktwice drive` does the same for many episodes, and compares drivers.
+"""
+
+import argparse
+from pathlib import Path
+
+from clients.metadrive.drive import DriveConfig, drive
+from clients.metadrive.film import Film
+from clients.metadrive.pilots import ServicePilot
+from clients.metadrive.rig import Rig
+from clients.planner import PlannerClient
+from clients.wire import Controls
+
+parser = argparse.ArgumentParser()
+parser.add_argument("--service", default="http://127.0.0.1:8000")
+parser.add_argument("--film", type=Path, default=Path("drive.gif"))
+parser.add_argument("--seconds", type=float, default=20.0)
+asked = parser.parse_args()
+
+film, rig = Film(), Rig()
+with PlannerClient(asked.service) as planner:
+    pilot = ServicePilot(planner, "looktwice", Controls(n=6))
+    drove = drive(600_000, pilot, rig, DriveConfig(asked.seconds), film.add)
+rig.close()
+film.save(asked.film)
+print(f"{drove.driven_m:.0f} m with {drove.plans} plans, ended by {drove.ended}; see {asked.film}")
