@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from service.cli.engines import Device
 from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, ScenePath, told
 
 if TYPE_CHECKING:
@@ -106,6 +110,100 @@ def precision(
         for each in found:
             largest = f", largest margin {max(each.margins):.1e}" if each.margins else ""
             typer.echo(f"{each.name}: {each.different} of {each.responses} responses differ{largest}")
+
+
+@bench.command()
+def egodriver(
+    scenes: ScenePath = DEFAULT_SCENES,
+    checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
+    sessions: Annotated[int, typer.Option(help="Rollouts at once.", min=1)] = 8,
+    steps: Annotated[int, typer.Option(help="Drives of each.", min=1)] = 6,
+    rounds: Annotated[int, typer.Option(help="Measured rounds.", min=1)] = 5,
+    n: Annotated[int, typer.Option(help="Draws a drive.", min=1, max=64)] = 6,
+    thinking: Annotated[
+        Literal["adaptive", "always", "never"], typer.Option(help="Who decides on a second look.")
+    ] = "adaptive",
+    device: Device = "cpu",
+    as_json: Json = False,
+) -> None:
+    """The egodriver: the same rollouts one by one and together, without deadlines."""
+    with told():
+        from itertools import islice
+
+        from clients.alpasim.throughput import measure
+        from model.driving.scene_store import read_scenes
+
+        shown = [each.scene for each in islice(read_scenes(scenes, dense=False), sessions)]
+        options = f"--n {n} --thinking {thinking} --device {device} --max-sessions {2 * sessions}".split()
+        with _egodriver("--checkpoint", str(checkpoint), *options) as address:
+            found = measure(address, shown, sessions=sessions, steps=steps, rounds=rounds)
+        if as_json:
+            typer.echo(json.dumps({"n": n, "thinking": thinking, "device": device} | found.to_json()))
+            return
+        figures = found.to_json()
+        typer.echo(
+            f"{sessions} rollouts, drives/s: {figures['one_by_one_drives_per_s']:.2f} one by one, "
+            f"{figures['together_drives_per_s']:.2f} together: {found.ratio:.2f} times as many"
+        )
+
+
+@bench.command()
+def http(
+    service: Annotated[str, typer.Option(help="URL of a running service.")] = "http://127.0.0.1:8000",
+    scenes: ScenePath = DEFAULT_SCENES,
+    n: Annotated[int, typer.Option(help="Draws.", min=1, max=64)] = 6,
+    requests: Annotated[int, typer.Option(help="Of each kind of body.", min=1)] = 30,
+    seed: Annotated[int, typer.Option(help="Of pictures and draws.", min=0)] = 0,
+    as_json: Json = False,
+) -> None:
+    """What HTTP adds to planning, by kind of body, on a service that is otherwise idle."""
+    with told():
+        import httpx
+
+        from clients.planner import Access
+        from loadtests.overhead import measure
+        from model.driving.scene_store import read_scenes
+
+        key = Access.from_environment().api_key
+        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        labelled = tuple(read_scenes(scenes, dense=False))
+        try:
+            with httpx.Client(base_url=service, timeout=120, headers=headers) as client:
+                rows = list(measure(client, labelled, n=n, requests=requests, seed=seed))
+        except httpx.HTTPError as error:
+            raise RuntimeError(f"no service answers at {service}: {error}") from error
+    if as_json:
+        typer.echo(json.dumps({"n": n, "rows": [vars(row) | {"share": row.share} for row in rows]}))
+        return
+    for row in rows:
+        typer.echo(
+            f"{row.payload:9} {row.body_bytes / 1000:6.1f} kB   engine {row.engine_ms:7.1f} ms   "
+            f"HTTP {row.overhead_ms:5.1f} ms ({row.share:.1%}), {row.before_ms:.1f} ms of it in the service"
+        )
+
+
+@contextmanager
+def _egodriver(*options: str) -> Iterator[str]:
+    """An egodriver in a process of its own; where it listens."""
+    import grpc
+
+    with tempfile.TemporaryDirectory() as folder, (Path(folder) / "log").open("w+") as log:
+        address = f"unix://{folder}/driver.sock"
+        command = [sys.executable, "-m", "service.cli", "egodriver", "--host", address, "--deadline-ms", "0"]
+        process = subprocess.Popen([*command, *options], stderr=log)
+        try:
+            with grpc.insecure_channel(address) as channel:
+                ready = grpc.channel_ready_future(channel)
+                while not ready.done():
+                    if process.poll() is not None:
+                        log.seek(0)
+                        raise RuntimeError(f"the egodriver ended: {log.read()[-2000:]}")
+                    with suppress(grpc.FutureTimeoutError):
+                        ready.result(timeout=0.2)
+            yield address
+        finally:
+            process.kill()
+            process.wait()
 
 
 def _whole(text: str) -> int:

@@ -65,15 +65,15 @@ def rollout(
     """Roll a served model out over scenes: what it plans alone, and with the expert's plan given."""
     from clients.labelling.pipeline import Limits
     from clients.labelling.rollout import PATIENCE, Sampling, config_of, jobs, roll_out
-    from clients.planner import AsyncPlannerClient, PlannerError
+    from clients.planner import Access, AsyncPlannerClient, PlannerError
     from clients.wire import ModelName
 
-    sampling = Sampling(n, temperature, top_p, seed, route)
+    sampling, access = Sampling(n, temperature, top_p, seed, route), Access.from_environment()
     limits = Limits(at_once, give_up_after, max_error_rate)
     unlabelled: list[str] = []
 
     async def roll(ledger: Ledger) -> tuple[Run, Tally]:
-        async with AsyncPlannerClient(service, PATIENCE) as planner:
+        async with AsyncPlannerClient(service, PATIENCE, access=access) as planner:
             try:
                 (card, *_) = await planner.models()
             except PlannerError as error:
@@ -85,7 +85,7 @@ def rollout(
             if on_ray is not None:
                 from clients.labelling.on_ray import RolloutWork, chunks, work_on_ray
 
-                work = RolloutWork(run, service, model, sampling, limits)
+                work = RolloutWork(run, service, access, model, sampling, limits)
                 return run, work_on_ray(ledger, run, chunks(ledger, run, scenes), work, on_ray)
             found = islice(jobs(run, scenes, unlabelled.append), 0, None, every)
             return run, await _work(
@@ -169,6 +169,7 @@ def label(
     from clients.labelling.pipeline import Limits
     from clients.labelling.teachers.service import ServiceTeacher
     from clients.labelling.teachers.teacher import TeacherError
+    from clients.planner import Access
     from service.settings import TeacherSettings
 
     spent: dict[str, Any] = {}
@@ -181,7 +182,7 @@ def label(
             asked = (
                 TeacherSettings().teacher()
                 if teacher == "settings"
-                else await ServiceTeacher.connect(service)
+                else await ServiceTeacher.connect(service, Access.from_environment())
             )
         except TeacherError as error:
             raise RuntimeError(str(error)) from error

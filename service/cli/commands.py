@@ -7,7 +7,10 @@ import typer
 import service.cli.bench as bench
 import service.cli.build as build
 import service.cli.drive as drive
+import service.cli.egodriver as egodriver
 import service.cli.evaluate as evaluate
+import service.cli.keys as keys
+import service.cli.loadtest as loadtest
 import service.cli.plan as plan
 import service.cli.scenes as scenes
 import service.cli.serve as serve
@@ -24,6 +27,9 @@ app.command("serve")(serve.serve)
 app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
 app.command("drive")(drive.drive)
+app.command("loadtest")(loadtest.loadtest)
+app.command("egodriver")(egodriver.egodriver)
 app.add_typer(build.app, name="build")
 app.add_typer(bench.bench, name="bench")
 app.add_typer(scenes.app, name="scenes")
+app.add_typer(keys.app, name="keys")

@@ -41,7 +41,7 @@ def drive(
     from clients.metadrive.maps import MapError
     from clients.metadrive.pilots import ConstantVelocity, Pilot, ServicePilot
     from clients.metadrive.rig import Rig
-    from clients.planner import Patience, PlannerClient
+    from clients.planner import Access, Patience, PlannerClient
     from model.driving.scene import split_of_seed
 
     def pilot_of(driver: str, planner: PlannerClient) -> Pilot | None:
@@ -57,7 +57,10 @@ def drive(
     wanted = drivers or list(DRIVERS[:-1])
     if unknown := set(wanted) - set(DRIVERS):
         raise typer.BadParameter(f"unknown drivers: {', '.join(sorted(unknown))}")
-    with told(), PlannerClient(service, Patience(timeout_s=120.0)) as planner:
+    with (
+        told(),
+        PlannerClient(service, Patience(timeout_s=120.0), access=Access.from_environment()) as planner,
+    ):
         seeds = range(first_seed, first_seed + episodes)
         for seed in (seeds[0], seeds[-1]):
             split_of_seed(seed)

@@ -1,0 +1,138 @@
+"""Clients that mean no good or know no better: they leave, never read, or send their body byte by byte."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import struct
+from collections import Counter
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import urlsplit
+
+from loadtests.call import Call
+from loadtests.sending import Target
+
+_DRIP_S: Final = 0.5
+"""Between two bytes of a body that never ends."""
+_SMALL_BUFFER: Final = 4096
+_NO_LINGER: Final = struct.pack("ii", 1, 0)
+"""Closing resets the connection, as a process does that dies."""
+
+
+@dataclass(frozen=True)
+class Hostility:
+    """What is done to the service, all at once.
+
+    Attributes:
+        leaving: clients that ask for a plan, leave after ``leave_after_s``, and come back.
+        never_reading: clients that ask for one and never read what comes.
+        slow_bodies: clients that send a byte of their body now and then.
+        leave_after_s: time enough for the service to begin.
+    """
+
+    leaving: int = 4
+    never_reading: int = 8
+    slow_bodies: int = 16
+    leave_after_s: float = 0.05
+
+
+async def be_hostile(
+    target: Target, call: Call, hostility: Hostility, seconds: float
+) -> dict[str, dict[str, int]]:
+    """Do it for so many seconds; what became of these clients, by kind and by how it ended.
+
+    ``held``: the service still held the connection at the end. ``closed``: it had closed it without a word.
+    A number is the status of its answer. ``left``: the client went away itself.
+    """
+    clients = {
+        "leaving": [
+            _leaves(target, call, hostility.leave_after_s, seconds) for _ in range(hostility.leaving)
+        ],
+        "never_reading": [_never_reads(target, call, seconds) for _ in range(hostility.never_reading)],
+        "slow_bodies": [_sends_slowly(target, call, seconds) for _ in range(hostility.slow_bodies)],
+    }
+    ends = {}
+    for name, ended in zip(
+        clients, await asyncio.gather(*(asyncio.gather(*each) for each in clients.values())), strict=True
+    ):
+        ends[name] = dict(sum(ended, Counter[str]()))
+    return ends
+
+
+async def _leaves(target: Target, call: Call, after_s: float, seconds: float) -> Counter[str]:
+    ends = Counter[str]()
+    clock = asyncio.get_running_loop().time
+    until = clock() + seconds
+    while clock() < until:
+        try:
+            _, writer = await _connect(target)
+            writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
+            writer.write(_head(target, call, len(call.body)) + call.body)
+            await writer.drain()
+            await asyncio.sleep(after_s)
+            writer.close()
+            ends["left"] += 1
+        except OSError:
+            ends["refused"] += 1
+            await asyncio.sleep(after_s)
+    return ends
+
+
+async def _never_reads(target: Target, call: Call, seconds: float) -> Counter[str]:
+    try:
+        reader, writer = await _connect(target)
+        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SMALL_BUFFER)
+    except OSError:
+        return Counter({"refused": 1})
+    writer.write(_head(target, call, len(call.body)) + call.body)
+    await asyncio.sleep(seconds)
+    return await _ending(reader, writer)
+
+
+async def _sends_slowly(target: Target, call: Call, seconds: float) -> Counter[str]:
+    clock = asyncio.get_running_loop().time
+    until = clock() + seconds
+    try:
+        reader, writer = await _connect(target)
+        writer.write(_head(target, call, len(call.body)))
+    except OSError:
+        return Counter({"refused": 1})
+    for place in range(len(call.body)):
+        writer.write(call.body[place : place + 1])
+        await asyncio.sleep(_DRIP_S)
+        if clock() >= until or reader.at_eof() or writer.is_closing():
+            break
+    return await _ending(reader, writer)
+
+
+async def _ending(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Counter[str]:
+    try:
+        line = await asyncio.wait_for(reader.readline(), _DRIP_S)
+        said = line.split()
+        end = said[1].decode() if len(said) > 1 and said[1].isdigit() else "closed"
+    except TimeoutError:
+        end = "held"
+    except OSError:
+        end = "closed"
+    writer.close()
+    return Counter({end: 1})
+
+
+async def _connect(target: Target) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    where = urlsplit(target.url)
+    secure = where.scheme == "https"
+    # Beyond twice the limit, what is not read stays in the way of the service.
+    return await asyncio.open_connection(
+        where.hostname, where.port or (443 if secure else 80), ssl=secure or None, limit=_SMALL_BUFFER
+    )
+
+
+def _head(target: Target, call: Call, length: int) -> bytes:
+    lines = [
+        f"POST {call.path} HTTP/1.1",
+        f"Host: {urlsplit(target.url).netloc}",
+        f"Content-Length: {length}",
+    ]
+    lines += [f"{name}: {value}" for name, value in (*call.headers, *target.headers.items())]
+    return ("\r\n".join(lines) + "\r\n\r\n").encode()

@@ -1,0 +1,69 @@
+"""Scenario `hostile`: a steady rate of polite requests while other clients leave, never read, or dawdle."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+from loadtests.aftermath import left_behind
+from loadtests.arrivals import Phase, poisson_arrivals, windows
+from loadtests.bodies import make_call, make_calls
+from loadtests.hostile import Hostility, be_hostile
+from loadtests.loads import OpenLoop
+from loadtests.mix import Kind
+from loadtests.run import WARM_UP, Result, Setup, check, needed, run
+
+CALM, HOSTILE, AFTER = "calm", "hostile", "after"
+
+
+def hostile(setup: Setup, hostility: Hostility) -> Result:
+    """Measure polite requests before, during and after; hostile ones stream where the mix has streams.
+
+    Raises:
+        ServiceAway: the service has no metrics to say what it still holds.
+        WorkerDied: a process of the generator did.
+        ValueError: there are no scenes.
+    """
+    names = (WARM_UP, CALM, HOSTILE, AFTER)
+    phases = [
+        Phase(name, setup.warm_up_s if name == WARM_UP else setup.seconds, setup.rate_rps) for name in names
+    ]
+    calls = tuple(make_calls(setup.scenes, setup.mix, needed(phases, setup), setup.seed))
+    bait = make_call(
+        Kind("think", max(setup.mix.draws), stream=setup.mix.stream > 0), setup.scenes[:1], setup.seed
+    )
+    begins = next(window for window in windows(phases) if window.name == HOSTILE)
+    ends: dict[str, dict[str, int]] = {}
+
+    def meanwhile(starts_at: float) -> None:
+        time.sleep(max(0.0, starts_at + begins.start_s - time.monotonic()))
+        ends.update(asyncio.run(be_hostile(setup.target, bait, hostility, begins.seconds)))
+
+    ran = run(OpenLoop(poisson_arrivals(phases, setup.seed), calls), phases, setup, meanwhile)
+    held = left_behind(setup.target)
+    parts = {name: ran.summary(setup.goal_s, name) for name in (CALM, HOSTILE, AFTER)}
+    overall = ran.summary(setup.goal_s, CALM, AFTER)
+    faults = check(parts[CALM], setup)
+    if failed := overall.count("failed"):
+        faults.append(f"{failed} polite requests failed: {overall.problems()}")
+    if any(held.values()):
+        faults.append(f"the service still holds what nobody waits for: {held}")
+    before_s, during_s = (parts[name].latencies().percentile_s("p95") for name in (CALM, HOSTILE))
+    ratio = during_s / before_s if during_s is not None and before_s else None
+    return Result(
+        "hostile",
+        overall,
+        parts,
+        tuple(faults),
+        {"hostile": {"clients": ends, "polite_p95_ratio": ratio, "left_behind": held}},
+        (
+            *(f"{name.replace('_', ' ')}: {_told(ended)}" for name, ended in ends.items()),
+            "no p95 to compare" if ratio is None else f"polite p95 meanwhile: {ratio:.1f} times that before",
+            f"held afterwards: {held}",
+        ),
+        ran.exchanges,
+    )
+
+
+def _told(ended: dict[str, int]) -> str:
+    return ", ".join(f"{count} x {end}" for end, count in ended.items())

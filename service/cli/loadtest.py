@@ -1,0 +1,124 @@
+"""`looktwice loadtest`: load on a running service, and what it does to latency."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from service.cli.options import DEFAULT_SCENES, Json, ScenePath, told
+
+Scenario = Literal["poisson", "sweep", "fleet", "soak", "burst", "hostile"]
+
+
+def loadtest(
+    service: Annotated[str, typer.Option(help="URL of a running service.")] = "http://127.0.0.1:8000",
+    scenario: Annotated[Scenario, typer.Option(help="What is done; docs/load-tests.md tells.")] = "poisson",
+    rate: Annotated[
+        float, typer.Option(help="Requests offered per second; where a sweep begins.", min=0.2)
+    ] = 1.0,
+    seconds: Annotated[float, typer.Option(help="Of the measured run, or of each of its steps.", min=1)] = 60,
+    warm_up: Annotated[float, typer.Option(help="Seconds before, left out of all figures.", min=0)] = 5.0,
+    mix: Annotated[
+        str, typer.Option(help="plan, direct, think, reflect, label, batch, with weights: direct=3,think=1.")
+    ] = "plan",
+    n: Annotated[str, typer.Option(help="Draws, with weights: 1=3,6=1.")] = "6",
+    payload: Annotated[str, typer.Option(help="json, msgpack, multipart, with weights.")] = "json",
+    deadline_ms: Annotated[
+        str, typer.Option(help="Told to the service, with weights: none=3,300=1.")
+    ] = "none",
+    stream: Annotated[float, typer.Option(help="Share that is streamed.", min=0, max=1)] = 0.0,
+    goal_ms: Annotated[
+        float | None,
+        typer.Option(
+            help="Latency wanted of requests without a deadline.",
+            min=1,
+            show_default="1000; of a fleet, the time between two ticks",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of arrivals, mix, pictures and draws.", min=0)] = 0,
+    workers: Annotated[int, typer.Option(help="Processes that send.", min=1)] = 1,
+    timeout_s: Annotated[float, typer.Option(help="After which an answer is given up.", min=0.1)] = 30.0,
+    lag_limit_ms: Annotated[
+        float, typer.Option(help="A run is not valid where 1 in 100 requests is sent later.", min=1)
+    ] = 25.0,
+    distinct: Annotated[
+        int, typer.Option(help="Requests made beforehand at most; then they are sent again.", min=1)
+    ] = 1000,
+    scenes: ScenePath = DEFAULT_SCENES,
+    api_key: Annotated[
+        str,
+        typer.Option(envvar="LOOKTWICE_API_KEY", help="Of a service that asks for one.", show_default=False),
+    ] = "",
+    planners: Annotated[int, typer.Option(help="fleet: how many.", min=1)] = 4,
+    hz: Annotated[float, typer.Option(help="fleet: plans a second of each; 10, 5, 2 or 1.")] = 10.0,
+    knee: Annotated[float | None, typer.Option(help="soak: what a sweep found.", min=0.05)] = None,
+    share: Annotated[float, typer.Option(help="soak: of the knee.", min=0.01, max=1)] = 0.7,
+    server_pid: Annotated[int | None, typer.Option(help="soak: whose memory is watched.")] = None,
+    factor: Annotated[float, typer.Option(help="burst: times the rate.", min=1)] = 10.0,
+    burst_seconds: Annotated[float, typer.Option(help="burst: how long.", min=0.5)] = 5.0,
+    report: Annotated[Path | None, typer.Option(help="Write a page with plots here (HTML).")] = None,
+    as_json: Json = False,
+) -> None:
+    """Offer load, measured from when each request was due; exits with 1 where the run is not valid."""
+    with told():
+        from loadtests.about import about_client, about_service, versions
+        from loadtests.hostile import Hostility
+        from loadtests.knee import KneeSearch
+        from loadtests.mix import parse_mix
+        from loadtests.report import Report
+        from loadtests.run import Result, Setup
+        from loadtests.scenarios.burst import burst
+        from loadtests.scenarios.fleet import fleet
+        from loadtests.scenarios.hostile import hostile
+        from loadtests.scenarios.poisson import poisson
+        from loadtests.scenarios.soak import soak
+        from loadtests.scenarios.sweep import sweep
+        from loadtests.sending import Target
+        from model.driving.scene_store import read_scenes
+
+        def soaked() -> Result:
+            if knee is None or server_pid is None:
+                raise ValueError(
+                    "a soak needs --knee (see the sweep) and --server-pid (whose memory is watched)"
+                )
+            return soak(setup, knee, share, server_pid)
+
+        run: dict[Scenario, Callable[[], Result]] = {
+            "poisson": lambda: poisson(setup),
+            "sweep": lambda: sweep(setup, KneeSearch(rate)),
+            "fleet": lambda: fleet(setup, planners, hz),
+            "soak": soaked,
+            "burst": lambda: burst(setup, factor, burst_seconds),
+            "hostile": lambda: hostile(setup, Hostility()),
+        }
+        goal_s = (1 / hz if scenario == "fleet" else 1.0) if goal_ms is None else goal_ms / 1000
+        setup = Setup(
+            target=Target(service.rstrip("/"), api_key, timeout_s),
+            scenes=tuple(read_scenes(scenes, dense=False)),
+            mix=parse_mix(mix, n, payload, deadline_ms, stream),
+            rate_rps=rate,
+            seconds=seconds,
+            warm_up_s=warm_up,
+            goal_s=goal_s,
+            lag_limit_s=lag_limit_ms / 1000,
+            seed=seed,
+            workers=workers,
+            distinct=distinct,
+            tell=lambda line: typer.echo(line, err=True),
+        )
+        models, client = about_service(setup.target), about_client()
+        began = datetime.now(UTC).isoformat(timespec="seconds")
+        made = Report(setup, run[scenario](), began, client, models, versions())
+        if report is not None:
+            from loadtests.page import page
+
+            report.parent.mkdir(parents=True, exist_ok=True)
+            report.write_text(page(made), encoding="utf-8")
+        typer.echo(json.dumps(made.to_json()) if as_json else str(made))
+    if not made.result.valid:
+        raise typer.Exit(1)

@@ -1,0 +1,80 @@
+"""Loads over real sockets: what an open and a closed loop report about the same service."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from itertools import pairwise
+
+import numpy as np
+
+from loadtests.accounting import Summary, summarise
+from loadtests.arrivals import Phase, Window, poisson_arrivals
+from loadtests.bodies import make_calls
+from loadtests.loads import Fleet, OpenLoop, Planner
+from loadtests.mix import Mix
+from loadtests.sending import Target
+from loadtests.workers import run_load
+from tests.loadtests.scenes import labelled_scenes
+from tests.loadtests.stand_in import StandIn, standing_in
+
+CALLS = tuple(make_calls(labelled_scenes(), Mix(draws={1: 1}), 10, seed=0))
+GOAL_S = 0.2
+
+
+def test_stalls_are_reported_by_the_clock_of_when_requests_were_due() -> None:
+    """The service stalls for 1 s in every 4 s, so a fifth of all requests cannot be in time."""
+    seconds = 8.0
+    opened = OpenLoop(poisson_arrivals([Phase("all", seconds, 25)], 3), CALLS)
+    # It asks again as soon as it has its answer, as closed loops commonly do.
+    closed = Fleet((Planner(CALLS, period_s=0.02, offset_s=0.0),), seconds)
+    with standing_in(StandIn(stall_every_s=4.0, stall_s=1.0)) as url:
+
+        async def both() -> tuple[Summary, Summary]:
+            target, starts_at = Target(url), time.monotonic() + 0.2
+            exchanges = await asyncio.gather(
+                run_load(opened, target, starts_at), run_load(closed, target, starts_at)
+            )
+            one, other = (summarise(each, Window("all", 0, seconds), GOAL_S) for each in exchanges)
+            return one, other
+
+        of_open, of_closed = asyncio.run(both())
+    answered = of_closed.answered()
+    late_of_closed = sum(not each.good(GOAL_S) for each in answered) / len(answered)
+    assert len(of_open.answered()) == len(of_open.exchanges)
+    assert 0.1 < 1 - of_open.goodput < 0.4
+    assert late_of_closed < (1 - of_open.goodput) / 3, "the answers of a closed loop alone look far better"
+    assert of_closed.count("missed") > 0.1 * len(of_closed.exchanges)
+    assert of_closed.goodput < 0.9, "and do not once its missed ticks are counted"
+
+
+def test_an_open_loop_does_not_wait_for_answers() -> None:
+    service = StandIn(service_s=1.0)
+    load = OpenLoop(np.linspace(0, 0.3, 20), CALLS)
+    with standing_in(service) as url:
+        exchanges = asyncio.run(run_load(load, Target(url), time.monotonic() + 0.1))
+    assert len(exchanges) == 20
+    last_sent_s = max(each.sent_s for each in exchanges)
+    assert last_sent_s < min(each.ended_s for each in exchanges)
+
+
+def test_a_planner_waits_and_counts_the_ticks_that_went_by() -> None:
+    planner = Planner(CALLS, period_s=0.05, offset_s=0.0)
+    with standing_in(StandIn(service_s=0.12)) as url:
+        exchanges = asyncio.run(run_load(Fleet((planner,), 1.5), Target(url), time.monotonic() + 0.1))
+    np.testing.assert_allclose([each.due_s for each in exchanges], 0.05 * np.arange(30), atol=1e-9)
+    sent = [each for each in exchanges if each.verdict.outcome == "answered"]
+    assert 0 < len(sent) <= 10
+    for before, after in pairwise(sent):
+        assert before.ended_s <= after.due_s + 1e-9
+
+
+def test_work_split_between_workers_is_the_same_work() -> None:
+    load = OpenLoop(np.arange(7.0), CALLS, first=4)
+    parts = load.split(3)
+    again = sorted(
+        (due_s, part.calls[place].body) for part in parts for place, due_s in enumerate(part.due_s.tolist())
+    )
+    assert again == [(due_s, CALLS[(4 + due_s) % 10].body) for due_s in range(7)]
+    fleet = Fleet(tuple(Planner(CALLS, 0.1, offset) for offset in (0.0, 0.01, 0.02)), 1)
+    assert {planner.offset_s for part in fleet.split(2) for planner in part.planners} == {0.0, 0.01, 0.02}

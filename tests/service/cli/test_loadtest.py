@@ -1,0 +1,70 @@
+"""`looktwice loadtest` as a process, against the service over a socket."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from service.settings import Settings
+from tests.service.scripted_engine import ScriptedEngine
+from tests.service.serving import serve
+
+
+def loadtest(url: str, *options: str) -> subprocess.CompletedProcess[str]:
+    command = [
+        sys.executable,
+        "-m",
+        "service.cli",
+        "loadtest",
+        "--service",
+        url,
+        "--warm-up",
+        "0.5",
+        *options,
+    ]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def test_scripts_find_what_they_rely_on(tmp_path: Path) -> None:
+    report = tmp_path / "reports" / "load.html"
+    mix = ("--mix", "direct=2,think=2,reflect=1,label=1", "--n", "1,2", "--deadline-ms", "none=1,5000=1")
+    with serve(ScriptedEngine(), Settings()) as served:
+        done = loadtest(
+            served.url, "--rate", "4", "--seconds", "6", *mix, "--lag-limit-ms", "5000", "--json",
+            "--report", str(report),
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr + done.stdout
+    told: dict[str, Any] = json.loads(done.stdout)
+    assert {"offered_rps", "achieved_rps", "latency_s", "errors", "rejected", "goodput", "by_branch"} <= set(
+        told
+    )
+    assert {"p50", "p95", "p99", "p999"} <= set(told["latency_s"])
+    assert (told["errors"], told["rejected"]) == (0, 0)
+    assert {"direct", "think"} <= set(told["by_branch"])
+    assert told["service"]["models"][0]["name"] == "scripted"
+    assert told["setup"]["mix"]["deadlines_ms"] == {"none": 1, "5000": 1}
+    assert "</html>" in report.read_text()
+
+
+def test_a_run_that_does_not_count_says_so_and_why() -> None:
+    engine = ScriptedEngine()
+    engine.failure = RuntimeError("out of order")
+    with serve(engine, Settings()) as served:
+        done = loadtest(served.url, "--rate", "10", "--seconds", "1", "--n", "1")
+    assert done.returncode == 1, done.stderr
+    assert "NOT VALID" in done.stdout
+    assert "did not keep up" in done.stdout
+
+
+def test_what_cannot_be_run_is_refused_before_it_begins() -> None:
+    away = loadtest("http://127.0.0.1:9")
+    assert away.returncode == 2
+    assert "not ready to be tested" in away.stderr
+    with serve(ScriptedEngine(), Settings()) as served:
+        for options in (("--mix", "sprint"), ("--scenario", "soak")):
+            refused = loadtest(served.url, *options)
+            assert refused.returncode == 2, options
+            assert refused.stderr.startswith("looktwice: ")
