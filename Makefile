@@ -13,18 +13,23 @@ VLLM_PIP := $(VLLM_BIN)/pip install --quiet --disable-pip-version-check -c deplo
 # What vLLM's CPU build brings along but never imports there, and what is linked to CUDA.
 VLLM_UNUSED := torchaudio torchcodec triton
 
-.PHONY: plan test check sim vllm test-vllm system-packages clean
+.PHONY: plan test check deploy-check sim vllm test-vllm system-packages clean
 
 plan: $(VENV)/.serve
 	$(BIN)/looktwice plan
 
-test: $(VENV)/.dev system-packages check
+test: $(VENV)/.dev $(BIN)/promtool system-packages check
 	$(BIN)/python -m pytest
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Everything in deploy/, with hadolint, helm, promtool, a local Ray and the schemas of compose, Kubernetes and Grafana.
+deploy-check: $(VENV)/.dev $(BIN)/promtool
+	$(BIN)/python -m pytest tests/deploy
+	@$(BIN)/python -m tests.deploy.covered
 
 # MetaDrive's own pins are too old to install; its real needs are in the extra `sim`.
 sim: $(VENV)/.sim
@@ -50,6 +55,14 @@ $(VENV)/.sim: $(VENV)/.torch pyproject.toml
 $(VENV)/.dev: $(VENV)/.sim
 	$(PIP) -e '.[dev]'
 	touch $@ $(VENV)/.serve
+
+# promtool alone, out of Debian's package: installing that would start a server.
+$(BIN)/promtool: | $(VENV)/.created
+	if [ "$$(id -u)" = 0 ]; then apt-get update -qq; fi
+	folder=$$(mktemp -d) && cd "$$folder" && \
+	apt-get download -qq -o APT::Sandbox::User=root prometheus && \
+	dpkg-deb --fsys-tarfile prometheus_*.deb | tar -x ./usr/bin/promtool && \
+	mv usr/bin/promtool "$(abspath $@)" && rm -r "$$folder"
 
 # vLLM's CPU build in an environment of its own: it holds other packages back (docs/vllm.md).
 vllm: $(VLLM_VENV)/.made

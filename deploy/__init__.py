@@ -1,0 +1,1 @@
+"""Where the service runs; `deploy.ray` is the one part that is code."""
