@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from clients.wire import PROBLEM_MEDIA_TYPE, Fault, Problem
+from service.callers import CALLER_LEFT_STATUS, CallerLeft
 from service.metrics import Metrics
 from service.problems import (
     BODY_TIMEOUT,
@@ -76,6 +77,10 @@ def install_error_handlers(app: FastAPI, metrics: Metrics) -> None:
     @app.exception_handler(RequestValidationError)
     async def _validation(request: Request, error: RequestValidationError) -> Response:
         return answer(request, from_validation(error))
+
+    @app.exception_handler(CallerLeft)
+    async def _left(request: Request, error: CallerLeft) -> Response:
+        return Response(status_code=CALLER_LEFT_STATUS)
 
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> Response:

@@ -10,25 +10,19 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import JSONResponse
 
 import clients.wire as wire
+from service.callers import while_connected
 from service.errors import from_validation, problem_document
 from service.openai_chat import THINKING, ChatRequest, Completion, plan_request, trajectory_text
 from service.openapi import problems
 from service.parts import Parts
 from service.payloads import payload_route
 from service.planning import Planned, last
-from service.planning_routes import (
-    CALLER_LEFT_STATUS,
-    NO_BUFFERING,
-    REFUSALS,
-    CallerLeft,
-    arrival_of,
-    while_connected,
-)
+from service.planning_routes import REFUSALS, arrival_of
 from service.problems import ProblemError
-from service.streaming import Told, Written, told_events
+from service.streaming import Told, Written, streamed
 
 
 def openai_router(parts: Parts) -> APIRouter:
@@ -47,16 +41,9 @@ def openai_router(parts: Parts) -> APIRouter:
         await parts.planning.spend(arrival.owner, chat.n)
         completion = Completion(arrival.request_id, card.name, chat)
         events = parts.planning.events(asked, arrival)
-        try:
-            if not chat.stream:
-                return JSONResponse(completion.whole(await while_connected(request, last(events))))
-            first = await while_connected(request, anext(events))
-        except CallerLeft:
-            await events.aclose()
-            return Response(status_code=CALLER_LEFT_STATUS)
-        told = told_events(first, events)
-        stream = _chunks(told, completion, arrival.request_id)
-        return StreamingResponse(stream, media_type=wire.SSE_MEDIA_TYPE, headers=NO_BUFFERING)
+        if not chat.stream:
+            return JSONResponse(completion.whole(await while_connected(request, last(events))))
+        return await streamed(request, events, lambda told: _chunks(told, completion, arrival.request_id))
 
     return router
 

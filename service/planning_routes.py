@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Header, Request
 from fastapi.openapi.models import Example
 from pydantic import BaseModel
-from starlette.responses import Response, StreamingResponse
+from starlette.responses import Response
 
 import clients.wire as wire
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from service.answers import plan_answer, reflect_answer
+from service.callers import while_connected
 from service.errors import problem_document
 from service.examples import example_reflection, example_request
 from service.openapi import Responses, payloads, problems
@@ -50,10 +51,8 @@ from service.problems import (
     ProblemError,
     at,
 )
-from service.streaming import server_sent, told_events
+from service.streaming import server_sent, streamed
 
-CALLER_LEFT_STATUS = 499
-"""Nobody reads it; logs and metrics show it."""
 PLAN_EXAMPLES: dict[str, Example] = {"straight on": {"value": example_request((FRONT_WIDE, FRONT_TELE))}}
 REFLECT_EXAMPLES: dict[str, Example] = {
     "is it right to go on?": {"value": example_reflection((FRONT_WIDE, FRONT_TELE))}
@@ -71,8 +70,6 @@ STREAM: Responses = {
         }
     }
 }
-NO_BUFFERING = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-"""Proxies must not hold events back."""
 REFUSALS = (
     *(INVALID_JSON, INVALID_BODY, UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE),
     *(INVALID_REQUEST, UNKNOWN_FIELD, INVALID_CLIP, UNKNOWN_CAMERA, MISSING_CAMERA, INVALID_IMAGE),
@@ -90,12 +87,6 @@ IdempotencyKey = Annotated[
         "before; not with stream: true.",
     ),
 ]
-
-_Done = TypeVar("_Done")
-
-
-class CallerLeft(Exception):
-    """The caller closed the connection before the answer was ready."""
 
 
 def planning_router(parts: Parts) -> APIRouter:
@@ -169,25 +160,6 @@ def respond(request: Request, answer: BaseModel) -> Response:
     return Response(answer.model_dump_json(), media_type="application/json")
 
 
-async def while_connected(request: Request, work: Awaitable[_Done]) -> _Done:
-    """What ``work`` comes to; raises `CallerLeft`, and ends it, once nobody waits for it."""
-
-    async def caller_leaves() -> None:
-        while (await request.receive())["type"] != "http.disconnect":
-            pass
-
-    working, leaving = asyncio.ensure_future(work), asyncio.ensure_future(caller_leaves())
-    try:
-        await asyncio.wait((working, leaving), return_when=asyncio.FIRST_COMPLETED)
-        if working.done():
-            return working.result()
-        raise CallerLeft
-    finally:
-        working.cancel()
-        leaving.cancel()
-        await asyncio.gather(working, leaving, return_exceptions=True)
-
-
 async def _one(
     request: Request,
     parts: Parts,
@@ -204,7 +176,8 @@ async def _one(
     if asked.stream:
         if idempotency_key is not None:
             raise ProblemError(INVALID_REQUEST, f"{wire.IDEMPOTENCY_KEY_HEADER} cannot go with stream: true")
-        return await _stream(request, parts, asked, arrival, answer)
+        events = parts.planning.events(asked, arrival)
+        return await streamed(request, events, lambda told: server_sent(told, answer, arrival.request_id))
 
     async def work() -> Response:
         return respond(request, answer(await last(parts.planning.events(asked, arrival))))
@@ -223,31 +196,7 @@ async def _once(
     if idempotency_key is not None:
         same = request.url.path.encode() + packed(asked.model_dump())
         return await parts.idempotency.once(arrival.owner, idempotency_key, same, work)
-    try:
-        return await while_connected(request, work())
-    except CallerLeft:
-        return Response(status_code=CALLER_LEFT_STATUS)
-
-
-async def _stream(
-    request: Request,
-    parts: Parts,
-    asked: Asked,
-    arrival: Arrival,
-    answer: Callable[[Planned], BaseModel],
-) -> Response:
-    events = parts.planning.events(asked, arrival)
-    try:
-        # With the first event at hand, a scene that is not let in gets a status of its own.
-        first = await while_connected(request, anext(events))
-    except CallerLeft:
-        await events.aclose()
-        return Response(status_code=CALLER_LEFT_STATUS)
-    return StreamingResponse(
-        server_sent(told_events(first, events), answer, arrival.request_id),
-        media_type=wire.SSE_MEDIA_TYPE,
-        headers=NO_BUFFERING,
-    )
+    return await while_connected(request, work())
 
 
 async def _result(parts: Parts, asked: wire.PlanRequest, arrival: Arrival) -> wire.BatchResult:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
+from typing import Final
 
 import structlog
 from fastapi.sse import format_sse_event
 from pydantic import BaseModel
+from starlette.requests import Request
+from starlette.responses import StreamingResponse
 
 import clients.wire as wire
 from model.driving.plan import parse_plan
@@ -20,12 +23,15 @@ from model.engines.engine import (
 )
 from model.formats.pieces import BRANCH
 from service.answers import wire_plan, wire_trajectory
+from service.callers import CallerLeft, while_connected
 from service.errors import problem_document
 from service.planning import Planned
 from service.problems import ProblemError, unforeseen
 
 log = structlog.stdlib.get_logger()
 
+_NO_BUFFERING: Final = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+"""Proxies must not hold events back."""
 
 Written = wire.PlanWritten | wire.BranchTaken | wire.ThinkingWritten | wire.TrajectoryWritten
 """The data of an event."""
@@ -73,6 +79,27 @@ async def server_sent(
                 yield _event("done", answer(event)) if isinstance(event, Planned) else _event(*event)
         except ProblemError as error:
             yield _event("error", problem_document(error, request_id))
+
+
+async def streamed(
+    request: Request,
+    events: AsyncGenerator[Event | Planned],
+    sent: Callable[[AsyncGenerator[Told]], AsyncGenerator[bytes]],
+) -> StreamingResponse:
+    """A scene's events as they come, in the bytes that ``sent`` makes of them.
+
+    Waits for the first event: so a scene that is not let in gets a status of its own.
+
+    Raises:
+        CallerLeft: before there was anything to send.
+    """
+    try:
+        first = await while_connected(request, anext(events))
+    except CallerLeft:
+        await events.aclose()
+        raise
+    told = told_events(first, events)
+    return StreamingResponse(sent(told), media_type=wire.SSE_MEDIA_TYPE, headers=_NO_BUFFERING)
 
 
 def _data(event: Event, told: dict[int, str]) -> list[tuple[str, Written]]:
