@@ -23,9 +23,7 @@ DATASET: Final = "looktwice"
 
 def reflections(ledger: Ledger, label: Run) -> Iterator[LabelledReflection]:
     """What a teacher wrote, with its provenance, scene by scene."""
-    rollout = next((run for run in ledger.runs("rollout") if run.id == label.config["rollout"]), None)
-    if rollout is None:
-        raise LedgerError("the labels' rollout is not in the ledger")
+    rollout = _rollout_of(ledger, label)
     for entry in ledger.entries(label):
         yield LabelledReflection(
             scene_id=entry.scene_id,
@@ -40,6 +38,37 @@ def reflections(ledger: Ledger, label: Run) -> Iterator[LabelledReflection]:
             attempts=entry.record["attempts"],
             labelled_at=entry.ended_at,
         )
+
+
+def right_plans(ledger: Ledger, label: Run, plan_iou: float) -> Iterator[LabelledReflection]:
+    """The model's own plans that agree with the expert's, at least so much: nothing is to be corrected there.
+
+    They come from all scenes of the labels' rollout, whatever the filter kept.
+    """
+    rollout = _rollout_of(ledger, label)
+    for entry in ledger.entries(rollout):
+        right = (draw["plan"] for draw in entry.record["free"] if draw["plan_iou"] >= plan_iou)
+        for plan in dict.fromkeys(right):
+            yield LabelledReflection(
+                scene_id=entry.scene_id,
+                predicted_plan=parse_plan(plan),
+                reflection="",
+                expert_plan=parse_plan(entry.record["expert_plan"]),
+                key=entry.key,
+                model=rollout.config["model"],
+                model_revision=rollout.config["revision"],
+                teacher="",
+                teacher_revision="",
+                attempts=0,
+                labelled_at=entry.ended_at,
+            )
+
+
+def _rollout_of(ledger: Ledger, label: Run) -> Run:
+    rollout = next((run for run in ledger.runs("rollout") if run.id == label.config["rollout"]), None)
+    if rollout is None:
+        raise LedgerError("the labels' rollout is not in the ledger")
+    return rollout
 
 
 def write_messages(ledger: Ledger, label: Run, scenes: Path, folder: Path) -> int:

@@ -33,11 +33,11 @@ class LabelledReflection:
     Attributes:
         scene_id: of a scene in the scene store.
         predicted_plan: what the model planned.
-        reflection: a teacher's paragraph.
+        reflection: a teacher's paragraph; empty where the plan is right and is to be acted on.
         expert_plan: what it leads to.
         key: of the label in the ledger it comes from.
         model, model_revision: who planned.
-        teacher, teacher_revision: who wrote.
+        teacher, teacher_revision: who wrote; empty where nobody did.
         attempts: how often the teacher was asked.
         labelled_at: ISO 8601, UTC.
     """

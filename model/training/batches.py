@@ -134,6 +134,7 @@ class TaskSampler(BatchSampler):
         seed: of the order; every epoch has another one.
         processes: so many batches in a row are alike, as those who share the work wait for the slowest.
         reflected: int64 [m], the example that each reflection is on.
+        thought: bool [m], which of them have reasoning and so make longer responses; by default all.
         reasoning: whether reflections are learned; otherwise their examples are learned once more without,
             the control "multi-round" of CF-VLA section 4.3.
     """
@@ -147,9 +148,11 @@ class TaskSampler(BatchSampler):
         seed: int,
         processes: int = 1,
         reflected: npt.NDArray[np.int64] = np.zeros(0, np.int64),
+        thought: npt.NDArray[np.bool_] | None = None,
         reasoning: bool = True,
     ) -> None:
         self._processes, self._reflected, self._reasoning = processes, reflected, reasoning
+        self._thought = np.ones(len(reflected), np.bool_) if thought is None else thought
         self._has_route, self.batch_size, self._tasks = has_route, batch_size, tasks
         self._route_share, self._seed, self._epoch = route_share, seed, 0
         # accelerate, sharding batches over processes, reads these two and sets the epoch of `sampler`.
@@ -178,7 +181,8 @@ class TaskSampler(BatchSampler):
             reflects = place >= count
             task: Task = "cf_vla" if reflects else names[drawn[place]]
             reflection = int(place) - count if reflects and self._reasoning else None
-            key = (task, bool(given[place]), reflection is not None)
+            thinks = reflection is not None and bool(self._thought[reflection])
+            key = (task, bool(given[place]), thinks)
             bucket = buckets.setdefault(key, [])
             bucket.append(Item(int(example[place]), task, key[1], reflection))
             if len(bucket) == self.batch_size * self._processes:

@@ -27,7 +27,10 @@ Task = Literal["traj_only", "cf_vla"]
 
 @dataclass(frozen=True)
 class Reflection:
-    """A counterfactual example's own parts: a plan that is to be corrected, and why."""
+    """A counterfactual example's own parts: a plan of the model's own, and why it is to be corrected.
+
+    ``thinking`` is empty where it is not: such a plan is acted on.
+    """
 
     first_plan: Plan
     thinking: str
@@ -50,13 +53,16 @@ def target_values(
         task: the response format's name.
         plan: the expert's plan.
         codes: the expert's trajectory codes.
-        reflection: makes it a counterfactual example: first the wrong plan, then reasoning, then ``plan``.
+        reflection: makes it a counterfactual example: first the model's plan, then reasoning and ``plan``,
+            or the trajectory at once.
     """
     trajectory = tuple(int(code) for code in codes)
     if task == "traj_only":
         return {"trajectory": trajectory}
     if reflection is None:
         return {"plan": plan, BRANCH: ACTION, "trajectory": trajectory}
+    if not reflection.thinking:
+        return {"plan": reflection.first_plan, BRANCH: ACTION, "trajectory": trajectory}
     return {
         "plan": reflection.first_plan,
         BRANCH: THINKING,

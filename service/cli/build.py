@@ -6,7 +6,7 @@ import asyncio
 import json
 import tempfile
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -232,19 +232,33 @@ def export(
     scenes: Annotated[
         Path | None, typer.Option(help="Labelled scenes, for messages and openai-batch.")
     ] = None,
+    right_iou: Annotated[
+        float | None,
+        typer.Option(
+            help="parquet: also the model's plans that agree so much with the expert's, to be acted on.",
+            min=0,
+            max=1,
+        ),
+    ] = None,
     plans_per_scene: PlansPerScene = 1,
     seed: LabelSeed = 0,
     run: Annotated[str | None, typer.Option("--run", help="Which labels (openai-batch: rollout).")] = None,
 ) -> None:
     """Write what was labelled, or what is still to be asked."""
     from clients.labelling.batch import batch_requests
-    from clients.labelling.export import reflections, write_messages
+    from clients.labelling.export import reflections, right_plans, write_messages
     from clients.labelling.ledger import Ledger
     from model.driving.reflection_store import write_reflections
 
     with told(), Ledger(folder) as ledger:
+        if right_iou is not None and form != "parquet":
+            raise ValueError(
+                f"--form {form} has no place for plans that are right: --right-iou needs parquet"
+            )
         if form == "parquet":
-            count = write_reflections(to, reflections(ledger, ledger.the_run("label", run)))
+            labels = ledger.the_run("label", run)
+            right = () if right_iou is None else right_plans(ledger, labels, right_iou)
+            count = write_reflections(to, chain(reflections(ledger, labels), right))
         elif scenes is None:
             raise ValueError(f"--form {form} needs --scenes")
         elif form == "messages":

@@ -9,7 +9,7 @@ import pytest
 
 from clients.labelling.batch import BatchError, batch_requests, read_results, take_results
 from clients.labelling.checks import FailedCheck
-from clients.labelling.export import DATASET, reflections, write_messages
+from clients.labelling.export import DATASET, reflections, right_plans, write_messages
 from clients.labelling.label import Asked, config_of, jobs, labeller, predicted_plans, questions
 from clients.labelling.ledger import Entry, Ledger, LedgerError, Run
 from clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
@@ -148,6 +148,18 @@ def test_reflections_come_out_with_their_provenance(ledger: Ledger, file: Path, 
         list(read_reflections(target))
     with pytest.raises(ReflectionFileError, match="no reflections"):
         list(read_reflections(file))
+
+
+def test_right_plans_come_out_of_all_scenes_without_words(ledger: Ledger, file: Path, tmp_path: Path) -> None:
+    run, _ = labelled(ledger, file, RuleTeacher())
+    (rollout,) = ledger.runs("rollout")
+    least = max(draw["plan_iou"] for entry in ledger.entries(rollout) for draw in entry.record["free"])
+    target = tmp_path / "reflections.parquet"
+    count = write_reflections(target, right_plans(ledger, run, least))
+    read = list(read_reflections(target))
+    assert 0 < count == len(read)
+    assert all(not each.reflection and not each.teacher and each.model == "scripted" for each in read)
+    assert list(right_plans(ledger, run, 1.1)) == []
 
 
 def test_messages_are_what_trainers_read(ledger: Ledger, file: Path, tmp_path: Path) -> None:

@@ -107,6 +107,15 @@ def test_reflections_are_examples_beside_all_others() -> None:
     assert sorted(item.index for item in items if item.reflection is None) == list(range(8))
 
 
+def test_plans_that_are_right_lie_beside_responses_of_their_length() -> None:
+    thought = np.array([True, False, True])
+    sampler = TaskSampler(
+        np.zeros(8, np.bool_), 3, {"cf_vla": 1.0}, 0.5, seed=0, reflected=REFLECTED, thought=thought
+    )
+    long = [[item.reflection in (0, 2) for item in batch] for batch in list(sampler)[:-1]]
+    assert all(len(set(batch)) == 1 for batch in long)
+
+
 def test_the_control_learns_the_same_scenes_without_reasoning() -> None:
     sampler = TaskSampler(
         np.ones(8, np.bool_), 1, {"traj_only": 1.0}, 0.5, seed=0, reflected=REFLECTED, reasoning=False

@@ -49,6 +49,15 @@ def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
     }
 
 
+def test_a_right_plan_of_its_own_is_acted_on_and_not_taught() -> None:
+    compiled = CompiledFormat(CF_VLA, VOCABULARY)
+    target = make_target(compiled, PLAN, CODES, PAPER_WEIGHTS, Reflection(WRONG, ""))
+    values = parse(CF_VLA, VOCABULARY.decode(target.ids))
+    assert values == {"plan": WRONG, "branch": "Action:", "trajectory": CODES}
+    taught = [id for id, weight in zip(target.ids, target.weights, strict=True) if weight > 0]
+    assert VOCABULARY.decode(taught).startswith("Action:")
+
+
 def test_every_section_needs_a_weight() -> None:
     with pytest.raises(KeyError):
         make_target(CompiledFormat(CF_VLA, VOCABULARY), PLAN, CODES, {"plan": 1.0})
