@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import secrets
 import time
@@ -14,7 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from clients.wire import REQUEST_ID_HEADER
 from service.errors import problem_response
 from service.metrics import Metrics
-from service.problems import unforeseen
+from service.problems import DRAINING, ProblemError, unforeseen
 from service.traces import Traces
 
 _SANE_REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._:-]{1,128}")
@@ -61,6 +62,12 @@ class Around:
                 if status:  # too late for another answer; the server breaks the connection
                     raise
                 await problem_response(unforeseen(), request_id)(scope, receive, send_with_id)
+            except asyncio.CancelledError:
+                # The server's last word at the end of a drain; whoever waits is better asking elsewhere.
+                if status:
+                    raise
+                stopped = ProblemError(DRAINING, "the service stopped before this was answered; ask another")
+                await problem_response(stopped, request_id)(scope, receive, send_with_id)
             finally:
                 if span is not None:
                     span.set_attribute("http.response.status_code", status)

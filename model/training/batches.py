@@ -1,4 +1,4 @@
-"""Batches for learning to respond: examples with a task each, padded and stacked."""
+"""Batches for learning to respond: prompts with one response or several, padded and stacked."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from model.network.prompts import motion_text
 from model.network.vocabulary import Vocabulary
 from model.training.examples import Examples
 from model.training.soft_codes import SoftCodes
-from model.training.targets import Reflection, SectionWeights, Task, make_target
+from model.training.targets import Reflection, SectionWeights, Target, Task, make_target
 
 Batch = dict[str, Tensor]
 
@@ -33,20 +33,28 @@ kept in little memory (on CPUs every new shape costs megabytes)."""
 
 @dataclass(frozen=True)
 class Item:
-    """Which example to learn from, and how; ``reflection`` is the place of one on it, where it has one."""
+    """Which example to learn from, and how.
+
+    Attributes:
+        index: of the example.
+        task: the response format.
+        route: whether the prompt has the example's route.
+        reflections: places of reflections on it, whose responses all follow the same prompt; without any,
+            the response is the expert's own.
+    """
 
     index: int
     task: Task
     route: bool
-    reflection: int | None = None
+    reflections: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One example rendered for the network."""
+    """One prompt and its responses, rendered for the network; ``code_shares`` has a row for each response."""
 
-    ids: list[int]
-    weights: list[float]
+    prompt: list[int]
+    responses: list[Target]
     patches: np.ndarray[tuple[int, ...], np.dtype[np.uint8]] | None
     history: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
     route: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
@@ -83,22 +91,24 @@ class ResponseDataset(Dataset[Sample]):
 
     def __getitem__(self, item: Item) -> Sample:
         examples, index = self._examples, item.index
-        soft = self._soft.draw(self._vectors[index], self._random)
-        target = make_target(
-            self._formats[item.task],
-            examples.plan(index),
-            soft.codes.tolist(),
-            self._weights,
-            None if item.reflection is None else self._reflections[item.reflection],
-        )
-        prompt = self._prompt(item)
+        reflections = [self._reflections[place] for place in item.reflections] or [None]
+        soft = [self._soft.draw(self._vectors[index], self._random) for _ in reflections]
         return Sample(
-            ids=prompt + list(target.ids),
-            weights=[0.0] * len(prompt) + list(target.weights),
+            prompt=self._prompt(item),
+            responses=[
+                make_target(
+                    self._formats[item.task],
+                    examples.plan(index),
+                    drawn.codes.tolist(),
+                    self._weights,
+                    reflection,
+                )
+                for drawn, reflection in zip(soft, reflections, strict=True)
+            ],
             patches=patchify(self.frames(index), self._inputs.settings) if self._pictures else None,
             history=examples.history[index],
             route=np.nan_to_num(examples.route[index]),
-            code_shares=soft.shares,
+            code_shares=np.stack([drawn.shares for drawn in soft]),
             facts=examples.facts[index],
             future=self._vectors[index] / self._size,
         )
@@ -124,17 +134,17 @@ class ResponseDataset(Dataset[Sample]):
 class TaskSampler(BatchSampler):
     """Epochs of batches; a batch has one task, with or without route, so little is padded.
 
-    Reflections are examples of their own beside all others: the natural mixture of CF-VLA section 6.
+    Reflections are examples of their own beside all others: the natural mixture of CF-VLA section 6. Those
+    on one scene share its prompt, and scenes with about as many share a batch.
 
     Args:
-        examples: how many there are, and which have a route.
-        batch_size: examples per batch.
+        has_route: bool [m], which examples have one; so many there are.
+        batch_size: responses per batch; with reflections, about so many.
         tasks: share of the examples for each task.
         route_share: share of the examples, among those that have one, that are given their route.
         seed: of the order; every epoch has another one.
         processes: so many batches in a row are alike, as those who share the work wait for the slowest.
-        reflected: int64 [m], the example that each reflection is on.
-        thought: bool [m], which of them have reasoning and so make longer responses; by default all.
+        reflected: int64 [r], the example that each reflection is on.
         reasoning: whether reflections are learned; otherwise their examples are learned once more without,
             the control "multi-round" of CF-VLA section 4.3.
     """
@@ -148,15 +158,18 @@ class TaskSampler(BatchSampler):
         seed: int,
         processes: int = 1,
         reflected: npt.NDArray[np.int64] = np.zeros(0, np.int64),
-        thought: npt.NDArray[np.bool_] | None = None,
         reasoning: bool = True,
     ) -> None:
-        self._processes, self._reflected, self._reasoning = processes, reflected, reasoning
-        self._thought = np.ones(len(reflected), np.bool_) if thought is None else thought
-        self._has_route, self.batch_size, self._tasks = has_route, batch_size, tasks
+        self._processes, self._has_route, self._tasks = processes, has_route, tasks
         self._route_share, self._seed, self._epoch = route_share, seed, 0
-        # accelerate, sharding batches over processes, reads these two and sets the epoch of `sampler`.
-        self.drop_last = True
+        self._again = np.zeros(0, np.int64) if reasoning else reflected
+        self._reflections: dict[int, list[int]] = {}
+        for place, index in enumerate(reflected if reasoning else ()):
+            self._reflections.setdefault(int(index), []).append(place)
+        mean = len(reflected) / max(1, len(self._reflections))
+        self._scenes_a_batch = max(1, round(batch_size / max(1.0, mean)))
+        # accelerate, sharding batches over processes, reads these three and sets the epoch of `sampler`.
+        self.batch_size, self.drop_last = batch_size, True
         self.sampler = cast("Sampler[int]", self)
 
     def set_epoch(self, epoch: int) -> None:
@@ -164,54 +177,87 @@ class TaskSampler(BatchSampler):
         self._epoch = epoch
 
     def __len__(self) -> int:
-        return (len(self._has_route) + len(self._reflected)) // self.batch_size
+        plain = len(self._has_route) + len(self._again)
+        return plain // self.batch_size + len(self._reflections) // self._scenes_a_batch
 
     def __iter__(self) -> Iterator[list[Item]]:  # type: ignore[override]  # items instead of positions
         random = np.random.default_rng((self._seed, self._epoch))
-        count = len(self._has_route)
-        order = random.permutation(count + len(self._reflected))
-        example = np.concatenate([np.arange(count), self._reflected])
-        given = self._has_route[example] & (random.random(len(order)) < self._route_share)
-        names = list(self._tasks)
-        drawn = random.choice(len(names), len(order), p=list(self._tasks.values()))
-        buckets: dict[tuple[Task, bool, bool], list[Item]] = {}
-        leftover: list[Item] = []
-        batches: list[list[Item]] = []
-        for place in order:
-            reflects = place >= count
-            task: Task = "cf_vla" if reflects else names[drawn[place]]
-            reflection = int(place) - count if reflects and self._reasoning else None
-            thinks = reflection is not None and bool(self._thought[reflection])
-            key = (task, bool(given[place]), thinks)
-            bucket = buckets.setdefault(key, [])
-            bucket.append(Item(int(example[place]), task, key[1], reflection))
-            if len(bucket) == self.batch_size * self._processes:
-                batches += self._split(buckets.pop(key))
-        for bucket in buckets.values():
-            leftover += bucket
-        yield from (batches + self._split(leftover))[: len(self)]
+        plain, plain_rest = self._rounds(self._plain(random), self.batch_size)
+        reflected, reflected_rest = self._rounds(self._reflected(random), self._scenes_a_batch)
+        rounds = plain + reflected
+        for place in random.permutation(len(rounds)):
+            yield from rounds[place]
+        yield from plain_rest + reflected_rest
 
-    def _split(self, items: list[Item]) -> list[list[Item]]:
-        return [items[start : start + self.batch_size] for start in range(0, len(items), self.batch_size)]
+    def _plain(self, random: np.random.Generator) -> list[Item]:
+        """The expert's own responses, in a new order; those on ``again`` with a plan."""
+        count = len(self._has_route)
+        example = np.concatenate([np.arange(count), self._again])
+        names = list(self._tasks)
+        drawn = random.choice(len(names), len(example), p=list(self._tasks.values()))
+        given = self._given(example, random)
+        return [
+            Item(int(example[place]), names[drawn[place]] if place < count else "cf_vla", bool(given[place]))
+            for place in random.permutation(len(example))
+        ]
+
+    def _reflected(self, random: np.random.Generator) -> list[Item]:
+        example = np.array(list(self._reflections), np.int64)
+        given = self._given(example, random)
+        return [
+            Item(index, "cf_vla", bool(given[place]), tuple(self._reflections[index]))
+            for place in random.permutation(len(example))
+            for index in [int(example[place])]
+        ]
+
+    def _given(self, example: npt.NDArray[np.int64], random: np.random.Generator) -> npt.NDArray[np.bool_]:
+        chosen: npt.NDArray[np.bool_] = random.random(len(example)) < self._route_share
+        return self._has_route[example] & chosen
+
+    def _rounds(self, items: list[Item], size: int) -> tuple[list[list[list[Item]]], list[list[Item]]]:
+        """Batches of like items, as many in a round as there are processes; and batches of the rest."""
+        rounds: list[list[list[Item]]] = []
+        buckets: dict[tuple[Task, bool, int], list[Item]] = {}
+        for item in items:
+            key = (item.task, item.route, len(item.reflections))
+            bucket = buckets.setdefault(key, [])
+            bucket.append(item)
+            if len(bucket) == size * self._processes:
+                rounds.append(_split(buckets.pop(key), size))
+        rest = [item for key in sorted(buckets) for item in buckets[key]]
+        return rounds, _split(rest, size)[: len(rest) // size]
+
+
+def _split(items: list[Item], size: int) -> list[list[Item]]:
+    return [items[start : start + size] for start in range(0, len(items), size)]
 
 
 def collate(samples: list[Sample]) -> Batch:
-    """Stack samples, padded on the right with token 0 and weight 0 to a multiple of `WIDTH_STEP`."""
-    width = -(-max(len(sample.ids) for sample in samples) // WIDTH_STEP) * WIDTH_STEP
+    """Stack samples, padded on the right to a multiple of `WIDTH_STEP`.
+
+    ``parts`` says what a token belongs to: 0 the prompt, k its k-th response, -1 padding.
+    """
+    longest = max(
+        len(sample.prompt) + sum(len(response.ids) for response in sample.responses) for sample in samples
+    )
+    width = -(-longest // WIDTH_STEP) * WIDTH_STEP
     ids = np.zeros((len(samples), width), np.int64)
     weights = np.zeros((len(samples), width), np.float32)
-    mask = np.zeros((len(samples), width), np.int64)
+    parts = np.full((len(samples), width), -1, np.int64)
     for row, sample in enumerate(samples):
-        ids[row, : len(sample.ids)] = sample.ids
-        weights[row, : len(sample.ids)] = sample.weights
-        mask[row, : len(sample.ids)] = 1
+        end = len(sample.prompt)
+        ids[row, :end], parts[row, :end] = sample.prompt, 0
+        for part, response in enumerate(sample.responses, start=1):
+            place = slice(end, end + len(response.ids))
+            ids[row, place], weights[row, place], parts[row, place] = response.ids, response.weights, part
+            end = place.stop
     batch = {
         "input_ids": torch.from_numpy(ids),
-        "attention_mask": torch.from_numpy(mask),
+        "parts": torch.from_numpy(parts),
         "loss_weights": torch.from_numpy(weights),
         "history": torch.from_numpy(np.stack([sample.history for sample in samples])),
         "route": torch.from_numpy(np.stack([sample.route for sample in samples])),
-        "code_shares": torch.from_numpy(np.stack([sample.code_shares for sample in samples])),
+        "code_shares": torch.from_numpy(np.concatenate([sample.code_shares for sample in samples])),
         "facts": torch.from_numpy(np.stack([sample.facts for sample in samples])),
         "futures": torch.from_numpy(np.stack([sample.future for sample in samples])),
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -14,6 +14,46 @@ from model.training.probe import SceneProbe
 
 _PLACES_STEP: Final = 256
 """Predicted places are filled up to multiples of this, for the reason that `WIDTH_STEP` gives."""
+
+
+class _Lie(NamedTuple):
+    """How responses lie behind their prompts.
+
+    Attributes:
+        prompts: int64 [b], tokens of each prompt.
+        moved: int64 [b, t], by how many places a response's tokens lie behind where they would without the
+            responses before it.
+        before: int64 [b * t], the place whose state predicts a token.
+        mask: float [b, 1, t, t], added to scores: responses see their prompt and themselves. None where
+            there is one response only: then all see what lies before them, and padding lies behind.
+    """
+
+    prompts: Tensor
+    moved: Tensor
+    before: Tensor
+    mask: Tensor | None
+
+    @classmethod
+    def of(cls, parts: Tensor) -> _Lie:
+        """From what each token belongs to; see `collate`."""
+        rows, width = parts.shape
+        place = torch.arange(width, device=parts.device)
+        prompts = (parts == 0).sum(dim=1, keepdim=True)
+        starts = (parts > 0) & (parts != parts.roll(1, dims=1))
+        start = torch.where(starts, place, 0).cummax(dim=1).values
+        before = torch.where(starts, prompts, place) - 1
+        mask = None
+        if int(parts.max()) > 1:
+            seen = (parts[:, None] == 0) | (parts[:, None] == parts[:, :, None])
+            seen &= place <= place[:, None]
+            lowest = torch.finfo(torch.float32).min
+            mask = torch.zeros(seen.shape, device=parts.device).masked_fill(~seen, lowest)[:, None]
+        return cls(
+            prompts[:, 0],
+            torch.where(parts > 0, start - prompts, 0),
+            (before + width * torch.arange(rows, device=parts.device)[:, None]).flatten(),
+            mask,
+        )
 
 
 class ResponseLearner(nn.Module):
@@ -46,7 +86,7 @@ class ResponseLearner(nn.Module):
     def forward(
         self,
         input_ids: Tensor,
-        attention_mask: Tensor,
+        parts: Tensor,
         loss_weights: Tensor,
         history: Tensor,
         route: Tensor,
@@ -63,26 +103,25 @@ class ResponseLearner(nn.Module):
             clips = len(patches) // (grid[0] * grid[1] * grid[2])
             vision_tokens = vla.vision(patches, torch.tensor([grid] * clips))
         embeddings = vla.embed(input_ids, vision_tokens, history, route)
-        # No mask: padding lies on the right, where causal attention never looks.
+        lie = _Lie.of(parts)
         outputs = self._decoder[0](
             inputs_embeds=embeddings,
-            attention_mask=None,
-            position_ids=vla.position_ids(input_ids, attention_mask),
+            attention_mask=lie.mask,
+            position_ids=vla.position_ids(input_ids, parts >= 0) - lie.moved,
             use_cache=False,
             output_hidden_states=self.probe is not None,
         )
         hidden = outputs.last_hidden_state
-        labels, weights = input_ids[:, 1:].flatten(), loss_weights[:, 1:].flatten()
+        labels, weights = input_ids.flatten(), loss_weights.flatten()
         # Logits only where a token is predicted that counts: a third of the positions.
         places = weights.nonzero()[:, 0]
         filling = -len(places) % _PLACES_STEP
-        logits = vla.lm_head(hidden[:, :-1].flatten(0, 1)[F.pad(places, (0, filling))])
+        logits = vla.lm_head(hidden.flatten(0, 1)[F.pad(lie.before[places], (0, filling))])
         labels, weights = F.pad(labels[places], (0, filling)), F.pad(weights[places], (0, filling))
-        parts = response_loss(logits, labels, weights, self._first_code_id, code_shares)._asdict()
+        losses = response_loss(logits, labels, weights, self._first_code_id, code_shares)._asdict()
         if self.probe is not None:
             halfway = outputs.hidden_states[len(outputs.hidden_states) // 2]
-            last_of_prompt = (loss_weights > 0).int().argmax(dim=1) - 1
-            states = halfway[torch.arange(len(halfway), device=halfway.device), last_of_prompt]
+            states = halfway[torch.arange(len(halfway), device=halfway.device), lie.prompts - 1]
             probed = self.probe(states, facts, futures)
-            parts |= probed | {"loss": parts["loss"] + probed["loss"]}
-        return parts
+            losses |= probed | {"loss": losses["loss"] + probed["loss"]}
+        return losses

@@ -19,11 +19,6 @@ class OnExamples(NamedTuple):
     examples: npt.NDArray[np.int64]
     reflections: list[Reflection]
 
-    @property
-    def thought(self) -> npt.NDArray[np.bool_]:
-        """Bool [m], which of them correct a plan; the others leave it as it is."""
-        return np.array([bool(each.thinking) for each in self.reflections], np.bool_)
-
 
 def reflections_on(examples: Examples, found: Iterable[LabelledReflection]) -> OnExamples:
     """Reflections with the examples of their scenes; raises `ValueError` where a scene is missing."""

@@ -184,7 +184,6 @@ def _prepare(
         recipe.seed,
         processes=int(os.environ.get("WORLD_SIZE", 1)),
         reflected=np.zeros(0, np.int64) if on_examples is None else on_examples.examples,
-        thought=None if on_examples is None else on_examples.thought,
         reasoning=recipe.reflections == "learned",
     )
     loaded.model.model.visual.requires_grad_(recipe.vision_rate > 0)
@@ -210,6 +209,6 @@ def _about(recipe: Recipe, examples: Examples, on_examples: OnExamples | None) -
     about = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     about |= {"tasks": dict(recipe.tasks), "weights": dict(recipe.weights)}
     if on_examples is not None:
-        thought = int(on_examples.thought.sum())
+        thought = sum(bool(each.thinking) for each in on_examples.reflections)
         about |= {"reflections_count": thought, "right_plans_count": len(on_examples.reflections) - thought}
     return about | {"examples": len(examples), "episodes": len(np.unique(examples.episode))}

@@ -25,6 +25,7 @@ from service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem
+from tests.sockets import listening
 
 WAIT_S = 120
 
@@ -111,8 +112,6 @@ def test_while_draining_it_says_so(engine: ScriptedEngine) -> None:
     settings = Settings(drain_notice_s=0.0)
     app = create_app(engine, settings)
     server = make_server(app, settings)
-    from tests.sockets import listening
-
     with listening(app, 0, server) as (url, loop), httpx.Client(base_url=url, timeout=30) as http:
         served = Served(engine, url, http, loop)
         served.until_ready()
@@ -136,6 +135,25 @@ def test_while_draining_it_says_so(engine: ScriptedEngine) -> None:
         served.in_loop(engine.may_finish.set)
         thread.join()
         assert answers == [200]
+
+
+def test_what_is_cut_off_at_the_end_of_a_drain_is_told_to_ask_elsewhere(
+    engine: ScriptedEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.server._LAST_WORDS_S", 0.2)
+    settings = Settings(drain_notice_s=0.0)
+    app = create_app(engine, settings)
+    server = make_server(app, settings)
+    with listening(app, 0, server) as (url, loop), httpx.Client(base_url=url, timeout=30) as http:
+        served = Served(engine, url, http, loop)
+        served.until_ready()
+        with socket.create_connection(("127.0.0.1", int(url.rsplit(":", 1)[1])), 30) as half:
+            half.sendall(b"POST /v1/plan HTTP/1.1\r\nHost: x\r\nContent-Length: 1000\r\n\r\n{")
+            served.until(lambda: len(server.server_state.tasks) > 0)
+            served.in_loop(server.drain)
+            told = b"".join(iter(lambda: half.recv(65536), b""))
+    assert told.startswith(b"HTTP/1.1 503")
+    assert b"draining" in told
 
 
 def test_it_does_not_open_itself_to_others_without_keys(engine: ScriptedEngine, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from model.driving.plan import parse_plan
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.network.checkpoint import Loaded, load
-from model.training.batches import Item, ResponseDataset, TaskSampler, collate
+from model.training.batches import Item, ResponseDataset, Sample, TaskSampler, collate
 from model.training.examples import Examples
 from model.training.learner import ResponseLearner
 from model.training.targets import PAPER_WEIGHTS, Reflection, Task
@@ -66,9 +67,13 @@ def test_processes_get_batches_of_one_kind_at_a_time() -> None:
 def test_only_the_response_weighs(loaded: Loaded) -> None:
     sample = dataset(loaded)[Item(1, "cf_vla", True)]
     prompt = loaded.inputs.prompt("cf_vla", route=True).ids.tolist()
-    assert sample.ids[: len(prompt)] == prompt
-    assert set(sample.weights[: len(prompt)]) == {0.0}
-    assert min(sample.weights[len(prompt) :]) > 0
+    assert sample.prompt == prompt
+    batch = collate([sample])
+    (response,) = sample.responses
+    weights = batch["loss_weights"][0].tolist()
+    assert batch["input_ids"][0, : len(prompt) + len(response.ids)].tolist() == prompt + list(response.ids)
+    assert set(weights[: len(prompt)]) == {0.0}
+    assert min(weights[len(prompt) : len(prompt) + len(response.ids)]) > 0
 
 
 def test_padding_changes_no_loss(loaded: Loaded) -> None:
@@ -98,22 +103,63 @@ REFLECTED = np.array([3, 3, 5], np.int64)
 def test_reflections_are_examples_beside_all_others() -> None:
     sampler = TaskSampler(np.ones(8, np.bool_), 1, {"cf_vla": 1.0}, 0.5, seed=0, reflected=REFLECTED)
     items = [item for batch in sampler for item in batch]
-    assert len(items) == len(sampler) == 11
-    assert {(item.index, item.reflection) for item in items if item.reflection is not None} == {
-        (3, 0),
-        (3, 1),
-        (5, 2),
-    }
-    assert sorted(item.index for item in items if item.reflection is None) == list(range(8))
+    assert len(items) == len(sampler) == 10
+    reflected = [item for item in items if item.reflections]
+    assert {(item.index, item.reflections) for item in reflected} == {(3, (0, 1)), (5, (2,))}
+    assert sorted(item.index for item in items if not item.reflections) == list(range(8))
 
 
-def test_plans_that_are_right_lie_beside_responses_of_their_length() -> None:
-    thought = np.array([True, False, True])
+@pytest.mark.parametrize("processes", [1, 2])
+def test_batches_of_reflections_lie_among_the_others(processes: int) -> None:
+    reflected = np.repeat(np.arange(0, 4000, 4), 3)
     sampler = TaskSampler(
-        np.zeros(8, np.bool_), 3, {"cf_vla": 1.0}, 0.5, seed=0, reflected=REFLECTED, thought=thought
+        np.ones(4000, np.bool_), 16, {"cf_vla": 1.0}, 0.5, seed=0, processes=processes, reflected=reflected
     )
-    long = [[item.reflection in (0, 2) for item in batch] for batch in list(sampler)[:-1]]
-    assert all(len(set(batch)) == 1 for batch in long)
+    batches = list(sampler)
+    assert len(batches) == len(sampler) == 250 + 200
+    sizes = [len(batch) for batch in batches if batch[0].reflections]
+    assert set(sizes) == {5}, "of three responses each"
+    first_half = [bool(batch[0].reflections) for batch in batches[: len(batches) // 2]]
+    assert 0.3 < sum(first_half) / len(first_half) < 0.6
+    kinds = [{(item.route, bool(item.reflections)) for item in batch} for batch in batches]
+    alike = [one == two for one, two in zip(kinds[::2], kinds[1::2], strict=True)]
+    assert processes == 1 or alike.count(False) <= 4
+
+
+def test_responses_that_share_a_prompt_do_not_see_each_other(loaded: Loaded) -> None:
+    """Their loss is the mean of their losses alone, to the last gradient."""
+    texts = ("The road ahead is clear, so I should drive on.", "", "The car ahead has stopped: slow down.")
+    wrong = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
+    examples = Examples.from_scenes((training_scene(k) for k in range(8)), (FRONT_WIDE, FRONT_TELE))
+    data = ResponseDataset(
+        examples,
+        loaded.codec,
+        loaded.inputs,
+        loaded.vocabulary,
+        PAPER_WEIGHTS,
+        pictures=True,
+        reflections=[Reflection(wrong, text) for text in texts],
+    )
+    samples = [data[Item(2, "cf_vla", True, (0, 1, 2))], data[Item(4, "cf_vla", False, (1,))]]
+    alone = [
+        replace(sample, responses=[response], code_shares=shares[None])
+        for sample in samples
+        for response, shares in zip(sample.responses, sample.code_shares, strict=True)
+    ]
+    learner = ResponseLearner(loaded.model, loaded.vocabulary.code_ids(0).start)
+
+    def learned(batch: list[Sample]) -> tuple[float, torch.Tensor]:
+        loaded.model.zero_grad()
+        loss = learner(**collate(batch))["loss"]
+        loss.backward()
+        gradient = loaded.model.lm_head.weight.grad
+        assert gradient is not None
+        return loss.item(), gradient.clone()
+
+    together, separate = learned(samples), learned(alone)
+    loaded.model.zero_grad()
+    assert together[0] == pytest.approx(separate[0], rel=1e-5)
+    torch.testing.assert_close(together[1], separate[1], rtol=1e-3, atol=1e-6)
 
 
 def test_the_control_learns_the_same_scenes_without_reasoning() -> None:
@@ -121,7 +167,7 @@ def test_the_control_learns_the_same_scenes_without_reasoning() -> None:
         np.ones(8, np.bool_), 1, {"traj_only": 1.0}, 0.5, seed=0, reflected=REFLECTED, reasoning=False
     )
     items = [item for batch in sampler for item in batch]
-    assert {item.reflection for item in items} == {None}
+    assert {item.reflections for item in items} == {()}
     assert Counter(item.index for item in items if item.task == "cf_vla") == {3: 2, 5: 1}
 
 
@@ -137,15 +183,14 @@ def test_a_counterfactual_example_learns_everything_but_the_wrong_plan(loaded: L
         pictures=True,
         reflections=[Reflection(wrong, "The road ahead is clear, so I should drive on.")],
     )
-    sample = data[Item(2, "cf_vla", True, 0)]
-    prompt = len(loaded.inputs.prompt("cf_vla", route=True).ids)
-    response = loaded.vocabulary.decode(sample.ids[prompt:])
-    plain = data[Item(2, "cf_vla", True)]
+    (target,) = data[Item(2, "cf_vla", True, (0,))].responses
+    response = loaded.vocabulary.decode(target.ids)
+    (plain,) = data[Item(2, "cf_vla", True)].responses
     assert str(wrong) in response
     assert "The road ahead is clear" in response
     assert str(examples.plan(2)) in response
     assert response.index(str(wrong)) < response.index("Thinking:") < response.index(str(examples.plan(2)))
-    weighed = [token for token, weight in zip(sample.ids, sample.weights, strict=True) if weight > 0]
+    weighed = [token for token, weight in zip(target.ids, target.weights, strict=True) if weight > 0]
     assert loaded.vocabulary.decode(weighed).startswith("Thinking:")
     assert "Wait" not in loaded.vocabulary.decode(weighed)
     assert "Thinking:" not in loaded.vocabulary.decode(plain.ids)
