@@ -91,7 +91,8 @@ class ResponseDataset(Dataset[Sample]):
 
     def __getitem__(self, item: Item) -> Sample:
         examples, index = self._examples, item.index
-        reflections = [self._reflections[place] for place in item.reflections] or [None]
+        reflections: Sequence[Reflection | None] = [self._reflections[place] for place in item.reflections]
+        reflections = reflections or [None]
         soft = [self._soft.draw(self._vectors[index], self._random) for _ in reflections]
         return Sample(
             prompt=self._prompt(item),
