@@ -21,10 +21,13 @@ Ids = npt.NDArray[np.int64]
 GUESSES: Final = 24
 """Decisions guessed from habits in a pass, over all its rows: two of three are right, but with many rows one
 that is wrong still holds up the pass, and what is fed costs more than it saves."""
+GUESSES_A_ROW: Final = 8
+"""And over one row: that all of more are right is rare."""
 _REPEAT_TOKENS: Final = 64
 """Fed ahead at most as the last answer to the same pictures went on."""
 _HABITUAL: Final = 64
-"""Decisions between more tokens than this (codes, free words) are no matter of habit."""
+"""Decisions between more tokens than this (codes) are no matter of habit, unless they are a text's: what is
+said of a scene is said in much the same words of the next one."""
 _CONTEXT: Final = max(CONTEXTS)
 
 
@@ -65,7 +68,7 @@ class Ahead:
                     token = int(ids[0])
                 elif before in ids:
                     token = before if ahead < _REPEAT_TOKENS else None
-                elif len(ids) <= _HABITUAL and guessed < guesses:
+                elif (len(ids) <= _HABITUAL or cursor.stop_id is not None) and guessed < guesses:
                     guessed += 1
                     number = uniform(controls.seed, row.draws[0], written + ahead)
                     token = self._habits.likely(context, number if controls.temperature else None)
@@ -78,7 +81,7 @@ class Ahead:
 
     def saw(self, row: Row, alternatives: int, chosen: Sequence[tuple[int, tuple[int, ...]]]) -> None:
         """Draws of a row are about to write tokens, chosen among so many."""
-        if alternatives <= _HABITUAL:
+        if alternatives <= _HABITUAL or row.cursor.stop_id is not None:
             context = [token.id for token in row.tokens[-_CONTEXT:]]
             for token, draws in chosen:
                 self._habits.saw(context, token, len(draws))

@@ -21,7 +21,7 @@ from model.engines.engine import (
     Started,
 )
 from model.engines.requests import begin, branch_of, read
-from model.engines.torch.ahead import GUESSES, Ahead
+from model.engines.torch.ahead import GUESSES, GUESSES_A_ROW, Ahead
 from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
 from model.engines.torch.runner import ROWS_A_PROMPT, Feed, Prompt, Runner
@@ -296,7 +296,7 @@ class Decoder:
         if not self._shortcuts.jump and len(row.pending) > 1:
             return Feed(row.prompt, row.held, row.pending[:1], ())
         speculate = self._shortcuts.speculate
-        guesses = GUESSES // len(self._rows) if speculate else 0
+        guesses = min(GUESSES_A_ROW, GUESSES // len(self._rows)) if speculate else 0
         tokens, wanted = self._ahead.feed(row, copy=speculate, guesses=guesses)
         return Feed(row.prompt, row.held, tokens, wanted)
 

@@ -12,6 +12,9 @@ _FIRST_ENDING: Final = 40.0
 """Passes from the end of thinking to the end of the response, before any was seen."""
 _CALM: Final = 1.5
 """With less than so many times the necessary time left, a text ends at the next sentence."""
+_LATE_STEPS: Final = 3.0
+"""So many times their usual deviation steps may take longer than usual: when a new scene's prompt goes
+through the network between two of them, for one."""
 
 
 class TimeFor(Enum):
@@ -23,14 +26,15 @@ class TimeFor(Enum):
 
 
 class Pace:
-    """Running means of the time of a step and of the passes that follow a text."""
+    """Running means of the time of a step, of how far steps are from it, and of the passes behind a text."""
 
     def __init__(self) -> None:
-        self.step_s = _FIRST_STEP_S
+        self.step_s, self.deviation_s = _FIRST_STEP_S, 0.0
         self.ending_passes = _FIRST_ENDING
 
     def saw_step(self, seconds: float) -> None:
         """A step took so long."""
+        self.deviation_s += _MEMORY * (abs(seconds - self.step_s) - self.deviation_s)
         self.step_s += _MEMORY * (seconds - self.step_s)
 
     def saw_ending(self, passes: int) -> None:
@@ -46,5 +50,5 @@ class Pace:
         return TimeFor.END_SENTENCE if left_s > needed_s else TimeFor.END_NOW
 
     def last_step(self, deadline_s: float, now_s: float) -> bool:
-        """Whether another step would end behind the deadline."""
-        return now_s + self.step_s > deadline_s
+        """Whether another step might end behind the deadline."""
+        return now_s + self.step_s + _LATE_STEPS * self.deviation_s > deadline_s

@@ -7,11 +7,13 @@ from typing import Any
 import pytest
 
 from model.engines.engine import Controls, PlanRequest
+from model.engines.requests import branch_of
 from model.engines.torch.ahead import Ahead
 from model.engines.torch.rows import Request, Row
 from model.engines.torch.sampler import uniform
 from model.formats.cf_vla import CF_VLA
 from model.formats.cursor import CompiledFormat
+from model.formats.pieces import BRANCH, THINKING
 from model.network.checkpoint import Loaded, load
 from tests.checkpoints import noisy_scene
 
@@ -60,6 +62,25 @@ def test_at_temperature_zero_the_most_frequent_is_guessed(loaded: Loaded) -> Non
     ahead.saw(row, len(ids), [(int(ids[0]), (0,)), (int(ids[1]), (1, 2))])
     tokens, _ = ahead.feed(row, copy=False, guesses=1)
     assert tokens[len(row.pending)] == int(ids[1])
+
+
+def test_texts_are_guessed_and_codes_are_not(loaded: Loaded) -> None:
+    def at(section: str) -> Row:
+        row = beginning(loaded)
+        while row.cursor.section != section:
+            allowed, token = row.cursor.allowed(), row.cursor.stop_id
+            if allowed.choice == BRANCH:
+                token = next(int(id) for id in allowed.ids if branch_of(row.cursor, int(id)) == THINKING)
+            row.write((int(allowed.ids[-1]) if token is None else token,), loaded.vocabulary)
+        return row
+
+    for section, guessed in (("thinking", True), ("trajectory", False)):
+        row, ahead = at(section), Ahead()
+        ids = row.cursor.allowed().ids
+        assert len(ids) > 64
+        ahead.saw(row, len(ids), [(int(ids[5]), (0,))])
+        tokens, _ = ahead.feed(row, copy=False, guesses=1)
+        assert (tokens[len(row.pending) :] == [int(ids[5])]) is guessed
 
 
 def test_the_last_answer_to_the_same_pictures_is_repeated(loaded: Loaded) -> None:

@@ -227,7 +227,7 @@ def test_at_the_deadline_the_draft_is_the_answer(exact: Loaded) -> None:
 class Steady(Pace):
     """Steps of 10 ms, 40 of them behind a text, whatever is seen."""
 
-    step_s, ending_passes = 0.01, 40.0
+    step_s, deviation_s, ending_passes = 0.01, 0.0, 40.0
 
     def __init__(self) -> None:
         pass
@@ -272,6 +272,17 @@ def test_thinking_is_cut_when_the_rest_would_not_fit(exact: Loaded) -> None:
     assert draw.revised_plan is not None
     assert draw.tokens["thinking"] < unhurried.tokens["thinking"]
     assert draw.plan == unhurried.plan
+
+
+def test_steps_that_vary_are_left_more_room() -> None:
+    steady, varying = Pace(), Pace()
+    for step in range(200):
+        steady.saw_step(0.05)
+        varying.saw_step(0.02 if step % 2 else 0.08)
+    assert not steady.last_step(10.0, 9.94)
+    assert steady.last_step(10.0, 9.96)
+    assert varying.last_step(10.0, 9.9)
+    assert not varying.last_step(10.0, 9.8)
 
 
 def test_every_response_parses_at_high_temperature(untrained_checkpoint: Path) -> None:
