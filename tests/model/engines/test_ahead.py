@@ -68,10 +68,12 @@ def test_texts_are_guessed_and_codes_are_not(loaded: Loaded) -> None:
     def at(section: str) -> Row:
         row = beginning(loaded)
         while row.cursor.section != section:
-            allowed, token = row.cursor.allowed(), row.cursor.stop_id
+            allowed = row.cursor.allowed()
+            token = row.cursor.stop_id if row.cursor.stop_id in allowed.ids else int(allowed.ids[-1])
             if allowed.choice == BRANCH:
                 token = next(int(id) for id in allowed.ids if branch_of(row.cursor, int(id)) == THINKING)
-            row.write((int(allowed.ids[-1]) if token is None else token,), loaded.vocabulary)
+            assert token is not None
+            row.write((token,), loaded.vocabulary)
         return row
 
     for section, guessed in (("thinking", True), ("trajectory", False)):
