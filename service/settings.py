@@ -52,7 +52,7 @@ class Settings(BaseSettings):
     api_keys_file: Path | None = None
     open: bool = False
     rate_limit: str | None = None
-    max_draws: int = Field(default=24, gt=0)
+    max_draws: int = Field(default=12, gt=0)
     max_scenes: int = Field(default=64, gt=0)
     max_connections: int = Field(default=1024, gt=0)
     queue_timeout_s: float = Field(default=10.0, gt=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
@@ -64,6 +65,7 @@ _RUNGS: Final = (
     Rung(ROUND_2, "counterfactual", COUNTERFACTUAL, "round-2"),
 )
 _PLANS_PER_SCENE: Final = 6
+_ROWS: Final = 96
 
 
 def climb(
@@ -129,8 +131,19 @@ def _served(checkpoint: Path) -> Iterator[str]:
     """A service over a checkpoint on a port of its own, until the block ends."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    command = [*_LOOKTWICE, "serve", "--checkpoint", str(checkpoint), "--port", str(port), "--rows", "96"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    command = [
+        *_LOOKTWICE,
+        "serve",
+        "--checkpoint",
+        str(checkpoint),
+        "--port",
+        str(port),
+        "--rows",
+        str(_ROWS),
+    ]
+    # Nobody waits for an answer here: the more at once the better.
+    environment = os.environ | {"LOOKTWICE_MAX_DRAWS": str(_ROWS)}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
     url = f"http://127.0.0.1:{port}"
     try:
         _wait_for(url, process)

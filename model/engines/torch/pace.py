@@ -12,7 +12,7 @@ _FIRST_ENDING: Final = 40.0
 """Passes from the end of thinking to the end of the response, before any was seen."""
 _CALM: Final = 1.5
 """With less than so many times the necessary time left, a text ends at the next sentence."""
-_LATE_STEPS: Final = 3.0
+_LATE_STEPS: Final = 4.0
 """So many times their usual deviation steps may take longer than usual: when a new scene's prompt goes
 through the network between two of them, for one."""
 

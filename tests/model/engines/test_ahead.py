@@ -64,25 +64,19 @@ def test_at_temperature_zero_the_most_frequent_is_guessed(loaded: Loaded) -> Non
     assert tokens[len(row.pending)] == int(ids[1])
 
 
-def test_texts_are_guessed_and_codes_are_not(loaded: Loaded) -> None:
-    def at(section: str) -> Row:
-        row = beginning(loaded)
-        while row.cursor.section != section:
-            allowed = row.cursor.allowed()
-            token = row.cursor.stop_id if row.cursor.stop_id in allowed.ids else int(allowed.ids[-1])
-            if allowed.choice == BRANCH:
-                token = next(int(id) for id in allowed.ids if branch_of(row.cursor, int(id)) == THINKING)
-            assert token is not None
-            row.write((token,), loaded.vocabulary)
-        return row
-
-    for section, guessed in (("thinking", True), ("trajectory", False)):
-        row, ahead = at(section), Ahead()
-        ids = row.cursor.allowed().ids
-        assert len(ids) > 64
-        ahead.saw(row, len(ids), [(int(ids[5]), (0,))])
-        tokens, _ = ahead.feed(row, copy=False, guesses=1)
-        assert (tokens[len(row.pending) :] == [int(ids[5])]) is guessed
+def test_texts_are_guessed_though_any_word_may_follow(loaded: Loaded) -> None:
+    row, ahead = beginning(loaded), Ahead()
+    while row.cursor.stop_id is None:
+        allowed = row.cursor.allowed()
+        token = int(allowed.ids[-1])
+        if allowed.choice == BRANCH:
+            token = next(int(id) for id in allowed.ids if branch_of(row.cursor, int(id)) == THINKING)
+        row.write((token,), loaded.vocabulary)
+    ids = row.cursor.allowed().ids
+    assert len(ids) > 64
+    ahead.saw(row, len(ids), [(int(ids[5]), (0,))])
+    tokens, _ = ahead.feed(row, copy=False, guesses=1)
+    assert tokens[len(row.pending) :] == [int(ids[5])]
 
 
 def test_the_last_answer_to_the_same_pictures_is_repeated(loaded: Loaded) -> None:
