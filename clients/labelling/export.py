@@ -47,13 +47,14 @@ def right_plans(ledger: Ledger, label: Run, plan_iou: float) -> Iterator[Labelle
     """
     rollout = _rollout_of(ledger, label)
     for entry in ledger.entries(rollout):
+        expert = parse_plan(entry.record["expert_plan"])
         right = (draw["plan"] for draw in entry.record["free"] if draw["plan_iou"] >= plan_iou)
         for plan in dict.fromkeys(right):
             yield LabelledReflection(
                 scene_id=entry.scene_id,
                 predicted_plan=parse_plan(plan),
                 reflection="",
-                expert_plan=parse_plan(entry.record["expert_plan"]),
+                expert_plan=expert,
                 key=entry.key,
                 model=rollout.config["model"],
                 model_revision=rollout.config["revision"],

@@ -23,10 +23,20 @@ def loaded(untrained_checkpoint: Path) -> Loaded:
     return load(untrained_checkpoint)
 
 
-def dataset(loaded: Loaded, *, pictures: bool = True) -> ResponseDataset:
-    examples = Examples.from_scenes((training_scene(k) for k in range(8)), (FRONT_WIDE, FRONT_TELE))
+WRONG = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
+EXAMPLES = Examples.from_scenes((training_scene(k) for k in range(8)), (FRONT_WIDE, FRONT_TELE))
+
+
+def dataset(loaded: Loaded, *texts: str, pictures: bool = True) -> ResponseDataset:
+    """With a reflection on `WRONG` for each text."""
     return ResponseDataset(
-        examples, loaded.codec, loaded.inputs, loaded.vocabulary, PAPER_WEIGHTS, pictures=pictures
+        EXAMPLES,
+        loaded.codec,
+        loaded.inputs,
+        loaded.vocabulary,
+        PAPER_WEIGHTS,
+        pictures=pictures,
+        reflections=[Reflection(WRONG, text) for text in texts],
     )
 
 
@@ -129,17 +139,7 @@ def test_batches_of_reflections_lie_among_the_others(processes: int) -> None:
 def test_responses_that_share_a_prompt_do_not_see_each_other(loaded: Loaded) -> None:
     """Their loss is the mean of their losses alone, to the last gradient."""
     texts = ("The road ahead is clear, so I should drive on.", "", "The car ahead has stopped: slow down.")
-    wrong = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
-    examples = Examples.from_scenes((training_scene(k) for k in range(8)), (FRONT_WIDE, FRONT_TELE))
-    data = ResponseDataset(
-        examples,
-        loaded.codec,
-        loaded.inputs,
-        loaded.vocabulary,
-        PAPER_WEIGHTS,
-        pictures=True,
-        reflections=[Reflection(wrong, text) for text in texts],
-    )
+    data = dataset(loaded, *texts)
     samples = [data[Item(2, "cf_vla", True, (0, 1, 2))], data[Item(4, "cf_vla", False, (1,))]]
     alone = [
         replace(sample, responses=[response], code_shares=shares[None])
@@ -172,24 +172,14 @@ def test_the_control_learns_the_same_scenes_without_reasoning() -> None:
 
 
 def test_a_counterfactual_example_learns_everything_but_the_wrong_plan(loaded: Loaded) -> None:
-    wrong = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
-    examples = Examples.from_scenes((training_scene(k) for k in range(8)), (FRONT_WIDE, FRONT_TELE))
-    data = ResponseDataset(
-        examples,
-        loaded.codec,
-        loaded.inputs,
-        loaded.vocabulary,
-        PAPER_WEIGHTS,
-        pictures=True,
-        reflections=[Reflection(wrong, "The road ahead is clear, so I should drive on.")],
-    )
+    data = dataset(loaded, "The road ahead is clear, so I should drive on.")
     (target,) = data[Item(2, "cf_vla", True, (0,))].responses
     response = loaded.vocabulary.decode(target.ids)
     (plain,) = data[Item(2, "cf_vla", True)].responses
-    assert str(wrong) in response
+    assert str(WRONG) in response
     assert "The road ahead is clear" in response
-    assert str(examples.plan(2)) in response
-    assert response.index(str(wrong)) < response.index("Thinking:") < response.index(str(examples.plan(2)))
+    assert str(EXAMPLES.plan(2)) in response
+    assert response.index(str(WRONG)) < response.index("Thinking:") < response.index(str(EXAMPLES.plan(2)))
     weighed = [token for token, weight in zip(target.ids, target.weights, strict=True) if weight > 0]
     assert loaded.vocabulary.decode(weighed).startswith("Thinking:")
     assert "Wait" not in loaded.vocabulary.decode(weighed)
