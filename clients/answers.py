@@ -241,16 +241,18 @@ def told(event: ServerSentEvent, response: httpx.Response) -> Told | None:
     """
     name, data = event.event, event.data
     try:
-        if name == "error":
-            raise _typed(wire.Problem.model_validate_json(data))
         if name == "done" and response.url.path == "/v1/reflect":
             return _reflected(wire.ReflectResponse.model_validate_json(data), response)
         if name == "done":
             return _planned(wire.PlanResponse.model_validate_json(data), response)
-        kind = wire.EVENTS.get(name)
-        return None if kind is None else kind.model_validate_json(data)  # type: ignore[return-value]
+        if name not in wire.EVENTS:
+            return None
+        event_data = wire.EVENTS[name].model_validate_json(data)
     except ValidationError as error:
         raise BadAnswer(f"{response.url} told of something else than {name}: {error}") from error
+    if isinstance(event_data, wire.Problem):
+        raise _typed(event_data)
+    return event_data
 
 
 def reflect_result(response: httpx.Response) -> ReflectResult:

@@ -17,7 +17,7 @@ from collections.abc import AsyncGenerator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self, TypedDict
+from typing import Self, TypedDict
 
 import httpx
 import msgpack
@@ -50,6 +50,7 @@ from clients.answers import (
 )
 from clients.labelling.teachers.view import Surroundings
 from clients.requests import label_request, plan_request, reflect_request
+from clients.wire_values import with_pictures
 from model.driving.plan import Plan
 from model.driving.scene import Scene
 
@@ -418,18 +419,8 @@ def _body(asked: BaseModel, request_id: str | None, *, packed: bool) -> _Body:
 
 
 def _packed(asked: BaseModel) -> bytes:
-    content: bytes = msgpack.packb(_with_raw_images(asked.model_dump()))
+    content: bytes = msgpack.packb(with_pictures(asked.model_dump(), base64.b64decode))
     return content
-
-
-def _with_raw_images(node: Any) -> Any:
-    """The document with its pictures as bytes instead of base64."""
-    if isinstance(node, dict):
-        return {
-            key: [base64.b64decode(image) for image in value] if key == "images" else _with_raw_images(value)
-            for key, value in node.items()
-        }
-    return [_with_raw_images(value) for value in node] if isinstance(node, list) else node
 
 
 def _headers(access: Access) -> dict[str, str]:

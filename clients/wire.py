@@ -517,7 +517,9 @@ class TrajectoryWritten(Answered):
     trajectory: Trajectory
 
 
-EVENTS: Final[dict[str, type[Answered]]] = {
+Event = PlanWritten | BranchTaken | TrajectoryWritten | ThinkingWritten | Problem
+
+EVENTS: Final[dict[str, type[Event]]] = {
     "plan": PlanWritten,
     "branch": BranchTaken,
     "draft_trajectory": TrajectoryWritten,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
-from typing import cast
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,20 @@ def wire_scene(scene: Scene, decimals: int | None = None) -> wire.Scene:
         history=rows(scene.history, decimals),
         route=None if scene.route is None else rows(scene.route, decimals),
     )
+
+
+def with_pictures(document: Any, change: Callable[[Any], Any]) -> Any:
+    """A request's document with ``change`` made to every picture; what is no picture is as it was."""
+    if isinstance(document, dict):
+        return {
+            key: [change(picture) for picture in value]
+            if key == "images" and isinstance(value, list)
+            else with_pictures(value, change)
+            for key, value in document.items()
+        }
+    if isinstance(document, list):
+        return [with_pictures(value, change) for value in document]
+    return document
 
 
 def wire_agents(agents: Sequence[Agent], decimals: int | None = None) -> list[wire.Agent]:

@@ -19,6 +19,7 @@ from clients.wire import (
     PART_SCHEME,
     REQUEST_PART,
 )
+from clients.wire_values import with_pictures
 from service.problems import INVALID_BODY, INVALID_IMAGE, INVALID_JSON, ProblemError
 
 _JSON: Final = b"application/json"
@@ -109,30 +110,14 @@ async def _multipart(request: Request) -> Any:
         asked = form.get(REQUEST_PART)
         if asked is None:
             raise ProblemError(INVALID_BODY, f"the multipart body lacks the part {REQUEST_PART!r}")
-        document = _json(await asked.read() if isinstance(asked, UploadFile) else asked)
+        text = await asked.read() if isinstance(asked, UploadFile) else asked
         parts = {name: await part.read() for name, part in form.items() if isinstance(part, UploadFile)}
     finally:
         await form.close()
-    return _with_parts(document, parts)
-
-
-def _json(text: str | bytes) -> Any:
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
+        return with_pictures(json.loads(text), lambda picture: _part(picture, parts))
+    except (ValueError, RecursionError) as error:  # the latter: nested too deeply
         raise ProblemError(INVALID_JSON, f"part {REQUEST_PART!r} is not JSON: {error}") from None
-
-
-def _with_parts(node: Any, parts: dict[str, bytes]) -> Any:
-    """The document with pictures in the places where it names them."""
-    if isinstance(node, dict):
-        return {
-            key: [_part(image, parts) for image in value]
-            if key == "images" and isinstance(value, list)
-            else _with_parts(value, parts)
-            for key, value in node.items()
-        }
-    return [_with_parts(value, parts) for value in node] if isinstance(node, list) else node
 
 
 def _part(image: Any, parts: dict[str, bytes]) -> Any:

@@ -94,12 +94,25 @@ def test_faults_are_placed_as_in_json(served: Served) -> None:
     [
         ({"other": "{}"}, "invalid-body"),
         ({"request": "{"}, "invalid-json"),
+        ({"request": "[" * 700 + "]" * 700}, "invalid-json"),
+        ({"request": "[" * 90_000}, "invalid-json"),
         ({"request": "{}"}, "invalid-request"),
         ({"request": json.dumps(parts()[0])}, "invalid-image"),
     ],
 )
 def test_bad_parts(served: Served, engine: ScriptedEngine, data: dict[str, str], slug: str) -> None:
     problem(served.http.post("/v1/plan", data=data, files={"unused": b"x"}), slug)
+    assert engine.submitted == []
+
+
+@pytest.mark.parametrize("depth", [200, 900])
+@pytest.mark.parametrize("key", ["scene", "unknown"])
+def test_nested_deeply(served: Served, engine: ScriptedEngine, depth: int, key: str) -> None:
+    text = f'{{"{key}": {"[" * depth}{"]" * depth}}}'
+    packed = b"\x81" + msgpack.packb(key) + b"\x91" * depth + b"\xc0"
+    for content, media_type in ((text, "application/json"), (packed, "application/msgpack")):
+        answer = served.http.post("/v1/plan", content=content, headers={"Content-Type": media_type})
+        assert answer.status_code == 422, answer.text
     assert engine.submitted == []
 
 
