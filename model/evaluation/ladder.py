@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from model.engines.engine import Controls
+from model.engines.engine import Controls, Thinking
 from model.evaluation.bootstrap import Comparison, compare
 from model.evaluation.open_loop import SceneResult
 from model.evaluation.report import Report, variant_rows
@@ -30,12 +30,19 @@ GROUPS: Final = 10
 Results = Mapping[Variant, Sequence[SceneResult]]
 
 
-def rung_variants(rung: str, *, n: int, route: bool) -> list[Variant]:
-    """The rows of one checkpoint of the ladder, without or with the route."""
+def rung_variants(rung: str, controls: Controls, *, route: bool) -> list[Variant]:
+    """The rows of one checkpoint of the ladder, without or with the route.
 
-    def variant(name: str, **changes: Any) -> Variant:
-        controls = Controls(n=n, thinking=changes.pop("thinking", "never"))
-        return Variant(f"{name}{' + route' if route else ''}", "cf_vla", controls, route, **changes)
+    Args:
+        rung: one of `RUNGS`.
+        controls: of the adaptive rows; the others differ in ``thinking`` alone.
+        route: whether it is given.
+    """
+
+    def variant(name: str, thinking: Thinking = "never", **changes: Any) -> Variant:
+        threshold = controls.think_threshold if thinking == "adaptive" else None
+        given = replace(controls, thinking=thinking, think_threshold=threshold)
+        return Variant(f"{name}{' + route' if route else ''}", "cf_vla", given, route, **changes)
 
     if rung == META_ACT:
         return [
@@ -52,13 +59,13 @@ def rung_variants(rung: str, *, n: int, route: bool) -> list[Variant]:
     ]
 
 
-def sweep_variants(rung: str, *, n: int) -> list[Variant]:
+def sweep_variants(rung: str, controls: Controls) -> list[Variant]:
     """Figure 8's temperatures, and think thresholds from often to seldom; without the route."""
     return [
-        Variant(f"{rung}, temperature {value:g}", "cf_vla", Controls(n=n, temperature=value))
+        Variant(f"{rung}, temperature {value:g}", "cf_vla", replace(controls, temperature=value))
         for value in TEMPERATURES
     ] + [
-        Variant(f"{rung}, threshold {value:g}", "cf_vla", Controls(n=n, think_threshold=value))
+        Variant(f"{rung}, threshold {value:g}", "cf_vla", replace(controls, think_threshold=value))
         for value in THRESHOLDS
     ]
 

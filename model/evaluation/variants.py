@@ -18,7 +18,6 @@ from model.engines.engine import (
     Engine,
     EngineError,
     PlanRequest,
-    Thinking,
 )
 from model.evaluation.open_loop import SceneResult, evaluate_draws, expert_plan
 
@@ -44,16 +43,14 @@ class Variant:
     shuffled_images: bool = False
 
 
-def standard_variants(
-    formats: Sequence[str], *, n: int = 6, thinking: Thinking = "adaptive"
-) -> list[Variant]:
+def standard_variants(formats: Sequence[str], controls: Controls = Controls()) -> list[Variant]:
     """The open-loop table's rows for a checkpoint that writes ``formats``, without and with the route."""
-    controls = Controls(n=n, thinking=thinking)
+    no_branch = replace(controls, thinking="adaptive", think_threshold=None)
     variants = []
     for route in (False, True):
         suffix = " + route" if route else ""
         if "traj_only" in formats:
-            variants.append(Variant(f"traj-only{suffix}", "traj_only", Controls(n=n), route))
+            variants.append(Variant(f"traj-only{suffix}", "traj_only", no_branch, route))
         if "cf_vla" in formats:
             variants += [
                 Variant(f"meta-act{suffix}", "cf_vla", controls, route),

@@ -14,12 +14,12 @@ from service.cli.engines import Device, EngineName, Rows, VllmArguments, make_en
 from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, ScenePath, told
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
     from rich.progress import Progress
 
     from model.driving.scene import LabelledScene
-    from model.engines.engine import Engine
+    from model.engines.engine import Controls, Engine
     from model.evaluation.ladder import LadderReport
     from model.evaluation.open_loop import SceneResult
     from model.evaluation.report import Report
@@ -33,6 +33,11 @@ def evaluate(
     checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
     limit: Annotated[int | None, typer.Option(help="Scenes to evaluate on, evenly chosen.", min=1)] = None,
     n: Annotated[int, typer.Option(help="Draws per scene.", min=1)] = 6,
+    temperature: Annotated[float, typer.Option(help="Of sampling.", min=0, max=2)] = 1.0,
+    think_threshold: Annotated[
+        float | None,
+        typer.Option(help="Think when the think probability exceeds it, instead of by chance.", min=0, max=1),
+    ] = None,
     rows: Rows = 96,
     engine: EngineName = "torch",
     device: Device = "cpu",
@@ -44,32 +49,43 @@ def evaluate(
     ladder: Annotated[
         Path | None, typer.Option(help="Folder of the ladder's checkpoints; --checkpoint counts among them.")
     ] = None,
+    sweep: Annotated[
+        int, typer.Option(help="Scenes for the ladder's temperatures and thresholds, evenly chosen.", min=1)
+    ] = 240,
     plots: Annotated[Path | None, typer.Option(help="Folder for the ladder's pictures.")] = None,
     as_json: Json = False,
 ) -> None:
     """Evaluate open loop: baselines, with and without route, expert plans given, images shuffled."""
     with told():
         from model.driving.scene_store import count_scenes, read_scenes
+        from model.engines.engine import Controls
 
-        count = count_scenes(scenes)
-        every = max(1, count // limit) if limit else 1
-        labelled = list(islice(read_scenes(scenes, dense=False), 0, limit and every * limit, every))
+        controls = Controls(n=n, temperature=temperature, think_threshold=think_threshold)
+        labelled = list(_evenly(read_scenes(scenes, dense=False), count_scenes(scenes), limit))
 
         def engine_of(folder: Path) -> Engine:
             return make_engine(folder, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
 
         report: Report | LadderReport
         if preset == "ladder":
-            report = _ladder(labelled, engine_of, checkpoint, ladder, n, rows, plots, quiet=as_json)
+            report = _ladder(
+                labelled, engine_of, checkpoint, ladder, controls, rows, sweep, plots, quiet=as_json
+            )
         else:
             from model.evaluation.report import evaluate_checkpoint
             from model.evaluation.variants import standard_variants
 
             made = engine_of(checkpoint)
-            variants = standard_variants(made.card.formats, n=n)
+            variants = standard_variants(made.card.formats, controls)
             run = _run(evaluate_checkpoint, labelled, made, variants, n, rows, quiet=as_json)
             report = asyncio.run(run)
         typer.echo(json.dumps(report.to_json()) if as_json else str(report))
+
+
+def _evenly(scenes: Iterable[LabelledScene], count: int, limit: int | None) -> Iterator[LabelledScene]:
+    """So many of the ``count`` scenes, or all, evenly chosen."""
+    every = max(1, count // limit) if limit else 1
+    return islice(scenes, 0, limit and every * limit, every)
 
 
 def _ladder(
@@ -77,8 +93,9 @@ def _ladder(
     engine_of: Callable[[Path], Engine],
     checkpoint: Path,
     folder: Path | None,
-    n: int,
+    controls: Controls,
     rows: int,
+    sweep: int,
     plots: Path | None,
     *,
     quiet: bool,
@@ -100,11 +117,13 @@ def _ladder(
     found.setdefault(COUNTERFACTUAL, checkpoint)
     results: dict[Variant, list[SceneResult]] = {}
     for rung, path in found.items():
-        variants = [each for route in (False, True) for each in rung_variants(rung, n=n, route=route)]
+        variants = [each for route in (False, True) for each in rung_variants(rung, controls, route=route)]
+        work = [(scenes, variants)]
         if rung == COUNTERFACTUAL:
-            variants += sweep_variants(rung, n=n)
-        run = _run(evaluate_variants, scenes, engine_of(path), variants, n, rows, quiet=quiet)
-        results |= asyncio.run(run)
+            work.append((list(_evenly(scenes, len(scenes), sweep)), sweep_variants(rung, controls)))
+        for chosen, of in work:
+            run = _run(evaluate_variants, chosen, engine_of(path), of, controls.n, rows, quiet=quiet)
+            results |= asyncio.run(run)
     report = ladder_report(results)
     if plots is not None:
         plots.mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,7 @@ import pytest
 
 from model.driving.images import decode_image
 from model.driving.plan import parse_plan
+from model.engines.engine import Controls
 from model.evaluation.ladder import (
     COUNTERFACTUAL,
     META_ACT,
@@ -33,20 +34,23 @@ def result(scene: int, error_m: float, think_rate: float | None = None, **more: 
 
 
 def test_a_rung_has_its_rows_with_and_without_the_route() -> None:
-    names = {rung: [each.name for each in rung_variants(rung, n=6, route=True)] for rung in RUNGS}
+    names = {rung: [each.name for each in rung_variants(rung, Controls(n=6), route=True)] for rung in RUNGS}
     assert names[META_ACT] == [
         "traj-only + route",
         "meta-act + route",
         "meta-act, expert plan + route",
     ]
-    assert [each.controls.thinking for each in rung_variants(COUNTERFACTUAL, n=6, route=False)] == [
-        "adaptive",
-        "never",
-        "always",
+    asked = [
+        each.controls for each in rung_variants(COUNTERFACTUAL, Controls(think_threshold=0.3), route=False)
+    ]
+    assert [(each.thinking, each.think_threshold) for each in asked] == [
+        ("adaptive", 0.3),
+        ("never", None),
+        ("always", None),
     ]
     everything = [name for of in names.values() for name in of]
     assert len(set(everything)) == len(everything)
-    assert len(sweep_variants(COUNTERFACTUAL, n=6)) == len(TEMPERATURES) + len(THRESHOLDS)
+    assert len(sweep_variants(COUNTERFACTUAL, Controls(n=6))) == len(TEMPERATURES) + len(THRESHOLDS)
 
 
 def test_difficulty_is_told_by_the_error_without_thinking() -> None:
@@ -63,7 +67,7 @@ def test_the_ladder_compares_what_the_paper_compares() -> None:
     results = {
         each: [result(scene, 2.0, 0.2) for scene in range(40)]
         for rung in (META_ACT, COUNTERFACTUAL)
-        for each in rung_variants(rung, n=6, route=False)
+        for each in rung_variants(rung, Controls(n=6), route=False)
     }
     for variant, of in results.items():
         factor = {"counterfactual, adaptive": 0.9, "traj-only": 1.2}.get(variant.name, 1.0)
@@ -99,7 +103,7 @@ def test_the_pictures_show_what_is_measured(tmp_path: Path) -> None:
     never = [result(scene, float(scene)) for scene in range(40)]
     adaptive = [result(scene, float(scene), scene / 40) for scene in range(40)]
     difficulty_plot(by_difficulty(adaptive, never), tmp_path / "difficulty.png")
-    variants = sweep_variants(COUNTERFACTUAL, n=6)
+    variants = sweep_variants(COUNTERFACTUAL, Controls(n=6))
     rows = ladder_report({each: adaptive for each in variants}).report.rows
     by_name = {row.name: row for row in rows}
     temperature_plot(

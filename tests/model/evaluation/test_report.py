@@ -45,7 +45,7 @@ class LookingEngine(FakeEngine):
 @pytest.fixture(scope="module")
 def report() -> Report:
     seen: list[tuple[Variant, SceneResult]] = []
-    variants = standard_variants(["cf_vla", "traj_only"], n=2)
+    variants = standard_variants(["cf_vla", "traj_only"], Controls(n=2))
     made = asyncio.run(
         evaluate_checkpoint(
             LookingEngine(),

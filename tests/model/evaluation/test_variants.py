@@ -124,7 +124,7 @@ def test_images_that_cannot_be_shuffled_across_episodes_are_an_error() -> None:
 
 
 def test_the_standard_rows_fit_what_a_checkpoint_writes() -> None:
-    both = standard_variants(["cf_vla", "traj_only"], n=4)
+    both = standard_variants(["cf_vla", "traj_only"], Controls(n=4))
     assert len({variant.name for variant in both}) == len(both) == 8
     assert {variant.format for variant in standard_variants(["traj_only"])} == {"traj_only"}
     assert all(variant.controls.n == 4 for variant in both)
