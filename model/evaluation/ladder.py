@@ -8,9 +8,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from model.engines.engine import Controls, Thinking
+from model.driving.scene import LabelledScene
+from model.engines.engine import Controls, Draw, Thinking
 from model.evaluation.bootstrap import Comparison, compare
-from model.evaluation.open_loop import SceneResult
+from model.evaluation.open_loop import SceneResult, evaluate_draws
 from model.evaluation.report import Report, variant_rows
 from model.evaluation.variants import Variant
 
@@ -59,14 +60,48 @@ def rung_variants(rung: str, controls: Controls, *, route: bool) -> list[Variant
     ]
 
 
-def sweep_variants(rung: str, controls: Controls) -> list[Variant]:
-    """Figure 8's temperatures, and think thresholds from often to seldom; without the route."""
+def temperature_variants(rung: str, controls: Controls) -> list[Variant]:
+    """Figure 8's temperatures; without the route."""
     return [
         Variant(f"{rung}, temperature {value:g}", "cf_vla", replace(controls, temperature=value))
         for value in TEMPERATURES
-    ] + [
-        Variant(f"{rung}, threshold {value:g}", "cf_vla", replace(controls, think_threshold=value))
-        for value in THRESHOLDS
+    ]
+
+
+def threshold_results(
+    rung: str,
+    controls: Controls,
+    scenes: Sequence[LabelledScene],
+    draws: Mapping[tuple[str, str], Sequence[Draw]],
+) -> dict[Variant, list[SceneResult]]:
+    """Think thresholds from often to seldom; without the route.
+
+    Args:
+        rung: one of `RUNGS`.
+        controls: of the adaptive rows.
+        scenes: that were planned for.
+        draws: of the rung's rows that never and that always think, by the row's name and the scene's.
+    """
+    results: dict[Variant, list[SceneResult]] = {}
+    for value in THRESHOLDS:
+        given = replace(controls, think_threshold=value)
+        found = results[Variant(f"{rung}, threshold {value:g}", "cf_vla", given)] = []
+        for labelled in scenes:
+            name = labelled.scene.scene_id
+            never, always = draws[f"{rung}, never thinks", name], draws[f"{rung}, always thinks", name]
+            found.append(evaluate_draws(labelled, at_threshold(never, always, value)))
+    return results
+
+
+def at_threshold(never: Sequence[Draw], always: Sequence[Draw], threshold: float) -> list[Draw]:
+    """What ``think_threshold`` makes of draws, told from those that may not think and those that must.
+
+    A draw's random numbers depend on seed, draw and position alone: both ways it has written the same when
+    it comes to its branch, and behind the branch it goes on as one of the two does.
+    """
+    return [
+        thought if (direct.think_probability or 0.0) > threshold else direct
+        for direct, thought in zip(never, always, strict=True)
     ]
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from model.driving.lead import LEAD_WITHIN_M
 from model.driving.scene import LabelledScene
-from model.engines.engine import Engine
+from model.engines.engine import Draw, Engine
 from model.evaluation.bootstrap import Comparison, compare
 from model.evaluation.open_loop import SceneResult, evaluate_baselines
 from model.evaluation.table import Row, format_table, to_json
@@ -66,17 +67,18 @@ async def evaluate_variants(
     *,
     concurrency: int = 16,
     on_result: Callable[[Variant, SceneResult], None] | None = None,
+    on_draws: Callable[[Variant, LabelledScene, Sequence[Draw]], None] | None = None,
 ) -> dict[Variant, list[SceneResult]]:
-    """Results of a started engine in every variant; see `evaluate_checkpoint`."""
+    """Results of a started engine in every variant; see `evaluate_checkpoint` and `evaluate_engine`."""
     results = {}
     for variant in variants:
-
-        def done(result: SceneResult, variant: Variant = variant) -> None:
-            if on_result is not None:
-                on_result(variant, result)
-
         results[variant] = await evaluate_engine(
-            engine, scenes, variant, concurrency=concurrency, on_result=done
+            engine,
+            scenes,
+            variant,
+            concurrency=concurrency,
+            on_result=on_result and partial(on_result, variant),
+            on_draws=on_draws and partial(on_draws, variant),
         )
     return results
 

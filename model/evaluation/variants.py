@@ -69,6 +69,7 @@ async def evaluate_engine(
     *,
     concurrency: int = 16,
     on_result: Callable[[SceneResult], None] | None = None,
+    on_draws: Callable[[LabelledScene, Sequence[Draw]], None] | None = None,
 ) -> list[SceneResult]:
     """Plan for every scene and return the results in the scenes' order.
 
@@ -79,6 +80,7 @@ async def evaluate_engine(
         variant: what to ask for.
         concurrency: how many scenes are under way at once.
         on_result: called after each scene, for progress.
+        on_draws: called with each scene's draws.
 
     Raises:
         EngineError, RequestError: the engine's.
@@ -97,7 +99,10 @@ async def evaluate_engine(
             if item is None:
                 return
             index, labelled = item
-            results[index] = evaluate_draws(labelled, await _plan(engine, labelled, variant))
+            draws = await _plan(engine, labelled, variant)
+            results[index] = evaluate_draws(labelled, draws)
+            if on_draws is not None:
+                on_draws(labelled, draws)
             if on_result is not None:
                 on_result(results[index])
 

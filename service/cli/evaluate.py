@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from model.driving.scene import LabelledScene
-    from model.engines.engine import Controls, Engine
+    from model.engines.engine import Controls, Draw, Engine
     from model.evaluation.ladder import LadderReport
     from model.evaluation.open_loop import SceneResult
     from model.evaluation.report import Report
@@ -50,7 +51,7 @@ def evaluate(
         Path | None, typer.Option(help="Folder of the ladder's checkpoints; --checkpoint counts among them.")
     ] = None,
     sweep: Annotated[
-        int, typer.Option(help="Scenes for the ladder's temperatures and thresholds, evenly chosen.", min=1)
+        int, typer.Option(help="Scenes for the ladder's temperatures, evenly chosen.", min=1)
     ] = 240,
     plots: Annotated[Path | None, typer.Option(help="Folder for the ladder's pictures.")] = None,
     as_json: Json = False,
@@ -109,7 +110,8 @@ def _ladder(
         THRESHOLDS,
         ladder_report,
         rung_variants,
-        sweep_variants,
+        temperature_variants,
+        threshold_results,
     )
     from model.evaluation.report import evaluate_variants
 
@@ -117,12 +119,21 @@ def _ladder(
     found.setdefault(COUNTERFACTUAL, checkpoint)
     results: dict[Variant, list[SceneResult]] = {}
     for rung, path in found.items():
+        draws: dict[tuple[str, str], Sequence[Draw]] = {}
+
+        def keep(variant: Variant, labelled: LabelledScene, of: Sequence[Draw], draws: Any = draws) -> None:
+            draws[variant.name, labelled.scene.scene_id] = of
+
         variants = [each for route in (False, True) for each in rung_variants(rung, controls, route=route)]
-        work = [(scenes, variants)]
+        evaluate = partial(evaluate_variants, on_draws=keep)
+        results |= asyncio.run(
+            _run(evaluate, scenes, engine_of(path), variants, controls.n, rows, quiet=quiet)
+        )
         if rung == COUNTERFACTUAL:
-            work.append((list(_evenly(scenes, len(scenes), sweep)), sweep_variants(rung, controls)))
-        for chosen, of in work:
-            run = _run(evaluate_variants, chosen, engine_of(path), of, controls.n, rows, quiet=quiet)
+            results |= threshold_results(rung, controls, scenes, draws)
+            swept = list(_evenly(scenes, len(scenes), sweep))
+            variants = temperature_variants(rung, controls)
+            run = _run(evaluate_variants, swept, engine_of(path), variants, controls.n, rows, quiet=quiet)
             results |= asyncio.run(run)
     report = ladder_report(results)
     if plots is not None:

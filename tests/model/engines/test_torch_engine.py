@@ -13,6 +13,7 @@ from model.driving.scene import Clip, Scene
 from model.engines.engine import Controls, Draw, DrawFinished, EngineError, PlanRequest, RequestError
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.torch.runner import Runner
+from model.evaluation.ladder import at_threshold
 from tests.checkpoints import noisy_scene
 
 
@@ -50,6 +51,24 @@ def test_many_requests_at_once_get_what_they_get_alone(untrained_checkpoint: Pat
                 assert [draw.codes for draw in alone] == [draw.codes for draw in draws]
                 assert [draw.index for draw in draws] == [0, 1]
                 assert np.isfinite([draw.trajectory for draw in draws]).all()
+
+    run(test)
+
+
+def test_every_threshold_is_told_from_never_and_always_thinking(untrained_checkpoint: Path) -> None:
+    async def test() -> None:
+        async with running(untrained_checkpoint) as engine:
+
+            async def draws(**controls: object) -> list[Draw]:
+                asked = Controls(n=6, seed=3, **controls)  # type: ignore[arg-type]
+                return await plan(engine, PlanRequest(str(controls), noisy_scene(), controls=asked))
+
+            never, always = await draws(thinking="never"), await draws(thinking="always")
+            probabilities = sorted(draw.think_probability or 0.0 for draw in never)
+            for threshold in (0.0, (probabilities[2] + probabilities[3]) / 2, 1.0):
+                thresholded = await draws(think_threshold=threshold)
+                told = at_threshold(never, always, threshold)
+                assert [draw.text for draw in told] == [draw.text for draw in thresholded]
 
     run(test)
 

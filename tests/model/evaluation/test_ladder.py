@@ -15,13 +15,16 @@ from model.evaluation.ladder import (
     RUNGS,
     TEMPERATURES,
     THRESHOLDS,
+    at_threshold,
     by_difficulty,
     ladder_report,
     rung_variants,
-    sweep_variants,
+    temperature_variants,
+    threshold_results,
 )
 from model.evaluation.ladder_plots import difficulty_plot, temperature_plot, threshold_plot
 from model.evaluation.open_loop import SceneResult, evaluate_draws, expert_plan
+from model.evaluation.variants import Variant
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import draw_of
 
@@ -50,7 +53,7 @@ def test_a_rung_has_its_rows_with_and_without_the_route() -> None:
     ]
     everything = [name for of in names.values() for name in of]
     assert len(set(everything)) == len(everything)
-    assert len(sweep_variants(COUNTERFACTUAL, Controls(n=6))) == len(TEMPERATURES) + len(THRESHOLDS)
+    assert len(temperature_variants(COUNTERFACTUAL, Controls(n=6))) == len(TEMPERATURES)
 
 
 def test_difficulty_is_told_by_the_error_without_thinking() -> None:
@@ -99,11 +102,27 @@ def test_revised_plans_are_measured_where_there_are_some() -> None:
     assert evaluate_draws(labelled, [direct]).thought_iou_first is None
 
 
+def test_thresholds_choose_between_the_two_ways() -> None:
+    labelled = labelled_scene()
+    right, wrong = expert_plan(labelled), parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
+    sure, unsure = (replace(draw_of(labelled.future, wrong), think_probability=p) for p in (0.05, 0.35))
+    never, always = [sure, unsure], [draw_of(labelled.future, wrong, right)] * 2
+    assert at_threshold(never, always, 0.35) == never, "it must exceed the threshold"
+    assert at_threshold(never, always, 0.1) == [sure, always[1]]
+    name = labelled.scene.scene_id
+    draws = {(f"round-2, {way} thinks", name): of for way, of in (("never", never), ("always", always))}
+    found = threshold_results("round-2", Controls(n=2), [labelled], draws)
+    assert [variant.controls.think_threshold for variant in found] == list(THRESHOLDS)
+    rates = [result.think_rate for [result] in found.values()]
+    assert rates == [0.5 * (value < 0.35) + 0.5 * (value < 0.05) for value in THRESHOLDS]
+
+
 def test_the_pictures_show_what_is_measured(tmp_path: Path) -> None:
     never = [result(scene, float(scene)) for scene in range(40)]
     adaptive = [result(scene, float(scene), scene / 40) for scene in range(40)]
     difficulty_plot(by_difficulty(adaptive, never), tmp_path / "difficulty.png")
-    variants = sweep_variants(COUNTERFACTUAL, Controls(n=6))
+    variants = temperature_variants(COUNTERFACTUAL, Controls(n=6))
+    variants += [Variant(f"{COUNTERFACTUAL}, threshold {value:g}") for value in THRESHOLDS]
     rows = ladder_report({each: adaptive for each in variants}).report.rows
     by_name = {row.name: row for row in rows}
     temperature_plot(
