@@ -169,8 +169,10 @@ class TaskSampler(BatchSampler):
             self._reflections.setdefault(int(index), []).append(place)
         mean = len(reflected) / max(1, len(self._reflections))
         self._scenes_a_batch = max(1, round(batch_size / max(1.0, mean)))
-        # accelerate, sharding batches over processes, reads these three and sets the epoch of `sampler`.
-        self.batch_size, self.drop_last = batch_size, True
+        self._batch_size = batch_size
+        # accelerate, sharding batches over processes, reads these three and sets the epoch of `sampler`. With
+        # a number here it would leave out all batches of another length, which those of reflections have.
+        self.batch_size, self.drop_last = None, True  # type: ignore[assignment]  # torch's stubs know no None
         self.sampler = cast("Sampler[int]", self)
 
     def set_epoch(self, epoch: int) -> None:
@@ -179,11 +181,11 @@ class TaskSampler(BatchSampler):
 
     def __len__(self) -> int:
         plain = len(self._has_route) + len(self._again)
-        return plain // self.batch_size + len(self._reflections) // self._scenes_a_batch
+        return plain // self._batch_size + len(self._reflections) // self._scenes_a_batch
 
     def __iter__(self) -> Iterator[list[Item]]:  # type: ignore[override]  # items instead of positions
         random = np.random.default_rng((self._seed, self._epoch))
-        plain, plain_rest = self._rounds(self._plain(random), self.batch_size)
+        plain, plain_rest = self._rounds(self._plain(random), self._batch_size)
         reflected, reflected_rest = self._rounds(self._reflected(random), self._scenes_a_batch)
         rounds = plain + reflected
         for place in random.permutation(len(rounds)):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from accelerate.data_loader import BatchSamplerShard
 
 from model.driving.plan import parse_plan
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
@@ -117,6 +118,20 @@ def test_reflections_are_examples_beside_all_others() -> None:
     reflected = [item for item in items if item.reflections]
     assert {(item.index, item.reflections) for item in reflected} == {(3, (0, 1)), (5, (2,))}
     assert sorted(item.index for item in items if not item.reflections) == list(range(8))
+
+
+def test_every_batch_reaches_a_process() -> None:
+    reflected = np.arange(300).repeat(4)
+    sampler = TaskSampler(
+        np.ones(2000, np.bool_), 16, {"cf_vla": 1.0}, 0.5, seed=0, processes=2, reflected=reflected
+    )
+    sampler.set_epoch(1)
+    shards = [list(BatchSamplerShard(sampler, 2, process)) for process in range(2)]
+    dealt = [batch for pair in zip(*shards, strict=True) for batch in pair]
+    everything = list(sampler)
+    assert dealt == everything[: len(dealt)]
+    assert len(everything) - len(dealt) <= 1
+    assert sum(len(item.reflections) for batch in dealt for item in batch) > 1100
 
 
 @pytest.mark.parametrize("processes", [1, 2])
