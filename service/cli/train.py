@@ -56,6 +56,7 @@ def train(
 
     from model.driving.scene_store import count_scenes, read_scenes
     from model.evaluation.curves import training_curves
+    from model.training.memory import keep_freed_memory
     from model.training.recipes import NANO, PAPER
     from model.training.run import RunSettings, create, run
     from model.training.trainer import LOG_FILE
@@ -94,6 +95,7 @@ def train(
         if validation is not None:
             every = max(1, count_scenes(validation) // validation_scenes)
             held_out = list(islice(read_scenes(validation, dense=False), 0, every * validation_scenes, every))
+        keep_freed_memory()
         run(
             chosen,
             scenes,
