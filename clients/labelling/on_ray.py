@@ -21,7 +21,7 @@ from clients.labelling import label, rollout
 from clients.labelling.ledger import Entered, Entry, Ledger, Run
 from clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
 from clients.labelling.rollout import PATIENCE, Sampling, roll_out
-from clients.labelling.teachers.teacher import Teacher
+from clients.labelling.teachers.teacher import Teacher, TeacherError
 from clients.planner import Access, AsyncPlannerClient
 from model.driving.scene_store import row_groups, scene_files
 
@@ -82,11 +82,11 @@ class RolloutWork:
 
 @dataclass(frozen=True)
 class LabelWork:
-    """See `clients.labelling.label`; ``make_teacher`` is called by every worker."""
+    """See `clients.labelling.label`; ``connect`` is called for every chunk, where it is worked on."""
 
     run: Run
     rollout: Run
-    make_teacher: Callable[[], Teacher]
+    connect: Callable[[], Awaitable[Teacher]]
     plans_per_scene: int
     seed: int
     limits: Limits
@@ -106,7 +106,10 @@ class LabelWork:
             seed=self.seed,
             group=chunk.group,
         )
-        teacher = self.make_teacher()
+        try:
+            teacher = await self.connect()
+        except TeacherError as error:
+            raise StageStopped(str(error)) from error
         try:
             return await work_through(
                 book,

@@ -6,6 +6,7 @@ import asyncio
 import json
 import tempfile
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -100,7 +101,7 @@ def rollout(
             )
 
     with told():
-        _check_ray(on_ray, every > 1, limit, dry_run)
+        _check_ray(on_ray, limit, dry_run, every)
         run, tally = _stage(folder, roll, dry=dry_run > 0)
         for name in unlabelled:
             typer.echo(f"{name}: left out, it has no expert's future", err=True)
@@ -170,8 +171,12 @@ def label(
     from clients.labelling.teachers.service import ServiceTeacher
     from clients.labelling.teachers.teacher import TeacherError
     from clients.planner import Access
-    from service.settings import TeacherSettings
 
+    connect: Callable[[], Awaitable[Teacher]] = (
+        _teacher_of_settings
+        if teacher == "settings"
+        else partial(ServiceTeacher.connect, service, Access.from_environment())
+    )
     spent: dict[str, Any] = {}
 
     async def ask_all(ledger: Ledger) -> tuple[Run, Tally]:
@@ -179,11 +184,7 @@ def label(
         if not ledger.count_kept(rollout, 1):
             raise RuntimeError("no scene is kept: run `looktwice build filter` first")
         try:
-            asked = (
-                TeacherSettings().teacher()
-                if teacher == "settings"
-                else await ServiceTeacher.connect(service, Access.from_environment())
-            )
+            asked = await connect()
         except TeacherError as error:
             raise RuntimeError(str(error)) from error
         try:
@@ -195,7 +196,7 @@ def label(
             if on_ray is not None:
                 from clients.labelling.on_ray import LabelWork, chunks, work_on_ray
 
-                work = LabelWork(begun, rollout, _teacher_here, plans_per_scene, seed, limits)
+                work = LabelWork(begun, rollout, connect, plans_per_scene, seed, limits)
                 tally = work_on_ray(ledger, begun, chunks(ledger, begun, scenes, rollout), work, on_ray)
             else:
                 found = questions(ledger, rollout, scenes, plans_per_scene=plans_per_scene, seed=seed)
@@ -216,7 +217,7 @@ def label(
             await asked.close()
 
     with told():
-        _check_ray(on_ray, teacher == "service", limit, dry_run)
+        _check_ray(on_ray, limit, dry_run)
         begun, tally = _stage(folder, ask_all, dry=dry_run > 0)
         _report(begun, tally, as_json, **spent)
 
@@ -308,13 +309,12 @@ def _batch(
     return settings, begun, jobs(begun, found)
 
 
-def _check_ray(on_ray: str | None, other: bool, limit: int | None, dry_run: int) -> None:
-    if on_ray is not None and (other or limit is not None or dry_run):
-        raise ValueError("--ray works on whole scene files, with the teacher that the settings name")
+def _check_ray(on_ray: str | None, limit: int | None, dry_run: int, every: int = 1) -> None:
+    if on_ray is not None and (limit is not None or dry_run or every > 1):
+        raise ValueError("--ray works on whole scene files: no --limit, --dry-run or --every")
 
 
-def _teacher_here() -> Teacher:
-    """The teacher of the settings, made where it is needed."""
+async def _teacher_of_settings() -> Teacher:
     from service.settings import TeacherSettings
 
     return TeacherSettings().teacher()

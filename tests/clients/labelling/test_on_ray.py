@@ -65,3 +65,6 @@ def test_rolled_out_and_labelled_by_workers(scenes: Path, url: str, tmp_path: Pa
     with Ledger(tmp_path) as ledger:
         labels = ledger.the_run("label")
         assert {entry.record["rollout"] for entry in ledger.entries(labels)} == set(keys)
+
+    asked = build("label", tmp_path, scenes, "--teacher", "service", "--service", url, "--seed", 1)
+    assert (asked["done"], asked["dead"], asked["answers"]) == (EACH + 1, 0, EACH + 1)
