@@ -40,8 +40,8 @@ class Metrics:
         )
         self._latency = Histogram(
             "looktwice_request_seconds",
-            "From a request's headers to the end of its answer.",
-            ["endpoint"],
+            "From a request's headers to the end of its answer; status is a class such as 2xx.",
+            ["endpoint", "status"],
             buckets=LATENCY_BUCKETS_S,
             registry=registry,
         )
@@ -140,7 +140,7 @@ class Metrics:
     def request_answered(self, endpoint: str, method: str, status: int, seconds: float) -> None:
         """Count one request; ``endpoint`` is the route's template, never a caller's path."""
         self._requests.labels(endpoint, method, str(status)).inc()
-        self._latency.labels(endpoint).observe(seconds)
+        self._latency.labels(endpoint, f"{status // 100}xx").observe(seconds)
 
     def watch(self, engine_load: Callable[[], Load], admission: Admission) -> None:
         """Read what is full, and of what, whenever Prometheus asks."""
@@ -158,6 +158,11 @@ class Metrics:
             "looktwice_capacity_draws",
             "Draws that are accepted at once at most.",
             lambda: admission.draws,
+        )
+        gauge(
+            "looktwice_accepted_draws",
+            "Draws accepted and not answered; those of batches whose turn has not come apart.",
+            lambda: sum(place.draws for place in admission.places),
         )
         gauge(
             "looktwice_queue_scenes",
