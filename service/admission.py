@@ -14,6 +14,8 @@ _MEMORY: Final = 0.1
 """Weight of the latest observation in a running mean."""
 _FIRST_DRAW_S: Final = 0.1
 """That a draw keeps its place, before any was seen."""
+PATIENCE_S: Final = 1.0
+"""That a batch's next scene lets others go first."""
 
 
 class Full(Exception):
@@ -36,11 +38,13 @@ class Place:
         draws: how many.
         since_s: when, on the admission's clock.
         waiting: whether the engine has not begun with it.
+        waited_s: for its turn, before it was reserved.
     """
 
     draws: int
     since_s: float = 0.0
     waiting: bool = True
+    waited_s: float = 0.0
 
     def began(self) -> None:
         """The engine has begun with it."""
@@ -50,6 +54,9 @@ class Place:
 @dataclass(eq=False)
 class _Turn:
     place: Place
+    since_s: float
+    first_s: float | None = None
+    """Since when it is the next one."""
     come: asyncio.Event = field(default_factory=asyncio.Event)
 
 
@@ -57,7 +64,9 @@ class Admission:
     """Bounds what is accepted and not yet answered.
 
     Draws are what costs: memory in the engine and time in every pass, so a scene takes as many places as
-    it asks draws for. Scenes are bounded too, since each is held with its pictures.
+    it asks draws for. Scenes are bounded too, since each is held with its pictures. Scenes of batches wait
+    for places that others leave; one that is next for `PATIENCE_S` goes before whoever comes, so that a
+    batch gets on under any load.
 
     Args:
         draws: accepted at once, at most.
@@ -69,6 +78,7 @@ class Admission:
         self.draws, self.scenes, self._clock = draws, scenes, clock
         self._places: list[Place] = []
         self._turns: deque[_Turn] = deque()
+        self._batched = 0
         self._draw_s = _FIRST_DRAW_S
 
     @property
@@ -87,12 +97,16 @@ class Admission:
 
     @property
     def waiting(self) -> tuple[Place, ...]:
-        """Those that the engine has not begun with."""
-        return tuple(place for place in self._places if place.waiting)
+        """Those that the engine has not begun with, and those that are to come in turn."""
+        begun = tuple(place for place in self._places if place.waiting)
+        return begun + tuple(turn.place for turn in self._turns)
 
-    def check_open(self) -> None:
-        """Raise `Full` where not even one draw could be accepted; asked before a body is read."""
-        self._check(1)
+    def check_open(self, *, batch: bool = False) -> None:
+        """Raise `Full` where not even one draw, or scene of a batch, could be accepted."""
+        if batch:
+            self._check_batch(1)
+        else:
+            self._check(1)
 
     @contextmanager
     def place(self, draws: int) -> Generator[Place]:
@@ -108,10 +122,24 @@ class Admission:
         finally:
             self._leave(place)
 
+    @contextmanager
+    def batch(self, scenes: int) -> Generator[None]:
+        """Let a batch in until the block ends; its scenes then take their turns.
+
+        Raises:
+            Full: with those of other batches they are too many; alone, a batch is let in however large.
+        """
+        self._check_batch(scenes)
+        self._batched += scenes
+        try:
+            yield
+        finally:
+            self._batched -= scenes
+
     @asynccontextmanager
     async def place_in_turn(self, draws: int) -> AsyncGenerator[Place]:
-        """The same, but wait for it; for scenes of a batch, which take what others leave."""
-        turn = _Turn(Place(draws))
+        """The same as `place`, but wait for it; for scenes of a batch."""
+        turn = _Turn(Place(draws), self._clock())
         self._turns.append(turn)
         self._next_turns()
         try:
@@ -120,6 +148,7 @@ class Admission:
         finally:
             if turn in self._turns:
                 self._turns.remove(turn)
+                self._next_turns()
             else:
                 self._leave(turn.place)
 
@@ -142,10 +171,27 @@ class Admission:
     def _next_turns(self) -> None:
         while self._turns and self._fits(self._turns[0].place.draws):
             turn = self._turns.popleft()
+            turn.place.waited_s = self._clock() - turn.since_s
             self._enter(turn.place)
             turn.come.set()
+        if self._turns and self._turns[0].first_s is None:
+            self._turns[0].first_s = self._clock()
+
+    def _is_turns(self) -> bool:
+        """Whether what is free is kept for a batch's next scene."""
+        first_s = self._turns[0].first_s if self._turns else None
+        return first_s is not None and self._clock() - first_s > PATIENCE_S
+
+    def _check_batch(self, scenes: int) -> None:
+        if self._batched and self._batched + scenes > self.scenes:
+            detail = f"{scenes} scenes of a batch were asked for beside {self._batched} of others"
+            waiting_s = sum(turn.place.draws for turn in self._turns) * self._draw_s
+            raise Full(f"{detail}; {self.scenes} are accepted at once", waiting_s)
 
     def _check(self, draws: int) -> None:
+        if self._is_turns():
+            first = self._turns[0].place.draws
+            raise Full("the next scene of a batch has waited and goes first", first * self._draw_s)
         if self._fits(draws):
             return
         missing = max(1, draws - self.free)

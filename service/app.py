@@ -91,7 +91,12 @@ def create_app(
         redoc_url=None,
     )
     # The last one added is the outermost.
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
+    app.add_middleware(
+        BodyLimit,
+        max_bytes=settings.max_body_bytes,
+        max_held_bytes=settings.max_held_bytes,
+        timeout_s=settings.body_timeout_s,
+    )
     app.add_middleware(Guard, keys=keys, metrics=metrics)
     if settings.cors_origins:
         app.add_middleware(
@@ -101,7 +106,7 @@ def create_app(
             allow_headers=["Authorization", "Content-Type", IDEMPOTENCY_KEY_HEADER, REQUEST_ID_HEADER],
             expose_headers=[REQUEST_ID_HEADER, "Retry-After"],
         )
-    app.add_middleware(Around, metrics=metrics, traces=traces)
+    app.add_middleware(Around, metrics=metrics, traces=traces, stopping=lambda: lifecycle.stopping)
     install_error_handlers(app, metrics)
     parts = Parts(settings, metrics, lifecycle, planning, idempotency, teacher, load, int(time.time()))
     app.include_router(make_router(parts))

@@ -40,7 +40,7 @@ class Guard:
             owner = None if key is None else self._keys.owner(key)
         if owner is None:
             problem = ProblemError(UNAUTHORIZED, "send a key of this service: Authorization: Bearer …")
-            self._metrics.rejected(UNAUTHORIZED.slug)
+            self._metrics.problem_told(UNAUTHORIZED)
             await problem_response(problem, scope["state"]["request_id"])(scope, receive, send)
             return
         scope["state"]["owner"] = owner

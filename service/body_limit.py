@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from typing import Final
 
 from starlette.datastructures import Headers
@@ -15,14 +16,17 @@ _DRAIN_FACTOR: Final = 4
 class BodyLimit:
     """Ends a request with 413 when its body is read and turns out, or is announced, to be too large.
 
-    With 408 when it is not there after ``timeout_s``.
+    With 408 when it is not there after ``timeout_s``, and with 429 when the bodies of all requests under way
+    together would be more than ``max_held_bytes``: a place is reserved only once a body is read.
 
-    What still arrives of such a body is read and dropped, up to four times the limit: a server that answers
-    and closes while the caller is still sending resets the connection, and the answer is lost.
+    What still arrives of such a body within that time is read and dropped, up to four times the limit: a
+    server that answers and closes while the caller is still sending resets the connection, and the answer is
+    lost.
     """
 
-    def __init__(self, app: ASGIApp, max_bytes: int, timeout_s: float) -> None:
-        self._app, self._max_bytes, self._timeout_s = app, max_bytes, timeout_s
+    def __init__(self, app: ASGIApp, max_bytes: int, max_held_bytes: int, timeout_s: float) -> None:
+        self._app, self._timeout_s = app, timeout_s
+        self._max_bytes, self._max_held_bytes, self._held_bytes = max_bytes, max_held_bytes, 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection; anything but HTTP passes through."""
@@ -41,7 +45,7 @@ class BodyLimit:
             if announced.isdigit() and int(announced) > self._max_bytes:
                 # A caller that asks first has not begun to send.
                 if headers.get("expect", "").lower() != "100-continue":
-                    await self._drain(receive)
+                    await self._drain(receive, ends_s)
                 raise self._too_large()
             try:
                 async with asyncio.timeout_at(ends_s):
@@ -50,21 +54,31 @@ class BodyLimit:
                 raise HTTPException(408, f"it was not there after {self._timeout_s:g} s") from None
             complete = not message.get("more_body", False)
             received += len(message.get("body", b""))
-            if received > self._max_bytes:
-                if message.get("more_body", False):
-                    await self._drain(receive)
+            self._held_bytes += len(message.get("body", b""))
+            too_large, too_many = received > self._max_bytes, self._held_bytes > self._max_held_bytes
+            if (too_large or too_many) and not complete:
+                await self._drain(receive, ends_s)
+            if too_large:
                 raise self._too_large()
+            if too_many:
+                detail = f"the bodies of all requests together hold at most {self._max_held_bytes} bytes"
+                raise HTTPException(429, detail, {"Retry-After": "1"})
             return message
 
-        await self._app(scope, receive_within_limit, send)
+        try:
+            await self._app(scope, receive_within_limit, send)
+        finally:
+            self._held_bytes -= received
 
-    async def _drain(self, receive: Receive) -> None:
+    async def _drain(self, receive: Receive, ends_s: float) -> None:
         dropped = 0
-        while dropped <= _DRAIN_FACTOR * self._max_bytes:
-            message = await receive()
-            dropped += len(message.get("body", b""))
-            if not message.get("more_body", False):
-                return
+        with suppress(TimeoutError):
+            async with asyncio.timeout_at(ends_s):
+                while dropped <= _DRAIN_FACTOR * self._max_bytes:
+                    message = await receive()
+                    dropped += len(message.get("body", b""))
+                    if not message.get("more_body", False):
+                        return
 
     def _too_large(self) -> HTTPException:
         return HTTPException(413, f"at most {self._max_bytes} bytes are accepted")

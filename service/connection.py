@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
+import sys
+import termios
 from typing import Any, Final
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
@@ -13,13 +16,17 @@ _TOO_LARGE: Final = (
 )
 
 
-def guarded_connection(headers_timeout_s: float, write_timeout_s: float) -> type[HttpToolsProtocol]:
+def guarded_connection(
+    headers_timeout_s: float, write_timeout_s: float, probes: frozenset[str] = frozenset()
+) -> type[HttpToolsProtocol]:
     """uvicorn's connection with limits that it lacks.
 
     Args:
         headers_timeout_s: a connection is closed when the headers of its next request take longer, from the
             first byte, or from the beginning of the connection.
         write_timeout_s: it is cut off when the caller takes nothing of what waits for it for so long.
+        probes: paths that are answered however many connections are open: a service that is full is not one
+            to be restarted.
     """
 
     class GuardedConnection(HttpToolsProtocol):
@@ -51,11 +58,16 @@ def guarded_connection(headers_timeout_s: float, write_timeout_s: float) -> type
 
         def on_headers_complete(self) -> None:
             self._headers_are_there()
-            super().on_headers_complete()
+            if self.url.partition(b"?")[0].decode("ascii", "replace") in probes:
+                limit, self.limit_concurrency = self.limit_concurrency, None
+                super().on_headers_complete()
+                self.limit_concurrency = limit
+            else:
+                super().on_headers_complete()
 
         def pause_writing(self) -> None:
             super().pause_writing()
-            self._write_timer = self.loop.call_later(write_timeout_s, self.transport.abort)
+            self._await_writing()
 
         def resume_writing(self) -> None:
             self._can_write()
@@ -70,6 +82,17 @@ def guarded_connection(headers_timeout_s: float, write_timeout_s: float) -> type
             self._header_bytes = 0
             self._headers_timer = self.loop.call_later(headers_timeout_s, self.transport.abort)
 
+        def _await_writing(self) -> None:
+            waiting = _not_taken(self.transport)
+
+            def look() -> None:
+                if _not_taken(self.transport) < waiting:
+                    self._await_writing()  # slow, but it takes what it is given
+                else:
+                    self.transport.abort()
+
+            self._write_timer = self.loop.call_later(write_timeout_s, look)
+
         def _headers_are_there(self) -> None:
             if self._headers_timer is not None:
                 self._headers_timer.cancel()
@@ -81,3 +104,12 @@ def guarded_connection(headers_timeout_s: float, write_timeout_s: float) -> type
                 self._write_timer = None
 
     return GuardedConnection
+
+
+def _not_taken(transport: asyncio.Transport) -> int:
+    """Bytes that the other end has not confirmed: ours, and the kernel's, which may hold megabytes."""
+    try:
+        queued = fcntl.ioctl(transport.get_extra_info("socket").fileno(), termios.TIOCOUTQ, bytes(4))
+    except OSError:  # where the system does not tell of sockets
+        queued = bytes(4)
+    return transport.get_write_buffer_size() + int.from_bytes(queued, sys.byteorder)

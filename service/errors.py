@@ -17,7 +17,6 @@ from service.metrics import Metrics
 from service.problems import (
     BODY_TIMEOUT,
     BODY_TOO_LARGE,
-    DRAINING,
     INTERNAL,
     INVALID_CLIP,
     INVALID_CONTROLS,
@@ -28,7 +27,7 @@ from service.problems import (
     INVALID_ROUTE,
     METHOD_NOT_ALLOWED,
     NOT_FOUND,
-    REJECTIONS,
+    QUEUE_FULL,
     UNAUTHORIZED,
     UNKNOWN_CAMERA,
     UNKNOWN_FIELD,
@@ -54,7 +53,7 @@ _KIND_BY_STATUS: Final = {
     kind.status: kind
     for kind in (
         *(INVALID_JSON, NOT_FOUND, METHOD_NOT_ALLOWED, BODY_TIMEOUT, BODY_TOO_LARGE),
-        UNSUPPORTED_MEDIA_TYPE,
+        *(UNSUPPORTED_MEDIA_TYPE, QUEUE_FULL),
     )
 }
 
@@ -63,8 +62,7 @@ def install_error_handlers(app: FastAPI, metrics: Metrics) -> None:
     """Answer every error of ``app`` with a problem document; what is not foreseen, the middleware answers."""
 
     def answer(request: Request, problem: ProblemError, headers: dict[str, str] | None = None) -> Response:
-        if problem.kind in REJECTIONS:
-            metrics.rejected(problem.kind.slug)
+        metrics.problem_told(problem.kind)
         # OpenAI's clients show their users this member, and no other.
         chat = request.url.path.startswith("/v1/chat/")
         extension = {"message": problem.detail} if chat else {}
@@ -100,7 +98,7 @@ def problem_response(
     extra = dict(headers or {})
     if error.retry_after_s is not None:
         extra["Retry-After"] = str(error.retry_after_s)
-    if kind in (DRAINING, BODY_TIMEOUT):
+    if kind is BODY_TIMEOUT:
         extra["Connection"] = "close"
     # Plain ASCII: details quote what callers sent, which need not be encodable otherwise.
     document = problem_document(error, request_id).model_dump(exclude_defaults=True)

@@ -15,6 +15,7 @@ from service.problems import IDEMPOTENCY_KEY_REUSED, ProblemError
 
 REPLAYED_HEADER: Final = "Idempotency-Replayed"
 _KEPT: Final = 1024
+_KEPT_BYTES: Final = 64_000_000
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,8 @@ class Idempotency:
     """Answers by the idempotency keys they were asked for with, in memory and for a while.
 
     A caller that asks again while the answer is being made waits for it, and the work goes on when its first
-    caller leaves: whoever lost a connection comes back for what was made meanwhile. Failures are not kept.
+    caller leaves: whoever lost a connection comes back for what was made meanwhile. Failures are not kept;
+    where answers are many or large, the oldest go early.
 
     Args:
         kept_s: how long an answer is kept.
@@ -38,6 +40,11 @@ class Idempotency:
     def __init__(self, kept_s: float, clock: Callable[[], float]) -> None:
         self._kept_s, self._clock = kept_s, clock
         self._made: OrderedDict[tuple[str, str], _Made] = OrderedDict()
+
+    def knows(self, owner: str, key: str) -> bool:
+        """Whether an answer was made, or is being made, for ``owner``'s ``key``."""
+        self._forget_old()
+        return (owner, key) in self._made
 
     async def once(
         self, owner: str, key: str, asked: bytes, work: Callable[[], Awaitable[Response]]
@@ -65,22 +72,33 @@ class Idempotency:
             )
         task = asyncio.ensure_future(_ensure_coroutine(work))
         self._made[place] = _Made(fingerprint, self._clock() + self._kept_s, task)
-        try:
-            return await asyncio.shield(task)
-        finally:
-            task.add_done_callback(lambda done: self._keep_only_success(place, done))
+        task.add_done_callback(lambda done: self._keep_only_success(place, done))
+        return await asyncio.shield(task)
 
     def _keep_only_success(self, place: tuple[str, str], done: asyncio.Task[Response]) -> None:
-        if done.cancelled() or done.exception() is not None:
-            self._made.pop(place, None)
+        made = self._made.get(place)
+        if made is not None and made.answer is done and not _succeeded(done):
+            del self._made[place]
 
     def _forget_old(self) -> None:
+        """Let answers go that are old, or too many; never one that is being made: it would be made twice."""
         now_s = self._clock()
-        while self._made:
-            oldest = next(iter(self._made.values()))
-            if oldest.until_s > now_s and len(self._made) < _KEPT:
+        sizes = {place: _size(made) for place, made in self._made.items() if made.answer.done()}
+        kept_bytes = sum(sizes.values())
+        for place, size in sizes.items():
+            old = self._made[place].until_s <= now_s
+            if not old and len(self._made) < _KEPT and kept_bytes <= _KEPT_BYTES:
                 return
-            self._made.popitem(last=False)
+            kept_bytes -= size
+            del self._made[place]
+
+
+def _succeeded(done: asyncio.Task[Response]) -> bool:
+    return not done.cancelled() and done.exception() is None
+
+
+def _size(made: _Made) -> int:
+    return len(made.answer.result().body) if _succeeded(made.answer) else 0
 
 
 async def _ensure_coroutine(work: Callable[[], Awaitable[Response]]) -> Response:

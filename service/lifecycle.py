@@ -47,6 +47,7 @@ class Lifecycle:
         self._keeping: asyncio.Task[None] | None = None
         self._retiring: set[asyncio.Task[None]] = set()
         self._users: dict[int, int] = {}
+        self._accepted = 0
         self._nobody = asyncio.Event()
         self._nobody.set()
         self._ready = self._draining = self._swapping = False
@@ -75,25 +76,46 @@ class Lifecycle:
         await asyncio.gather(*tasks, return_exceptions=True)
         await self._engine.stop()
 
+    @property
+    def stopping(self) -> bool:
+        """Whether the service is about to stop."""
+        return self._draining
+
+    @contextmanager
+    def accepted(self) -> Generator[None]:
+        """A request that is to be answered whatever comes: a drain waits until the block ends.
+
+        Raises:
+            ProblemError: the service is about to stop.
+        """
+        self.check_accepting()
+        self._accepted += 1
+        self._nobody.clear()
+        try:
+            yield
+        finally:
+            self._accepted -= 1
+            if not self._accepted:
+                self._nobody.set()
+
     @contextmanager
     def engine(self) -> Generator[Engine]:
         """The engine that answers now, kept until the block ends even when it is replaced.
 
+        For requests that were accepted, so also while the service drains.
+
         Raises:
             ProblemError: no engine can answer.
         """
-        self.check_ready()
+        self._check_engine()
         engine = self._engine
         self._users[id(engine)] = self._users.get(id(engine), 0) + 1
-        self._nobody.clear()
         try:
             yield engine
         finally:
             self._users[id(engine)] -= 1
             if not self._users[id(engine)]:
                 del self._users[id(engine)]
-            if not self._users:
-                self._nobody.set()
 
     def check_accepting(self) -> None:
         """Raise `ProblemError` once the service is about to stop."""
@@ -103,6 +125,9 @@ class Lifecycle:
     def check_ready(self) -> None:
         """Raise `ProblemError` unless the engine can plan for new requests."""
         self.check_accepting()
+        self._check_engine()
+
+    def _check_engine(self) -> None:
         if self._ready:
             return
         if self._failure:
@@ -121,7 +146,7 @@ class Lifecycle:
         self._draining = True
         self._metrics.draining.set(1)
         self._metrics.ready.set(0)
-        log.info("draining", requests=sum(self._users.values()))
+        log.info("draining", requests=self._accepted)
         await self._nobody.wait()
 
     @contextmanager

@@ -10,6 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from model.driving.plan import plan_iou
 from model.engines.engine import Draw, Load, ModelCard, Thinking
 from service.admission import Admission
+from service.problems import REJECTIONS, Kind
 
 LATENCY_BUCKETS_S: Final = (
     *(0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.75),
@@ -54,13 +55,13 @@ class Metrics:
         )
         self._rejections = Counter(
             "looktwice_rejections",
-            "Requests that were not served, by the problem that their callers were told.",
+            "Requests, or scenes of batches, that were not served, by the problem that callers were told.",
             ["reason"],
             registry=registry,
         )
         self._queue = Histogram(
             "looktwice_queue_seconds",
-            "From a scene's acceptance to its place in the engine.",
+            "Of a scene, for its turn in a batch and for its place in the engine.",
             buckets=QUEUE_BUCKETS_S,
             registry=registry,
         )
@@ -85,7 +86,7 @@ class Metrics:
         )
         self._deadlines = Counter(
             "looktwice_deadlines",
-            "Answers with a deadline, by whether they were finished in time.",
+            "Scenes with a deadline, by whether they were answered in time.",
             ["outcome"],
             registry=registry,
         )
@@ -175,16 +176,19 @@ class Metrics:
             lambda: sum(place.draws for place in admission.waiting),
         )
 
-    def rejected(self, reason: str) -> None:
-        """Count a request that was not served; ``reason`` is the problem's slug."""
-        self._rejections.labels(reason).inc()
+    def problem_told(self, kind: Kind) -> None:
+        """Count a request, or a scene of a batch, that may have been right and was not served."""
+        if kind in REJECTIONS:
+            self._rejections.labels(kind.slug).inc()
 
-    def answered(self, endpoint: str, queue_s: float, engine_s: float, deadline_met: bool | None) -> None:
+    def answered(self, endpoint: str, queue_s: float, engine_s: float) -> None:
         """Count one scene that was planned for."""
         self._queue.observe(queue_s)
         self._engine.labels(endpoint).observe(engine_s)
-        if deadline_met is not None:
-            self._deadlines.labels("met" if deadline_met else "missed").inc()
+
+    def deadline_told(self, *, met: bool) -> None:
+        """Count one scene with a deadline, whether it was answered or given up."""
+        self._deadlines.labels("met" if met else "missed").inc()
 
     def engine_restarted(self) -> None:
         """Count an engine that broke and runs again."""

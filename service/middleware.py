@@ -6,6 +6,7 @@ import asyncio
 import re
 import secrets
 import time
+from collections.abc import Callable
 from typing import Final
 
 import structlog
@@ -27,10 +28,16 @@ log = structlog.stdlib.get_logger()
 
 
 class Around:
-    """Pure ASGI, so that answers stream and the disconnect message reaches the routes."""
+    """Pure ASGI, so that answers stream and the disconnect message reaches the routes.
 
-    def __init__(self, app: ASGIApp, metrics: Metrics, traces: Traces) -> None:
-        self._app, self._metrics, self._traces = app, metrics, traces
+    Args:
+        app: what is around.
+        metrics, traces: where requests are counted and traced.
+        stopping: whether the service is about to stop.
+    """
+
+    def __init__(self, app: ASGIApp, metrics: Metrics, traces: Traces, stopping: Callable[[], bool]) -> None:
+        self._app, self._metrics, self._traces, self._stopping = app, metrics, traces, stopping
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection; anything but HTTP passes through."""
@@ -47,7 +54,10 @@ class Around:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
+                headers = MutableHeaders(scope=message)
+                headers[REQUEST_ID_HEADER] = request_id
+                if self._stopping():
+                    headers["Connection"] = "close"  # or the next request meets a server that has gone
             await send(message)
 
         method = scope["method"] if scope["method"] in _METHODS else "other"
@@ -64,7 +74,8 @@ class Around:
                 await problem_response(unforeseen(), request_id)(scope, receive, send_with_id)
             except asyncio.CancelledError:
                 # The server's last word at the end of a drain; whoever waits is better asking elsewhere.
-                if status:
+                # At other times it is the caller who ends it, in this very process.
+                if status or not self._stopping():
                     raise
                 stopped = ProblemError(DRAINING, "the service stopped before this was answered; ask another")
                 await problem_response(stopped, request_id)(scope, receive, send_with_id)

@@ -27,7 +27,7 @@ from service.streaming import Told, Written, streamed
 
 def openai_router(parts: Parts) -> APIRouter:
     """The endpoint for clients of OpenAI's API."""
-    router = APIRouter(route_class=payload_route(parts.planning.check_open), tags=["planning"])
+    router = APIRouter(route_class=payload_route(lambda _: parts.planning.check_open()), tags=["planning"])
 
     @router.post("/v1/chat/completions", responses=problems(*REFUSALS))
     async def chat_completions(request: Request, chat: ChatRequest) -> Any:
@@ -38,12 +38,13 @@ def openai_router(parts: Parts) -> APIRouter:
             asked = plan_request(chat, card)
         except ValidationError as error:
             raise from_validation(RequestValidationError(error.errors())) from None
-        await parts.planning.spend(arrival.owner, chat.n)
         completion = Completion(arrival.request_id, card.name, chat)
         events = parts.planning.events(asked, arrival)
         if not chat.stream:
             return JSONResponse(completion.whole(await while_connected(request, last(events))))
-        return await streamed(request, events, lambda told: _chunks(told, completion, arrival.request_id))
+        return await streamed(
+            request, events, lambda told: _chunks(told, completion, arrival.request_id), parts.metrics
+        )
 
     return router
 

@@ -45,7 +45,7 @@ class _Decoded(Request):
         return self._document
 
 
-def payload_route(check_open: Callable[[], None]) -> type[APIRoute]:
+def payload_route(check_open: Callable[[Request], None]) -> type[APIRoute]:
     """A kind of route that takes all of them; the schema of each is that of the JSON body.
 
     Args:
@@ -58,7 +58,7 @@ def payload_route(check_open: Callable[[], None]) -> type[APIRoute]:
 
             async def decoded(request: Request) -> Response:
                 try:
-                    check_open()
+                    check_open(request)
                 except ProblemError:
                     # Read, or a caller that is still sending would miss the answer.
                     async for _ in request.stream():

@@ -110,11 +110,19 @@ class Planning:
         self._lifecycle, self._admission, self._rates = lifecycle, admission, rates
         self._metrics, self._traces, self._limits = metrics, traces, limits
 
-    def check_open(self) -> None:
+    def check_open(self, *, batch: bool = False) -> None:
         """Raise `ProblemError` where nothing could be accepted now; asked before a body is read."""
         self._lifecycle.check_ready()
-        with _full_as_problem():
-            self._admission.check_open()
+        with full_as_problem():
+            self._admission.check_open(batch=batch)
+
+    @contextmanager
+    def batch(self, scenes: int) -> Generator[None]:
+        """Let a batch in until it is answered; raises `ProblemError` where there are too many."""
+        with self._lifecycle.accepted(), ExitStack() as stack:
+            with full_as_problem():
+                stack.enter_context(self._admission.batch(scenes))
+            yield
 
     async def spend(self, owner: str, draws: int) -> None:
         """Count what ``owner`` asks for; raises `ProblemError` where it is too much."""
@@ -130,15 +138,16 @@ class Planning:
         Raises:
             ProblemError: at the first iteration where it is not let in; later where it fails.
         """
-        with ExitStack() as stack:
-            with _full_as_problem():
+        with self._lifecycle.accepted(), ExitStack() as stack:
+            with full_as_problem():
                 place = stack.enter_context(self._admission.place(asked.controls.n))
+            await self.spend(arrival.owner, asked.controls.n)
             async with aclosing(self._plan(asked, arrival, place)) as events:
                 async for event in events:
                     yield event
 
     async def in_turn(self, asked: Asked, arrival: Arrival) -> Planned:
-        """A scene of a batch, which waits for its place; raises `ProblemError`."""
+        """A scene of a batch that was let in, which waits for its place; raises `ProblemError`."""
         async with self._admission.place_in_turn(asked.controls.n) as place:
             return await last(self._plan(asked, arrival, place))
 
@@ -149,29 +158,37 @@ class Planning:
             checking_s = time.monotonic()
             request = await self._checked(asked, engine.card, arrival)
             submitted_s = began_s = time.monotonic()
-            with self._metrics.plans_in_flight.track_inprogress():
-                async with aclosing(self._decode(engine, request)) as events:
-                    async for event in events:
-                        if isinstance(event, Started):
-                            place.began()
-                            began_s = time.monotonic()
-                        elif isinstance(event, DraftFinished):
-                            drafts[event.draw.index] = event.draw
-                        elif isinstance(event, DrawFinished):
-                            draws.append(event.draw)
-                        yield event
+            try:
+                with self._metrics.plans_in_flight.track_inprogress():
+                    async with aclosing(self._decode(engine, request)) as events:
+                        async for event in events:
+                            if isinstance(event, Started):
+                                place.began()
+                                began_s = time.monotonic()
+                            elif isinstance(event, DraftFinished):
+                                drafts[event.draw.index] = event.draw
+                            elif isinstance(event, DrawFinished):
+                                draws.append(event.draw)
+                            yield event
+            except ProblemError as error:
+                if asked.controls.deadline_ms is not None and error.kind in (QUEUE_TIMEOUT, DECODE_TIMEOUT):
+                    self._metrics.deadline_told(met=False)
+                raise
             finished_s = time.monotonic()
             draws.sort(key=lambda draw: draw.index)
             deadline_met = _met(asked.controls.deadline_ms, arrival)
             for draw in draws:
                 self._metrics.draw_finished(draw, request.controls.thinking, endpoint)
-            self._metrics.answered(endpoint, began_s - submitted_s, finished_s - submitted_s, deadline_met)
+            queue_s = place.waited_s + began_s - submitted_s
+            self._metrics.answered(endpoint, queue_s, finished_s - submitted_s)
+            if deadline_met is not None:
+                self._metrics.deadline_told(met=deadline_met)
             span.drew(draws)
             timing = wire.Timing(
                 total_ms=_ms(finished_s - arrival.since_s),
                 checks_ms=_ms(submitted_s - checking_s),
                 engine_ms=_ms(finished_s - submitted_s),
-                queue_ms=_ms(began_s - submitted_s),
+                queue_ms=_ms(queue_s),
             )
             deadline = None
             if deadline_met is not None:
@@ -225,7 +242,8 @@ async def last(events: AsyncGenerator[Event | Planned]) -> Planned:
 
 
 @contextmanager
-def _full_as_problem() -> Generator[None]:
+def full_as_problem() -> Generator[None]:
+    """`Full` in the block as a `ProblemError` that says when to come back."""
     try:
         yield
     except Full as full:

@@ -91,7 +91,17 @@ IdempotencyKey = Annotated[
 
 def planning_router(parts: Parts) -> APIRouter:
     """The endpoints that the engine works for."""
-    router = APIRouter(route_class=payload_route(parts.planning.check_open), tags=["planning"])
+
+    def check_open(request: Request) -> None:
+        if not _made_before(request, parts):
+            parts.planning.check_open()
+
+    def check_open_for_batch(request: Request) -> None:
+        if not _made_before(request, parts):
+            parts.planning.check_open(batch=True)
+
+    router = APIRouter(route_class=payload_route(check_open), tags=["planning"])
+    batches = APIRouter(route_class=payload_route(check_open_for_batch), tags=["planning"])
     refusals = problems(*REFUSALS)
 
     @router.post(
@@ -122,7 +132,7 @@ def planning_router(parts: Parts) -> APIRouter:
         """A second look at a given plan: keep it or revise it, why, and the trajectory that follows."""
         return await _one(request, parts, asked, idempotency_key, reflect_answer)
 
-    @router.post(
+    @batches.post(
         "/v1/plan/batch",
         response_model=wire.BatchResponse,
         responses=refusals,
@@ -136,15 +146,24 @@ def planning_router(parts: Parts) -> APIRouter:
             if each.stream:
                 raise at(INVALID_CONTROLS, f"/requests/{number}/stream", "a batch cannot stream")
         arrival = arrival_of(request)
-        await parts.planning.spend(arrival.owner, sum(each.controls.n for each in asked.requests))
 
         async def work() -> Response:
-            results = [_result(parts, each, arrival) for each in asked.requests]
-            return respond(request, wire.BatchResponse(results=await asyncio.gather(*results)))
+            with parts.planning.batch(len(asked.requests)):
+                await parts.planning.spend(arrival.owner, sum(each.controls.n for each in asked.requests))
+                async with asyncio.TaskGroup() as group:
+                    tasks = [group.create_task(_result(parts, each, arrival)) for each in asked.requests]
+            return respond(request, wire.BatchResponse(results=[task.result() for task in tasks]))
 
         return await _once(request, parts, arrival, idempotency_key, asked, work)
 
+    router.include_router(batches)
     return router
+
+
+def _made_before(request: Request, parts: Parts) -> bool:
+    """Whether a request's answer was made, or is being made: to give it again costs nothing."""
+    key = request.headers.get(wire.IDEMPOTENCY_KEY_HEADER)
+    return key is not None and parts.idempotency.knows(request.state.owner, key)
 
 
 def arrival_of(request: Request) -> Arrival:
@@ -168,7 +187,6 @@ async def _one(
     made: Callable[[Planned, str], BaseModel],
 ) -> Response:
     arrival = arrival_of(request)
-    await parts.planning.spend(arrival.owner, asked.controls.n)
 
     def answer(planned: Planned) -> BaseModel:
         return made(planned, arrival.request_id)
@@ -177,7 +195,9 @@ async def _one(
         if idempotency_key is not None:
             raise ProblemError(INVALID_REQUEST, f"{wire.IDEMPOTENCY_KEY_HEADER} cannot go with stream: true")
         events = parts.planning.events(asked, arrival)
-        return await streamed(request, events, lambda told: server_sent(told, answer, arrival.request_id))
+        return await streamed(
+            request, events, lambda told: server_sent(told, answer, arrival.request_id), parts.metrics
+        )
 
     async def work() -> Response:
         return respond(request, answer(await last(parts.planning.events(asked, arrival))))
@@ -203,6 +223,7 @@ async def _result(parts: Parts, asked: wire.PlanRequest, arrival: Arrival) -> wi
     try:
         planned = await parts.planning.in_turn(asked, arrival)
     except ProblemError as error:
+        parts.metrics.problem_told(error.kind)
         document = problem_document(error, arrival.request_id)
         return wire.BatchResult(status=error.kind.status, problem=document)
     return wire.BatchResult(status=200, response=plan_answer(planned, arrival.request_id))

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+import time
+from contextlib import ExitStack
+from typing import Any, Final
 
 import prometheus_client
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 import clients.wire as wire
+from service.admission import Admission
 from service.answers import model_card
 from service.auth import NOBODY
+from service.callers import while_connected
 from service.labelling import label, teacher_name
 from service.openai_routes import openai_router
 from service.openapi import Responses, payloads, problems
 from service.parts import Parts
 from service.payloads import payload_route
+from service.planning import full_as_problem
 from service.planning_routes import arrival_of, planning_router, respond
 from service.problems import (
     BODY_TIMEOUT,
@@ -37,6 +42,7 @@ from service.problems import (
     LABEL_REFUSED,
     NEEDS_ANNOTATIONS,
     NOT_READY,
+    QUEUE_FULL,
     RATE_LIMITED,
     SCENES_UNREADABLE,
     SWAP_UNDER_WAY,
@@ -51,6 +57,8 @@ from service.problems import (
 )
 from service.views import BundledScenes, scenes_of_file, view
 
+_FILES_AT_ONCE: Final = 2
+"""Scene files that are unpacked; others wait."""
 NOT_NOW = (NOT_READY, DRAINING, ENGINE_FAILED)
 METRICS_TEXT: Responses = {200: {"description": "Prometheus text", "content": {"text/plain": {}}}}
 
@@ -68,7 +76,15 @@ def make_router(parts: Parts) -> APIRouter:
 
 
 def _add_labelling(router: APIRouter, parts: Parts) -> None:
-    labelling = APIRouter(route_class=payload_route(parts.lifecycle.check_accepting))
+    # A teacher that is slow must not gather callers and their pictures without end.
+    admission = Admission(parts.settings.max_scenes, parts.settings.max_scenes, time.monotonic)
+
+    def check_open(_: Request) -> None:
+        parts.lifecycle.check_accepting()
+        with full_as_problem():
+            admission.check_open()
+
+    labelling = APIRouter(route_class=payload_route(check_open))
 
     @labelling.post(
         "/v1/label",
@@ -78,15 +94,19 @@ def _add_labelling(router: APIRouter, parts: Parts) -> None:
             *(INVALID_JSON, INVALID_BODY, UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE),
             *(UNSUPPORTED_MEDIA_TYPE, INVALID_REQUEST, UNKNOWN_FIELD),
             *(INVALID_CLIP, UNKNOWN_CAMERA, INVALID_IMAGE, INVALID_HISTORY, INVALID_ROUTE, INVALID_PLAN),
-            *(NEEDS_ANNOTATIONS, LABEL_REFUSED, RATE_LIMITED, TEACHER_AWAY, DRAINING),
+            *(NEEDS_ANNOTATIONS, LABEL_REFUSED, QUEUE_FULL, RATE_LIMITED, TEACHER_AWAY, DRAINING),
         ),
         openapi_extra=payloads(wire.LabelRequest),
     )
     async def write_label(request: Request, asked: wire.LabelRequest) -> Any:
         """Why a plan is less good than another: a teacher's paragraph, checked, to train on."""
         arrival = arrival_of(request)
-        await parts.planning.spend(arrival.owner, 1)
-        return respond(request, await label(asked, parts.teacher, parts.metrics, arrival.request_id))
+        with parts.lifecycle.accepted(), ExitStack() as stack:
+            with full_as_problem():
+                stack.enter_context(admission.place(1))
+            await parts.planning.spend(arrival.owner, 1)
+            written = label(asked, parts.teacher, parts.metrics, arrival.request_id)
+            return respond(request, await while_connected(request, written))
 
     router.include_router(labelling)
 
@@ -150,6 +170,7 @@ def _add_probes(router: APIRouter, parts: Parts) -> None:
 
 def _add_scenes(router: APIRouter, parts: Parts) -> None:
     bundled = BundledScenes(parts.settings.bundled_scenes)
+    reading = asyncio.Semaphore(_FILES_AT_ONCE)
 
     @router.get("/v1/scenes", tags=["scenes"], responses=problems(UNAUTHORIZED, SCENES_UNREADABLE))
     async def scenes() -> wire.SceneList:
@@ -186,4 +207,5 @@ def _add_scenes(router: APIRouter, parts: Parts) -> None:
             raise ProblemError(
                 BODY_TOO_LARGE, f"the file has {len(content)} bytes; at most {largest} are read"
             )
-        return wire.SceneFile(scenes=await asyncio.to_thread(scenes_of_file, content))
+        async with reading:
+            return wire.SceneFile(scenes=await asyncio.to_thread(scenes_of_file, content))

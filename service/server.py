@@ -14,6 +14,7 @@ import structlog
 import uvicorn
 from fastapi import FastAPI
 
+from service.auth import OPEN_PATHS
 from service.connection import guarded_connection
 from service.settings import Settings
 
@@ -76,7 +77,7 @@ def make_server(app: FastAPI, settings: Settings, host: str = "127.0.0.1", port:
         app,
         host,
         port,
-        http=guarded_connection(settings.headers_timeout_s, settings.write_timeout_s),
+        http=guarded_connection(settings.headers_timeout_s, settings.write_timeout_s, OPEN_PATHS),
         ws="none",
         log_config=None,
         access_log=False,

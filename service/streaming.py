@@ -25,6 +25,7 @@ from model.formats.pieces import BRANCH
 from service.answers import wire_plan, wire_trajectory
 from service.callers import CallerLeft, while_connected
 from service.errors import problem_document
+from service.metrics import Metrics
 from service.planning import Planned
 from service.problems import ProblemError, unforeseen
 
@@ -40,13 +41,14 @@ Told = tuple[str, Written] | Planned
 
 
 async def told_events(
-    first: Event | Planned, events: AsyncGenerator[Event | Planned]
+    first: Event | Planned, events: AsyncGenerator[Event | Planned], metrics: Metrics
 ) -> AsyncGenerator[Told]:
     """What happens to a scene in the wire's words; closing it early frees everything.
 
     Args:
         first: was asked for already, so that a scene that is not let in gets a plain problem.
         events: what follows.
+        metrics: where a failure is counted, as no status shows it.
 
     Raises:
         ProblemError: whatever went wrong; the status is sent, so nothing but an event can tell.
@@ -62,7 +64,8 @@ async def told_events(
                 for each in _data(event, told):
                     yield each
                 event = await anext(events, None)
-        except ProblemError:
+        except ProblemError as error:
+            metrics.problem_told(error.kind)
             raise
         except Exception as error:
             log.exception("stream failed")
@@ -85,6 +88,7 @@ async def streamed(
     request: Request,
     events: AsyncGenerator[Event | Planned],
     sent: Callable[[AsyncGenerator[Told]], AsyncGenerator[bytes]],
+    metrics: Metrics,
 ) -> StreamingResponse:
     """A scene's events as they come, in the bytes that ``sent`` makes of them.
 
@@ -98,7 +102,7 @@ async def streamed(
     except CallerLeft:
         await events.aclose()
         raise
-    told = told_events(first, events)
+    told = told_events(first, events, metrics)
     return StreamingResponse(sent(told), media_type=wire.SSE_MEDIA_TYPE, headers=_NO_BUFFERING)
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.admission import Admission, Full, whole_seconds
+from service.admission import PATIENCE_S, Admission, Full, whole_seconds
 
 
 @dataclass
@@ -136,5 +136,44 @@ def test_never_more_than_there_is_and_all_comes_back(
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         assert admission.free == 8
+
+    asyncio.run(test())
+
+
+def test_batches_are_bounded_together() -> None:
+    admission = Admission(draws=10, scenes=8, clock=Clock())
+    with admission.batch(64), pytest.raises(Full, match="64 of others"), admission.batch(1):
+        pass
+    with admission.batch(5), admission.batch(3):
+        with pytest.raises(Full):
+            admission.check_open(batch=True)
+        admission.check_open()
+    with admission.batch(8):
+        pass
+
+
+def test_a_batch_gets_on_although_others_keep_coming() -> None:
+    async def test() -> None:
+        clock = Clock()
+        admission = Admission(draws=4, scenes=8, clock=clock)
+        began = asyncio.Event()
+
+        async def scene() -> None:
+            async with admission.place_in_turn(4) as place:
+                assert place.waited_s == pytest.approx(PATIENCE_S + 0.1)
+                began.set()
+
+        with admission.place(1):
+            task = asyncio.create_task(scene())
+            await asyncio.sleep(0)
+            assert [place.draws for place in admission.waiting] == [1, 4]
+            with admission.place(3):
+                clock.now_s += PATIENCE_S + 0.1
+            # There is room for another, but the batch's scene has waited for long enough.
+            with pytest.raises(Full, match="goes first"):
+                admission.check_open()
+        await asyncio.wait_for(began.wait(), 1)
+        await task
+        admission.check_open()
 
     asyncio.run(test())

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import threading
 from typing import Any
 
+import httpx
 import pytest
 
 import clients.wire as wire
+from model.engines.engine import EngineError
 from service.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
@@ -60,3 +63,38 @@ def test_bad_batches(served: Served, engine: ScriptedEngine, requests: Any, slug
     found = problem(served.http.post("/v1/plan/batch", json={"requests": requests}), slug)
     assert found.errors[0].pointer == pointer
     assert engine.submitted == []
+
+
+def test_a_batch_waits_where_a_scene_would_be_refused(served: Served, engine: ScriptedEngine) -> None:
+    served.in_loop(engine.may_finish.clear)
+    answers: list[httpx.Response] = []
+
+    def post(path: str, document: Any) -> threading.Thread:
+        def ask() -> None:
+            answers.append(httpx.post(served.url + path, json=document, timeout=30))
+
+        thread = threading.Thread(target=ask)
+        thread.start()
+        return thread
+
+    alone = post("/v1/plan", body(n=8))
+    served.until(lambda: len(engine.submitted) == 1)
+    problem(served.http.post("/v1/plan", json=body(n=1)), "queue-full")
+    batch = post("/v1/plan/batch", {"requests": [body(n=4), body(n=4), body(n=4)]})
+    served.until(lambda: served.metric("looktwice_queue_draws") == 12)
+    assert len(engine.submitted) == 1
+    served.in_loop(engine.may_finish.set)
+    for thread in (alone, batch):
+        thread.join()
+    assert [answer.status_code for answer in answers] == [200, 200]
+    results = answers[1].json()["results"]
+    assert [result["status"] for result in results] == [200] * 3
+    assert all(result["response"]["timing"]["queue_ms"] > 0 for result in results)
+    assert served.metric("looktwice_queue_draws") == 0
+
+
+def test_scenes_that_fail_are_counted(served: Served, engine: ScriptedEngine) -> None:
+    engine.failure = EngineError("broke")
+    results = ask(served, body(n=1), body(n=1))
+    assert [result.status for result in results] == [503, 503]
+    assert served.metric("looktwice_rejections_total", reason="engine-failed") == 2

@@ -8,7 +8,7 @@ import pytest
 
 from service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
-from tests.service.serving import Served, body
+from tests.service.serving import Served, body, serve
 from tests.service.test_errors import JSON, problem
 
 
@@ -59,3 +59,20 @@ def test_large_bodies_below_the_limit_are_served(served: Served) -> None:
 def test_scene_files_have_a_limit_of_their_own(served: Served) -> None:
     problem(served.http.post("/v1/scenes:read", content=b"x" * 1001), "body-too-large")
     problem(served.http.post("/v1/scenes:read", content=b"x" * 1000), "invalid-scene-file")
+
+
+def test_all_bodies_together_have_a_limit(engine: ScriptedEngine) -> None:
+    with serve(engine, Settings(max_held_bytes=1_500_000, body_timeout_s=20)) as served:
+        host, port = served.url.removeprefix("http://").split(":")
+        head = "POST /v1/plan HTTP/1.1\r\nHost: x\r\nContent-Length: 1000001\r\n\r\n"
+        with socket.create_connection((host, int(port)), timeout=30) as connection:
+            connection.sendall(head.encode() + b" " * 1_000_000)
+            padded = json.dumps(body()) + " " * 1_000_000
+            served.until(
+                lambda: served.http.post("/v1/plan", content=padded, headers=JSON).status_code == 429
+            )
+            refused = served.http.post("/v1/plan", content=padded, headers=JSON)
+            assert "together" in problem(refused, "queue-full").detail
+            assert refused.headers["Retry-After"] == "1"
+            assert served.http.post("/v1/plan", json=body()).status_code == 200
+        served.until(lambda: served.http.post("/v1/plan", content=padded, headers=JSON).status_code == 200)

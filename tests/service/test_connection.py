@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 import socket
+import threading
 from collections.abc import Iterator
 
+import httpx
 import pytest
+import uvicorn
+from starlette.types import Receive, Scope, Send
 
+from service.connection import guarded_connection
 from service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
+from tests.sockets import listening
 
 HEAD = b"POST /v1/plan HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
 
@@ -126,3 +132,46 @@ def _is_cut(connection: socket.socket) -> bool:
     except BlockingIOError:
         pass
     return False
+
+
+def test_a_body_announced_too_large_is_not_waited_for(served: Served) -> None:
+    with connect(served) as connection:
+        connection.sendall(HEAD + b"Content-Length: 30000000\r\n\r\n{")
+        assert ended(connection).startswith(b"HTTP/1.1 413")
+
+
+def test_probes_are_answered_when_no_more_connections_are(engine: ScriptedEngine) -> None:
+    with serve(engine, Settings(max_connections=3)) as served:
+        others = [connect(served) for _ in range(3)]
+        try:
+            served.until(lambda: httpx.get(f"{served.url}/v1/models").status_code == 503)
+            assert httpx.get(f"{served.url}/healthz").status_code == 200
+            assert httpx.get(f"{served.url}/readyz?verbose").status_code == 200
+        finally:
+            for other in others:
+                other.close()
+        served.until(lambda: httpx.get(f"{served.url}/v1/models").status_code == 200)
+
+
+def test_who_reads_slowly_is_not_cut_off_but_who_stops_is() -> None:
+    gone = threading.Event()
+
+    async def much(scope: Scope, receive: Receive, send: Send) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        for _ in range(100):  # uvicorn drops what is sent to a connection that was cut off
+            await send({"type": "http.response.body", "body": bytes(1_000_000), "more_body": True})
+        gone.set()
+
+    connections = guarded_connection(headers_timeout_s=10.0, write_timeout_s=0.5)
+    config = uvicorn.Config(much, log_config=None, ws="none", http=connections, lifespan="off")
+    with listening(much, server=uvicorn.Server(config)) as (url, _), socket.socket() as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        connection.connect(("127.0.0.1", int(url.rsplit(":", 1)[1])))
+        connection.settimeout(30)
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
+        pause = threading.Event()
+        for _ in range(30):
+            connection.recv(65_536)
+            pause.wait(0.1)
+        assert not gone.is_set()
+        assert gone.wait(30)

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import asyncio
 import threading
 
 import httpx
 import pytest
+from starlette.responses import Response
 
 from model.engines.engine import EngineError
+from service.idempotency import Idempotency
 from service.settings import Settings
 from tests.service.scripted_engine import KEEP_ON, ScriptedEngine
 from tests.service.serving import Served, body, serve
@@ -75,3 +78,48 @@ def test_answers_are_kept_for_a_while_only(engine: ScriptedEngine) -> None:
             served.http.post("/v1/plan", json=body(), headers=KEY)
             threading.Event().wait(0.2)
     assert len(engine.submitted) == 2
+
+
+def test_an_answer_is_given_again_by_a_service_that_is_full(engine: ScriptedEngine) -> None:
+    with serve(engine, Settings(max_draws=2, rate_limit="4/minute")) as served:
+        first = served.http.post("/v1/plan", json=body(n=2), headers=KEY)
+        served.in_loop(engine.may_finish.clear)
+        thread = threading.Thread(
+            target=lambda: httpx.post(served.url + "/v1/plan", json=body(n=2), timeout=30)
+        )
+        thread.start()
+        served.until(lambda: len(engine.submitted) == 2)
+        problem(served.http.post("/v1/plan", json=body()), "queue-full")
+        for _ in range(5):  # more than the limit allows: nothing is planned for
+            assert served.http.post("/v1/plan", json=body(n=2), headers=KEY).content == first.content
+        served.in_loop(engine.may_finish.set)
+        thread.join()
+
+
+def test_large_answers_go_early_and_those_being_made_stay() -> None:
+    async def test() -> None:
+        may_finish, made = asyncio.Event(), list[str]()
+        idempotency = Idempotency(600.0, lambda: 0.0)
+
+        async def ask(key: str, size: int) -> Response:
+            async def work() -> Response:
+                made.append(key)
+                if not size:
+                    await may_finish.wait()
+                return Response(b"x" * size)
+
+            return await idempotency.once("car", key, b"", work)
+
+        waiting = asyncio.create_task(ask("first", 0))
+        await asyncio.sleep(0)
+        for number in range(7):
+            await ask(f"{number}", 15_000_000)
+        assert not idempotency.knows("car", "0")
+        assert idempotency.knows("car", "6")
+        again = asyncio.create_task(ask("first", 0))
+        await asyncio.sleep(0)
+        may_finish.set()
+        await asyncio.gather(waiting, again)
+        assert made.count("first") == 1
+
+    asyncio.run(test())

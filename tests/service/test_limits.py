@@ -126,3 +126,24 @@ def test_a_broken_engine_is_started_again(engine: ScriptedEngine) -> None:
         assert served.http.post("/v1/plan", json=body()).status_code == 200
         assert served.metric("looktwice_engine_restarts_total") == 1
         assert engine.starts == 2
+
+
+def test_given_up_is_a_missed_deadline(engine: ScriptedEngine, settings: Settings) -> None:
+    with serve(engine, settings) as served:
+        served.in_loop(engine.may_finish.clear)
+        problem(served.http.post("/v1/plan", json=body(n=2, deadline_ms=100)), "decode-timeout")
+        assert served.metric("looktwice_deadlines_total", outcome="missed") == 1
+        document = body(n=2) | {"stream": True}
+        streamed = served.http.post("/v1/plan", json=document)
+        assert "decode-timeout" in streamed.text
+        assert served.metric("looktwice_rejections_total", reason="decode-timeout") == 2
+
+
+def test_who_is_refused_has_spent_nothing(engine: ScriptedEngine) -> None:
+    with serve(engine, Settings(max_draws=6, rate_limit="10/minute")) as served:
+        served.in_loop(engine.may_finish.clear)
+        with waiting(served, 4):
+            for _ in range(4):
+                problem(served.http.post("/v1/plan", json=body(n=6)), "queue-full")
+        assert served.http.post("/v1/plan", json=body(n=6)).status_code == 200
+        problem(served.http.post("/v1/plan", json=body(n=1)), "rate-limited")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import re
@@ -10,7 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
@@ -18,16 +19,35 @@ from typing import IO
 import httpx
 import pytest
 
+from clients.labelling.checks import FailedCheck
+from clients.labelling.teachers.teacher import Answer, Question
 from service.app import create_app
 from service.keys import new_line
 from service.server import make_server
 from service.settings import Settings
-from tests.service.scripted_engine import ScriptedEngine
+from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem
 from tests.sockets import listening
 
 WAIT_S = 120
+
+
+class SlowTeacher:
+    """A teacher that answers when it may."""
+
+    name, revision = "slow", "1"
+
+    def __init__(self) -> None:
+        self.asked, self.may_answer = 0, asyncio.Event()
+
+    async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
+        self.asked += 1
+        await self.may_answer.wait()
+        return Answer(REASONING)
+
+    async def close(self) -> None:
+        pass
 
 
 def free_port() -> int:
@@ -135,6 +155,46 @@ def test_while_draining_it_says_so(engine: ScriptedEngine) -> None:
         served.in_loop(engine.may_finish.set)
         thread.join()
         assert answers == [200]
+
+
+def test_draining_finishes_batches_and_labels(engine: ScriptedEngine) -> None:
+    settings, teacher = Settings(drain_notice_s=0.0, max_draws=2), SlowTeacher()
+    app = create_app(engine, settings, teacher=teacher)
+    server = make_server(app, settings)
+    with listening(app, 0, server) as (url, loop), httpx.Client(base_url=url, timeout=30) as http:
+        served = Served(engine, url, http, loop)
+        served.until_ready()
+        served.in_loop(engine.may_finish.clear)
+        answers: dict[str, httpx.Response] = {}
+
+        def post(path: str, document: object) -> threading.Thread:
+            def ask() -> None:
+                answers[path] = httpx.post(url + path, json=document, timeout=30)
+
+            thread = threading.Thread(target=ask)
+            thread.start()
+            return thread
+
+        question = {
+            "scene": body()["scene"],
+            "predicted_plan": str(KEEP_ON),
+            "expert_plan": str(SLOW_DOWN),
+        }
+        threads = [
+            post("/v1/plan/batch", {"requests": [body(n=2) for _ in range(4)]}),
+            post("/v1/label", question),
+        ]
+        served.until(lambda: len(engine.submitted) == 1 and teacher.asked == 1)
+        served.in_loop(server.drain)
+        served.until(lambda: served.metric("looktwice_draining") == 1)
+        served.in_loop(engine.may_finish.set)
+        threads[0].join()
+        assert [result["status"] for result in answers["/v1/plan/batch"].json()["results"]] == [200] * 4
+        assert "/v1/label" not in answers
+        problem(http.post("/v1/label", json=question), "draining")
+        served.in_loop(teacher.may_answer.set)
+        threads[1].join()
+        assert answers["/v1/label"].status_code == 200
 
 
 def test_what_is_cut_off_at_the_end_of_a_drain_is_told_to_ask_elsewhere(
