@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterable
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 import clients.wire as wire
 from model.driving.scene import CLIP_FRAMES
@@ -26,6 +26,14 @@ _EVERY: Final = 5
 """Poses of a trajectory between those that are told in a message: every half second."""
 _DATA: Final = "data:"
 _STANDING: Final = [[0.0, 0.0, 0.0, 0.0]] * 16
+
+
+_Off = Annotated[float, Field(ge=0, le=0)] | None
+
+
+def _null_is(default: float) -> BeforeValidator:
+    """Clients send null for what they leave to the server."""
+    return BeforeValidator(lambda value: default if value is None else value)
 
 
 class _Dialect(BaseModel):
@@ -88,10 +96,10 @@ class ChatRequest(_Dialect):
 
     model: str = ""
     messages: list[Message] = Field(min_length=1, max_length=64)
-    n: int = Field(default=1, ge=1, le=64)
-    temperature: float = Field(default=1.0, ge=0, le=2)
-    top_p: float = Field(default=1.0, gt=0, le=1)
-    seed: int = Field(default=0, ge=0, le=wire.MAX_SEED)
+    n: Annotated[int, _null_is(1), Field(ge=1, le=64)] = 1
+    temperature: Annotated[float, _null_is(1.0), Field(ge=0, le=2)] = 1.0
+    top_p: Annotated[float, _null_is(1.0), Field(gt=0, le=1)] = 1.0
+    seed: Annotated[int, _null_is(0), Field(ge=0, le=wire.MAX_SEED)] = 0
     stream: bool = False
     stream_options: StreamOptions | None = None
     looktwice: Extras = Extras()
@@ -99,6 +107,12 @@ class ChatRequest(_Dialect):
     tools: None = None
     response_format: None = None
     logprobs: Literal[False] | None = None
+    presence_penalty: _Off = None
+    frequency_penalty: _Off = None
+    min_p: _Off = None
+    top_k: Annotated[int, Field(ge=-1, le=0)] | None = None
+    repetition_penalty: Annotated[float, Field(ge=1, le=1)] | None = None
+    logit_bias: Annotated[dict[str, float], Field(max_length=0)] | None = None
 
 
 def plan_request(chat: ChatRequest, card: ModelCard) -> wire.PlanRequest:

@@ -117,6 +117,9 @@ def test_what_was_assumed_is_said(client: openai.OpenAI, engine: ScriptedEngine)
         ({"tools": [{"type": "function"}]}, "invalid-request"),
         ({"logprobs": True}, "invalid-request"),
         ({"n": 65}, "invalid-request"),
+        ({"frequency_penalty": 0.5}, "invalid-request"),
+        ({"top_k": 20}, "invalid-request"),
+        ({"logit_bias": {"50": 1}}, "invalid-request"),
         ({"looktwice": {"speed": 3}}, "unknown-field"),
         ({"looktwice": {"thinking": "never", "think_threshold": 0.5}}, "invalid-controls"),
     ],
@@ -141,3 +144,17 @@ def test_refusals_reach_the_client_as_its_own_errors(client: openai.OpenAI) -> N
     with pytest.raises(openai.UnprocessableEntityError) as error:
         client.chat.completions.create(model="gpt-4", messages=messages())
     assert "scripted" in str(error.value)
+
+
+def test_what_says_nothing_is_let_pass(served: Served) -> None:
+    said = {
+        "n": None,
+        "seed": None,
+        "temperature": None,
+        "presence_penalty": 0.0,
+        "top_k": -1,
+        "logit_bias": {},
+    }
+    document = {"model": "scripted", "messages": messages(), "user": "car-7", "max_tokens": 5} | said
+    answer = served.http.post("/v1/chat/completions", json=document)
+    assert len(answer.json()["choices"]) == 1
