@@ -62,17 +62,27 @@ class Server(uvicorn.Server):
         self.should_exit = True
 
 
+def check_who_may_ask(settings: Settings, where: str) -> None:
+    """Refuse to serve where others reach it, ``where``, unless there are keys or it is open on purpose.
+
+    Raises:
+        ValueError: everybody could ask.
+    """
+    if settings.api_keys_file is None and not settings.open:
+        raise ValueError(
+            f"without keys everybody who reaches {where} could use the service: set LOOKTWICE_API_KEYS_FILE "
+            "(`looktwice keys new NAME`), or LOOKTWICE_OPEN=true where something before it checks who asks"
+        )
+
+
 def make_server(app: FastAPI, settings: Settings, host: str = "127.0.0.1", port: int = 8000) -> Server:
     """A server for an application that `create_app` made.
 
     Raises:
         ValueError: everybody could ask from anywhere.
     """
-    if settings.api_keys_file is None and not settings.open and not _is_loopback(host):
-        raise ValueError(
-            f"without keys everybody who reaches {host} could use the service: set LOOKTWICE_API_KEYS_FILE "
-            "(`looktwice keys new NAME`), or LOOKTWICE_OPEN=true where something before it checks who asks"
-        )
+    if not _is_loopback(host):
+        check_who_may_ask(settings, host)
     config = uvicorn.Config(
         app,
         host,

@@ -20,6 +20,7 @@ from ray.serve import Application
 from model.bundled import CHECKPOINT
 from service.app import create_app
 from service.cli.engines import make_engine
+from service.server import check_who_may_ask
 from service.settings import Settings, TeacherSettings
 
 _GLANCE_S: Final = 0.2
@@ -32,7 +33,8 @@ class Arguments(BaseModel):
         checkpoint: folder that every node can read.
         engine, device, rows, vllm_arguments: as `looktwice serve` takes them.
         metrics_port: where a replica shows its own metrics on its node, so only with one replica a node;
-            /metrics behind Serve's proxy shows those of whichever replica answers.
+            /metrics behind Serve's proxy shows those of whichever replica answers. No key is asked for there,
+            whatever the settings say: let only Prometheus reach it.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -46,9 +48,16 @@ class Arguments(BaseModel):
 
 
 class Planning:
-    """One replica; its options are the configuration's."""
+    """One replica; its options are the configuration's.
+
+    Raises:
+        ValueError: everybody could ask. Serve's proxies hand on what they are sent, so a replica counts as
+            reachable from elsewhere wherever they listen.
+    """
 
     def __init__(self, arguments: Arguments) -> None:
+        settings = Settings()
+        check_who_may_ask(settings, "Ray Serve's proxies")
         engine = make_engine(
             arguments.checkpoint,
             arguments.rows,
@@ -57,7 +66,7 @@ class Planning:
             vllm_arguments=json.dumps(arguments.vllm_arguments),
         )
         registry = CollectorRegistry()
-        self._app = create_app(engine, Settings(), registry, TeacherSettings().teacher())
+        self._app = create_app(engine, settings, registry, TeacherSettings().teacher())
         self._ready = False
         if arguments.metrics_port is not None:
             start_http_server(arguments.metrics_port, registry=registry)

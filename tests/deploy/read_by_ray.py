@@ -1,4 +1,4 @@
-"""What Ray makes of Serve configurations, as JSON; run by itself, since importing Serve warns."""
+"""What Ray and the application make of Serve files, as JSON; by itself, since importing Serve warns."""
 
 from __future__ import annotations
 
@@ -23,8 +23,12 @@ def read(path: str) -> dict[str, Any]:
         app.application(application["args"] | {"row": 64})
     except ValidationError as error:
         refused = error.errors()[0]["loc"]
+    try:
+        app.Planning(app.Arguments())
+    except ValueError as error:
+        closed = str(error)
     kept = ServeDeploySchema.model_validate(told).model_dump(exclude_unset=True)
-    return {"ray": ray.__version__, "kept": kept, "refused": refused}
+    return {"ray": ray.__version__, "kept": kept, "refused": refused, "closed": closed}
 
 
 if __name__ == "__main__":

@@ -132,6 +132,15 @@ def test_a_number_of_replicas_is_set_by_one_only() -> None:
     assert scaled["ScaledObject", "plan-looktwice"]["spec"]["scaleTargetRef"]["name"] == "plan-looktwice"
 
 
+def test_a_pod_that_ends_listens_until_balancers_know_and_ends_in_time(
+    rendered: dict[tuple[str, str], dict[str, Any]],
+) -> None:
+    settings = rendered["ConfigMap", "plan-looktwice"]["data"]
+    notice_s, drain_s = (float(settings[f"LOOKTWICE_DRAIN_{name}"]) for name in ("NOTICE_S", "S"))
+    # Endpoints are told to every node's proxy in about a second, on large clusters in a few.
+    assert 3 <= notice_s < drain_s < pod(rendered)["terminationGracePeriodSeconds"]
+
+
 def test_keys_are_asked_for_unless_it_is_said_otherwise() -> None:
     closed = render({"monitoring": {"serviceMonitor": {"enabled": True}}})
     settings = closed["ConfigMap", "plan-looktwice"]["data"]
@@ -159,7 +168,9 @@ def test_rules_and_dashboard_are_those_of_compose() -> None:
         ({"engine": {"name": "onnx"}}, "value must be one of"),
         ({"settings": {"PATH": "/"}}, "does not match pattern"),
         ({"settings": {"LOOKTWICE_OPEN": "true"}}, "'not' failed"),
+        ({"settings": {"LOOKTWICE_DRAIN_NOTICE_S": "9"}}, "'not' failed"),
         ({"drainSeconds": 60}, "longer than drainSeconds"),
+        ({"drainNoticeSeconds": 25}, "longer than drainNoticeSeconds"),
         ({"engine": {"name": "vllm"}}, "needs engine.device cuda"),
         ({"engine": {"vllmArguments": {"seed": 1}}}, "need engine.name vllm"),
         ({"auth": {"existingSecret": ""}}, "auth.open=true"),

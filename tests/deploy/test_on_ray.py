@@ -1,22 +1,26 @@
-"""The service on a local Ray: replicas plan, and a burst is refused instead of waiting without end."""
+"""The service on a local Ray, in the shipped proportions: load adds a replica, and a burst is refused."""
 
 from __future__ import annotations
 
+import copy
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, Final
 
 import httpx
 import psutil
 import pytest
 import yaml
+from prometheus_client.parser import text_string_to_metric_families
 
 from clients import wire
 from clients.planner import Patience, PlannerClient
@@ -26,7 +30,12 @@ from model.driving.scene_store import read_scenes
 from tests.deploy.tools import DEPLOY, ROOT
 from tests.service.serving import body
 
-REPLICAS, ONGOING, QUEUED, BURST = 2, 1, 2, 16
+SERVE: Final[dict[str, Any]] = yaml.safe_load((DEPLOY / "ray" / "serve.yaml").read_text())
+SHIPPED: Final[dict[str, Any]] = SERVE["applications"][0]["deployments"][0]
+ONGOING, QUEUED = SHIPPED["max_ongoing_requests"], SHIPPED["max_queued_requests"]
+REPLICAS = 2
+"""As many as are added to the one at the beginning make."""
+BURST = 2 * (REPLICAS * ONGOING + QUEUED)
 START_S = 180
 
 
@@ -37,17 +46,17 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def configuration(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """serve.yaml, but small enough for any machine and its queue for a burst."""
-    told = yaml.safe_load((DEPLOY / "ray" / "serve.yaml").read_text())
+    """serve.yaml, but for replicas that are small enough for any machine, and quick to come."""
+    told = copy.deepcopy(SERVE)
     with socket.create_server(("127.0.0.1", 0)) as free:
         told["http_options"] |= {"host": "127.0.0.1", "port": free.getsockname()[1]}
     (application,) = told["applications"]
     del application["args"]["metrics_port"]
     application["runtime_env"]["env_vars"]["OMP_NUM_THREADS"] = "1"
     (deployment,) = application["deployments"]
-    deployment |= {"max_ongoing_requests": ONGOING, "max_queued_requests": QUEUED, "max_replicas_per_node": 8}
-    deployment["autoscaling_config"] |= {"min_replicas": REPLICAS, "max_replicas": REPLICAS}
-    deployment["ray_actor_options"] = {"num_cpus": 0.1}
+    deployment |= {"max_replicas_per_node": REPLICAS, "ray_actor_options": {"num_cpus": 0.1}}
+    soon = {"upscale_delay_s": 1, "metrics_interval_s": 1, "look_back_period_s": 2}
+    deployment["autoscaling_config"] |= soon | {"max_replicas": REPLICAS}
     path = tmp_path_factory.mktemp("ray") / "serve.yaml"
     path.write_text(yaml.safe_dump(told))
     return path
@@ -86,27 +95,65 @@ def ready(url: str) -> bool:
         return False
 
 
-def test_replicas_plan_over_http(serving: tuple[str, psutil.Process], scene: Scene) -> None:
+def ask(url: str, scene: Scene) -> httpx.Response:
+    """Of six draws, as callers ask by default; without second looks, which take longer."""
+    return httpx.post(f"{url}/v1/plan", json=body(scene, n=6, thinking="never"), timeout=120)
+
+
+def replica_that_answers(url: str) -> float:
+    """When the replica was made whose metrics these are, in s since 1970: no two have the same."""
+    told = httpx.get(f"{url}/metrics", timeout=120).raise_for_status().text
+    samples = (sample for family in text_string_to_metric_families(told) for sample in family.samples)
+    return next(each.value for each in samples if each.name == "looktwice_engine_restarts_created")
+
+
+def test_a_replica_plans_over_http(serving: tuple[str, psutil.Process], scene: Scene) -> None:
     url, process = serving
     names = Counter(one.name() for one in process.children(recursive=True))
-    assert sum(count for name, count in names.items() if "ServeReplica" in name) == REPLICAS
+    assert sum(count for name, count in names.items() if "ServeReplica" in name) == 1
     with PlannerClient(url, Patience(timeout_s=60)) as planner:
         answer = planner.plan(scene, wire.Controls(n=2, seed=1))
     assert [draw.trajectory.shape for draw in answer.draws] == [(64, 4)] * 2
 
 
-def test_a_burst_is_refused_with_a_word_on_when_to_come_back(
+def test_load_adds_a_replica_and_is_not_refused(serving: tuple[str, psutil.Process], scene: Scene) -> None:
+    """One replica takes all that Ray gives it at once; meanwhile another one comes."""
+    url, _ = serving
+    enough = threading.Event()
+
+    def keep_asking() -> Counter[int]:
+        told = Counter[int]()
+        while not enough.is_set():
+            told[ask(url, scene).status_code] += 1
+        return told
+
+    with ThreadPoolExecutor(ONGOING) as callers:
+        asking = [callers.submit(keep_asking) for _ in range(ONGOING)]
+        try:
+            replicas, until = set[float](), time.monotonic() + START_S
+            while len(replicas) < REPLICAS:
+                assert time.monotonic() < until
+                replicas.add(replica_that_answers(url))
+                time.sleep(0.2)
+        finally:
+            enough.set()
+    assert {status for each in asking for status in each.result()} == {200}
+
+
+def test_a_burst_is_refused_by_ray_with_a_word_on_when_to_come_back(
     serving: tuple[str, psutil.Process], scene: Scene
 ) -> None:
     url, _ = serving
-    request = body(scene, n=6)
-    with httpx.Client(base_url=url, timeout=60) as http, ThreadPoolExecutor(BURST) as callers:
-        answers = list(callers.map(lambda _: http.post("/v1/plan", json=request), range(BURST)))
+    with ThreadPoolExecutor(BURST) as callers:
+        answers = list(callers.map(lambda _: ask(url, scene), range(BURST)))
     statuses = Counter(answer.status_code for answer in answers)
     assert statuses.keys() == {200, 429}
     assert statuses[200] >= REPLICAS * ONGOING
-    assert {answer.headers["retry-after"] for answer in answers if answer.status_code == 429} == {"1"}
-    assert httpx.post(f"{url}/v1/plan", json=request, timeout=60).is_success
+    refused = [answer for answer in answers if answer.status_code == 429]
+    assert {answer.headers["retry-after"] for answer in refused} == {"1"}
+    # Of what Ray lets in, replicas refuse nothing.
+    assert wire.PROBLEM_MEDIA_TYPE not in {answer.headers["content-type"] for answer in refused}
+    assert ask(url, scene).is_success
 
 
 def test_what_is_wrong_with_a_request_is_told_as_ever(serving: tuple[str, psutil.Process]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -25,7 +26,11 @@ def read(path: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def read_by_ray() -> list[dict[str, Any]]:
     command = [sys.executable, "-m", "tests.deploy.read_by_ray", *map(str, CONFIGURATIONS)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    # Without settings: what is not in the files is not there.
+    unset = {name: value for name, value in os.environ.items() if not name.startswith("LOOKTWICE_")}
+    done = subprocess.run(
+        command, cwd=ROOT, env=unset, capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0, done.stderr
     found: list[dict[str, Any]] = json.loads(done.stdout)
     return found
@@ -35,6 +40,12 @@ def test_serve_and_the_application_know_every_key(read_by_ray: list[dict[str, An
     for path, found in zip(CONFIGURATIONS, read_by_ray, strict=True):
         assert found["kept"] == read(path)
         assert found["refused"] == ["row"]
+
+
+def test_a_replica_does_not_open_itself_without_keys(read_by_ray: list[dict[str, Any]]) -> None:
+    for found in read_by_ray:
+        assert "LOOKTWICE_API_KEYS_FILE" in found["closed"]
+        assert "Ray Serve" in found["closed"]
 
 
 def test_no_queue_is_endless() -> None:

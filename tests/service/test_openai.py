@@ -147,7 +147,7 @@ def test_refusals_reach_the_client_as_its_own_errors(client: openai.OpenAI) -> N
 
 
 def test_what_says_nothing_is_let_pass(served: Served) -> None:
-    said = {
+    said: dict[str, Any] = {
         "n": None,
         "seed": None,
         "temperature": None,

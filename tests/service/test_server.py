@@ -23,7 +23,7 @@ from clients.labelling.checks import FailedCheck
 from clients.labelling.teachers.teacher import Answer, Question
 from service.app import create_app
 from service.keys import new_line
-from service.server import make_server
+from service.server import check_who_may_ask, make_server
 from service.settings import Settings
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body, serve
@@ -226,6 +226,8 @@ def test_it_does_not_open_itself_to_others_without_keys(engine: ScriptedEngine, 
     make_server(app, Settings(open=True), "0.0.0.0")
     (tmp_path / "keys").write_text(new_line("car")[1])
     make_server(app, Settings(api_keys_file=tmp_path / "keys"), "0.0.0.0")
+    with pytest.raises(ValueError, match="who reaches the proxy"):
+        check_who_may_ask(Settings(), "the proxy")
 
 
 def test_another_checkpoint_takes_over_without_dropping_a_request(

@@ -21,6 +21,9 @@ helm.sh/chart: {{ printf "%s-%s" .Chart.Name .Chart.Version }}
 {{- if le (int .Values.terminationGracePeriodSeconds) (int .Values.drainSeconds) }}
 {{- fail "terminationGracePeriodSeconds must be longer than drainSeconds, or accepted requests are cut off" }}
 {{- end }}
+{{- if le (int .Values.drainSeconds) (int .Values.drainNoticeSeconds) }}
+{{- fail "drainSeconds must be longer than drainNoticeSeconds, or no drain ends in time" }}
+{{- end }}
 {{- if and (eq .Values.engine.name "vllm") (ne .Values.engine.device "cuda") }}
 {{- fail "engine.name vllm needs engine.device cuda" }}
 {{- end }}
