@@ -102,7 +102,7 @@ class Decoder:
         runner: network and memory; the decoder's alone.
         shortcuts: see there.
         prompt_chunk: tokens of new prompts that go through the network in one step while draws run.
-        clock: seconds, ever growing; deadlines count from a request's arrival on it.
+        clock: seconds, ever growing; what deadlines count on.
         pace: what is known of how long things take.
     """
 
@@ -137,8 +137,12 @@ class Decoder:
         """Whether there is nothing to do."""
         return self._schedule.idle
 
-    def add(self, plan_request: PlanRequest) -> None:
+    def add(self, plan_request: PlanRequest, submitted_s: float | None = None) -> None:
         """Queue a request.
+
+        Args:
+            plan_request: what is asked.
+            submitted_s: when, on the decoder's clock, its deadline counts from; now if it is not given.
 
         Raises:
             RequestError: it can never be served: unknown format, too many draws, a missing camera, a
@@ -147,7 +151,7 @@ class Decoder:
         if plan_request.request_id in self._schedule:
             raise RequestError(f"request id {plan_request.request_id} is in use")
         start = begin(plan_request, self._runner.loaded.card, self._runner.formats)
-        request = Request(plan_request, start, self._clock())
+        request = Request(plan_request, start, self._clock() if submitted_s is None else submitted_s)
         if not self._schedule.fits(request):
             raise RequestError(
                 f"n is {request.controls.n}; this engine runs at most {self._runner.rows} draws at once"
