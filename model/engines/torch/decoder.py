@@ -201,6 +201,7 @@ class Decoder:
             return events
         rows = list(self._rows)
         feeds = [self._feed_of(row) for row in rows]
+        self._count(rows, feeds)
         for row, feed, logits in zip(rows, feeds, self._runner.feed(feeds), strict=True):
             if row not in self._rows:
                 continue  # its request failed with another of its rows
@@ -210,7 +211,6 @@ class Decoder:
                 events.append(
                     self._fail(row.request, EngineError("the network gave logits that are no numbers"))
                 )
-        self._count(rows, feeds)
         events += self._end_the_done()
         self._pace.saw_step(self._clock() - began_s)
         return events + self._settle_for_drafts()
