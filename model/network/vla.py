@@ -84,7 +84,9 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
             return encode_pictures(visual, patches, rows, columns)
         if patches.dtype == torch.uint8:
             patches = normalised(patches)
-        features: Tensor = visual(patches.to(visual.dtype), grid_thw, return_dict=True).pooler_output
+        features: Tensor = visual(
+            patches.to(visual.dtype), grid_thw.to(patches.device), return_dict=True
+        ).pooler_output
         return features
 
     def embed(

@@ -6,6 +6,7 @@ A wrong guess costs its share of the pass, a right one saves a pass. Nothing tha
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import eq
 from typing import Final
 
 import numpy as np
@@ -15,6 +16,7 @@ from model.engines.torch.answers import Answers
 from model.engines.torch.habits import CONTEXTS, Habits
 from model.engines.torch.rows import Row
 from model.engines.torch.sampler import uniform
+from model.formats.pieces import FormatError
 
 Ids = npt.NDArray[np.int64]
 
@@ -23,8 +25,11 @@ GUESSES: Final = 24
 that is wrong still holds up the pass, and what is fed costs more than it saves."""
 GUESSES_A_ROW: Final = 8
 """And over one row: that all of more are right is rare."""
-_REPEAT_TOKENS: Final = 64
-"""Fed ahead at most as the last answer to the same pictures went on."""
+REPEATS: Final = 768
+"""Tokens fed in a pass, over all its rows, as the last answers to the same pictures went on: mostly right, so
+what bounds them is how large a pass is still quick to make."""
+REPEATS_A_ROW: Final = 64
+"""And of one row: where a response leaves the last one, all behind is fed in vain."""
 _HABITUAL: Final = 64
 """Decisions between more tokens than this (codes) are no matter of habit, unless they are a text's: what is
 said of a scene is said in much the same words of the next one."""
@@ -37,47 +42,62 @@ class Ahead:
     def __init__(self) -> None:
         self._habits, self._answers = Habits(), Answers()
 
-    def feed(self, row: Row, *, copy: bool, guesses: int) -> tuple[list[int], list[tuple[int, Ids]]]:
+    def feed(
+        self, row: Row, *, copy: bool, guesses: int, repeats: int
+    ) -> tuple[list[int], list[tuple[int, Ids]]]:
         """A row's pending tokens and what may come behind them, and the decisions among both.
 
         Args:
             row: whose prompt is there.
             copy: whether a revised plan is taken from the first one.
-            guesses: how many decisions at most are taken from habits; unless it is 0, more is also taken
-                from the last answer to the same pictures.
+            guesses: how many decisions at most are taken from habits.
+            repeats: how many tokens at most are fed as the last answer to the same pictures went on.
 
         Returns:
             tokens: to be fed.
             decisions: places among the tokens, and the ids that are allowed behind them.
         """
-        assert row.prompt is not None
         tokens, decisions, cursor = list(row.pending), list[tuple[int, Ids]](), row.cursor
+        if cursor.done:
+            return tokens, decisions
         written, controls = len(row.tokens), row.request.controls
+        ahead: list[int] = []
         context = [token.id for token in row.tokens[-_CONTEXT:]]
-        copied = iter(row.proposal() if copy else [])
-        answer = self._answers.last(row.prompt.shown, row.draws[0]) if guesses else ()
-        repeated, guessed = iter(answer[written:]), 0
-        while not cursor.done:
-            ids = cursor.allowed().ids
-            if len(ids) > 1:
-                decisions.append((len(tokens) - 1, ids))
-            token, before = next(copied, None), next(repeated, None)
-            if token is None and guesses:
-                ahead = len(tokens) - len(row.pending)
-                if len(ids) == 1:
-                    token = int(ids[0])
-                elif before in ids:
-                    token = before if ahead < _REPEAT_TOKENS else None
-                elif (len(ids) <= _HABITUAL or cursor.stop_id is not None) and guessed < guesses:
-                    guessed += 1
-                    number = uniform(controls.seed, row.draws[0], written + ahead)
-                    token = self._habits.likely(context, number if controls.temperature else None)
-            if token is None or token not in ids:
+        repeated = self._repeated(row)[:repeats]
+        copied = row.proposal() if copy else []
+        while True:
+            ids, place, token = cursor.allowed().ids, len(ahead), None
+            decisions.append((len(tokens) + place - 1, ids))
+            if place < len(repeated):
+                token = repeated[place]
+            elif place < len(copied):
+                token = copied[place]
+            elif guesses and (len(ids) <= _HABITUAL or cursor.stop_id is not None):
+                guesses -= 1
+                number = uniform(controls.seed, row.draws[0], written + place)
+                token = self._habits.likely(context, number if controls.temperature else None)
+            if token is None:
                 break
-            tokens.append(token)
-            context.append(token)
-            cursor = cursor.advance(token)
-        return tokens, decisions
+            try:
+                cursor = cursor.advance(token)
+            except FormatError:
+                break
+            run, cursor = cursor.forced()
+            new = [token, *(forced.id for forced in run)]
+            ahead += new
+            context += new
+            if cursor.done:
+                break
+            # Where the format forces something else, as behind another prefill, they are left for good.
+            repeated, copied = (each if _agree(each[place:], new) else [] for each in (repeated, copied))
+        return tokens + ahead, decisions
+
+    def _repeated(self, row: Row) -> Sequence[int]:
+        """How the last answer to the same pictures went on from here; nothing where it went another way."""
+        assert row.prompt is not None
+        answer, written = self._answers.last(row.prompt.shown, row.draws[0]), len(row.tokens)
+        same = len(answer) > written and all(map(eq, answer, (token.id for token in row.tokens)))
+        return answer[written:] if same else ()
 
     def saw(self, row: Row, alternatives: int, chosen: Sequence[tuple[int, tuple[int, ...]]]) -> None:
         """Draws of a row are about to write tokens, chosen among so many."""
@@ -90,3 +110,8 @@ class Ahead:
         """A row has written its whole response."""
         assert row.prompt is not None
         self._answers.keep(row.prompt.shown, row.draws, [token.id for token in row.tokens])
+
+
+def _agree(expected: Sequence[int], written: Sequence[int]) -> bool:
+    """Whether one begins as the other, as far as both go."""
+    return all(map(eq, expected, written))

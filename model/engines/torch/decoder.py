@@ -21,7 +21,7 @@ from model.engines.engine import (
     Started,
 )
 from model.engines.requests import begin, branch_of, read
-from model.engines.torch.ahead import GUESSES, GUESSES_A_ROW, Ahead
+from model.engines.torch.ahead import GUESSES, GUESSES_A_ROW, REPEATS, REPEATS_A_ROW, Ahead
 from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
 from model.engines.torch.runner import ROWS_A_PROMPT, Feed, Prompt, Runner
@@ -53,9 +53,9 @@ class Shortcuts:
         jump: a forced run goes through the network in one pass with the token before it.
         shared_rows: draws that have written the same tokens are one row.
         shared_prompts: a scene's prompt is worked out and held once for all its draws.
-        speculate: a revised plan is fed as far as it may repeat the first one, and, while few rows run, any
-            response as the last one to the same pictures did, or as others went on; what is fed ahead is
-            checked.
+        speculate: a revised plan is fed as far as it may repeat the first one, any response as the last one
+            to the same pictures went on while it does, and, while few rows run, as others went on; what is
+            fed ahead is checked.
     """
 
     jump: bool = True
@@ -102,7 +102,7 @@ class Decoder:
         runner: network and memory; the decoder's alone.
         shortcuts: see there.
         prompt_chunk: tokens of new prompts that go through the network in one step while draws run.
-        clock: seconds, ever growing; deadlines count from a request's arrival on it.
+        clock: seconds, ever growing; what deadlines count on.
         pace: what is known of how long things take.
     """
 
@@ -137,8 +137,12 @@ class Decoder:
         """Whether there is nothing to do."""
         return self._schedule.idle
 
-    def add(self, plan_request: PlanRequest) -> None:
+    def add(self, plan_request: PlanRequest, submitted_s: float | None = None) -> None:
         """Queue a request.
+
+        Args:
+            plan_request: what is asked.
+            submitted_s: when, on the decoder's clock, its deadline counts from; now if it is not given.
 
         Raises:
             RequestError: it can never be served: unknown format, too many draws, a missing camera, a
@@ -147,7 +151,7 @@ class Decoder:
         if plan_request.request_id in self._schedule:
             raise RequestError(f"request id {plan_request.request_id} is in use")
         start = begin(plan_request, self._runner.loaded.card, self._runner.formats)
-        request = Request(plan_request, start, self._clock())
+        request = Request(plan_request, start, self._clock() if submitted_s is None else submitted_s)
         if not self._schedule.fits(request):
             raise RequestError(
                 f"n is {request.controls.n}; this engine runs at most {self._runner.rows} draws at once"
@@ -197,6 +201,7 @@ class Decoder:
             return events
         rows = list(self._rows)
         feeds = [self._feed_of(row) for row in rows]
+        self._count(rows, feeds)
         for row, feed, logits in zip(rows, feeds, self._runner.feed(feeds), strict=True):
             if row not in self._rows:
                 continue  # its request failed with another of its rows
@@ -206,7 +211,6 @@ class Decoder:
                 events.append(
                     self._fail(row.request, EngineError("the network gave logits that are no numbers"))
                 )
-        self._count(rows, feeds)
         events += self._end_the_done()
         self._pace.saw_step(self._clock() - began_s)
         return events + self._settle_for_drafts()
@@ -295,9 +299,10 @@ class Decoder:
         assert row.prompt is not None
         if not self._shortcuts.jump and len(row.pending) > 1:
             return Feed(row.prompt, row.held, row.pending[:1], ())
-        speculate = self._shortcuts.speculate
-        guesses = min(GUESSES_A_ROW, GUESSES // len(self._rows)) if speculate else 0
-        tokens, wanted = self._ahead.feed(row, copy=speculate, guesses=guesses)
+        speculate, rows = self._shortcuts.speculate, len(self._rows)
+        guesses = min(GUESSES_A_ROW, GUESSES // rows) if speculate else 0
+        repeats = min(REPEATS_A_ROW, REPEATS // rows) if speculate else 0
+        tokens, wanted = self._ahead.feed(row, copy=speculate, guesses=guesses, repeats=repeats)
         return Feed(row.prompt, row.held, tokens, wanted)
 
     def _apply(self, row: Row, feed: Feed, found: list[Logits]) -> list[StepEvent]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import queue
+import time
 from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -140,7 +141,9 @@ class TorchEngine:
             raise RequestError(f"request id {request.request_id} is in use")
         events: asyncio.Queue[Event | Failed] = asyncio.Queue()
         self._listeners[request.request_id] = (asyncio.get_running_loop(), events)
-        self._commands.put(lambda decoder: self._add(decoder, request))
+        # Now and not when the thread gets to it, which may be a long step later.
+        submitted_s = time.monotonic()
+        self._commands.put(lambda decoder: self._add(decoder, request, submitted_s))
         try:
             remaining = request.controls.n
             while remaining:
@@ -158,9 +161,9 @@ class TorchEngine:
         self._tell(request_id, Failed(EngineError("the request was cancelled")))
         self._commands.put(lambda decoder: decoder.cancel(request_id))
 
-    def _add(self, decoder: Decoder, request: PlanRequest) -> None:
+    def _add(self, decoder: Decoder, request: PlanRequest, submitted_s: float) -> None:
         try:
-            decoder.add(request)
+            decoder.add(request, submitted_s)
         except RequestError as error:
             self._tell(request.request_id, Failed(error))
 
@@ -181,7 +184,7 @@ class TorchEngine:
                     clip_bytes=settings.clip_bytes,
                     products=settings.products,
                 )
-                decoder = Decoder(runner, settings.shortcuts)
+                decoder = Decoder(runner, settings.shortcuts, clock=time.monotonic)
                 self._counts = decoder.counts
                 runner.warm_up(_WARM_TOKENS)
                 while self._obey(decoder):

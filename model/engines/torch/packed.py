@@ -103,7 +103,7 @@ class PackedDecoder:
         """Multiply matrices of passes of so many tokens once: libraries keep the kernels that they make."""
         for product in self._layers[0]:
             for size in sizes:
-                product(torch.zeros(size, product.width, dtype=self._products))
+                product(self._final_norm.new_zeros(size, product.width, dtype=self._products))
 
     def rotation(self, position_ids: Tensor) -> Rotation:
         """The rotary embedding of positions int64 [3, t]."""

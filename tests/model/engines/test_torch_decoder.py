@@ -117,6 +117,8 @@ def test_shortcuts_save_what_they_are_for(exact: Loaded) -> None:
     assert everything.row_passes < everything.fan_out_row_passes
     unshared = counts(shared_rows=False)
     assert unshared.row_passes == unshared.fan_out_row_passes > everything.row_passes
+    decision_by_decision = counts(speculate=False)
+    assert decision_by_decision.fan_out_row_passes == counts(speculate=False, shared_rows=False).row_passes
 
 
 def test_cached_steps_equal_a_full_pass(exact: Loaded) -> None:

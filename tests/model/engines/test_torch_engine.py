@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import asyncio
+import threading
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -11,6 +13,7 @@ import torch
 
 from model.driving.scene import Clip, Scene
 from model.engines.engine import Controls, Draw, DrawFinished, EngineError, PlanRequest, RequestError
+from model.engines.torch.decoder import Decoder, StepEvent
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.torch.runner import Runner
 from model.evaluation.ladder import at_threshold
@@ -130,6 +133,38 @@ def test_cancelling_by_name_tells_who_waits(untrained_checkpoint: Path) -> None:
             with pytest.raises(EngineError, match="cancelled"):
                 await waiting
             assert len(await plan(engine, direct("next", n=2))) == 2
+
+    run(test)
+
+
+def test_a_deadline_counts_from_submission(
+    untrained_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not from the end of the step that the thread is in the middle of."""
+    step, add = Decoder.step, Decoder.add
+    in_step, go_on, submitted_s = threading.Event(), threading.Event(), dict[str, float]()
+
+    def long_step(decoder: Decoder) -> list[StepEvent]:
+        in_step.set()
+        go_on.wait(60)
+        return step(decoder)
+
+    def noted(decoder: Decoder, request: PlanRequest, stamp_s: float) -> None:
+        submitted_s[request.request_id] = stamp_s
+        add(decoder, request, stamp_s)
+
+    async def test() -> None:
+        async with running(untrained_checkpoint) as engine:
+            monkeypatch.setattr(Decoder, "step", long_step)
+            monkeypatch.setattr(Decoder, "add", noted)
+            first = asyncio.create_task(plan(engine, direct("first", n=1)))
+            assert await asyncio.to_thread(in_step.wait, 60)
+            second = asyncio.create_task(plan(engine, direct("second", n=1)))
+            await asyncio.sleep(0.01)
+            before_its_end_s = time.monotonic()
+            go_on.set()
+            await asyncio.gather(first, second)
+            assert submitted_s["second"] <= before_its_end_s
 
     run(test)
 
