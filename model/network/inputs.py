@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,8 +104,15 @@ class InputBuilder:
 
     def patches(self, pictures: tuple[bytes, ...]) -> npt.NDArray[np.uint8]:
         """The patches of one slice, uint8 [p, 1176]; raises `ImageError` for what cannot be decoded."""
-        frames = np.stack([resize(decode_image(picture), self.settings) for picture in pictures])
-        return patchify(frames, self.settings)
+        return self.patchified([self.frame(picture) for picture in pictures])
+
+    def frame(self, picture: bytes) -> npt.NDArray[np.uint8]:
+        """A picture in the network's size, uint8 [h, w, 3]; raises `ImageError` where that fails."""
+        return resize(decode_image(picture), self.settings)
+
+    def patchified(self, frames: Sequence[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:
+        """The patches of the `frame`s of one slice, uint8 [p, 1176]."""
+        return patchify(np.stack(frames), self.settings)
 
     def prompt(self, format: str, *, route: bool) -> Prompt:
         """The prompt of a format; raises `PromptError` for an unknown one."""

@@ -23,6 +23,7 @@ from model.engines.engine import (
     RequestError,
 )
 from model.engines.torch.decoder import Counts, Decoder, Failed, Shortcuts
+from model.engines.torch.frames import Frames
 from model.engines.torch.runner import Runner
 from model.engines.torch.worker import Worker
 from model.engines.warm_up import warm_up
@@ -84,6 +85,7 @@ class TorchEngine:
         self._worker: Worker | None = Worker(_THREAD)
         loading = self._worker.submit(lambda: load(checkpoint, settings.dtype, settings.device))
         self._loaded = loading.result()
+        self._frames = Frames(self._loaded.inputs)
         self._decoding: Future[None] | None = None
         self._counts, self._rows_used = Counts(), 0
         self._broke: EngineError | None = None
@@ -143,8 +145,9 @@ class TorchEngine:
         self._listeners[request.request_id] = (asyncio.get_running_loop(), events)
         # Now and not when the thread gets to it, which may be a long step later.
         submitted_s = time.monotonic()
-        self._commands.put(lambda decoder: self._add(decoder, request, submitted_s))
         try:
+            await asyncio.to_thread(self._frames.look_at, request.scene)
+            self._commands.put(lambda decoder: self._add(decoder, request, submitted_s))
             remaining = request.controls.n
             while remaining:
                 event = await events.get()
@@ -182,6 +185,7 @@ class TorchEngine:
                     settings.rows,
                     prompts=settings.prompts or self._prompts(),
                     clip_bytes=settings.clip_bytes,
+                    frames=self._frames,
                     products=settings.products,
                 )
                 decoder = Decoder(runner, settings.shortcuts, clock=time.monotonic)

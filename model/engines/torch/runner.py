@@ -16,6 +16,7 @@ from torch.nn import functional
 from model.driving.scene import Scene
 from model.engines.torch.attention import DrawPass, PromptPart, PromptPass
 from model.engines.torch.clips import ClipCache, digest
+from model.engines.torch.frames import Frames
 from model.engines.torch.head import AllowedHead, Ids
 from model.engines.torch.kv import KvRows
 from model.engines.torch.packed import PackedDecoder, Rotation, pass_size
@@ -97,6 +98,7 @@ class Runner:
         prompts: that can be held at once, each with what up to `ROWS_A_PROMPT` rows write behind it; by
             default as many as rows.
         clip_bytes: of vision tokens kept for pictures that come again, and as many of keys and values.
+        frames: where pictures are decoded; by default a new one.
         products: what matrix products are worked out in; None for the weights' own type.
 
     Attributes:
@@ -110,6 +112,7 @@ class Runner:
         *,
         prompts: int | None = None,
         clip_bytes: int = 0,
+        frames: Frames | None = None,
         products: torch.dtype | None = None,
     ) -> None:
         self.loaded = loaded
@@ -125,6 +128,7 @@ class Runner:
         self._decoder = PackedDecoder(model.model.language_model, products)
         self._head = AllowedHead(model.lm_head.weight)
         self._clips, self._pictures = ClipCache(clip_bytes), ClipCache(clip_bytes)
+        self._frames = frames or Frames(loaded.inputs)
         tower = model.model.visual
         self._tower = tower if products is None else copy.deepcopy(tower).to(products)
         kept = [
@@ -173,7 +177,8 @@ class Runner:
             begun.append(self._begin_prompt(scene, format, row, torch.cat(tokens), shown))
             row += 1
         for key, vision_tokens in made.items():
-            self._clips.keep(key, vision_tokens)
+            # A copy: a part of a tensor would keep all of it.
+            self._clips.keep(key, vision_tokens.clone())
         return begun
 
     def feed_prompts(self, parts: Sequence[tuple[Prompt, int]]) -> None:
@@ -251,7 +256,7 @@ class Runner:
             keys = [digest(pictures) for pictures in slices]
             kept = {key: tokens for key in keys if (tokens := self._clips.find(key)) is not None}
             patches = {
-                key: self.loaded.inputs.patches(pictures)
+                key: self._frames.patches(pictures)
                 for key, pictures in zip(keys, slices, strict=True)
                 if key not in kept
             }
