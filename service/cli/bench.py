@@ -235,10 +235,10 @@ def _rooflines(rows: list[Row], checkpoint: Path, device: str) -> list[Roofline]
 
     from model.bench.report import Roofline
     from model.bench.roofline import measure, work_of_plan
-    from model.engines.torch.engine import fast_products
     from model.network.checkpoint import read_config, read_parts
+    from model.network.precision import bfloat16_is_fast
 
-    dtype = torch.bfloat16 if device != "cpu" else fast_products() or torch.float32
+    dtype = torch.bfloat16 if bfloat16_is_fast(device) else torch.float32
     machine, parts, config = measure(device, dtype), read_parts(checkpoint), read_config(checkpoint)
     prompt = len(parts.inputs.prompt("cf_vla", route=parts.settings.with_route).ids)
     slices, grid_rows, columns = parts.settings.grid

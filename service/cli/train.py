@@ -42,7 +42,9 @@ def train(
     ] = None,
     seed: Annotated[int, typer.Option(help="Of order and initialisation.")] = 0,
     threads: Annotated[int | None, typer.Option(help="CPU threads.", min=1)] = None,
-    bf16: Annotated[bool, typer.Option(help="Mixed precision.")] = True,
+    bf16: Annotated[
+        bool | None, typer.Option(help="Mixed precision; by default where the machine is fast at it.")
+    ] = None,
     compiled: Annotated[bool, typer.Option(help="Compile the decoder; pays on long runs.")] = False,
     gpu: Annotated[bool, typer.Option(help="Use the accelerators that are there.")] = False,
     test: Annotated[Path | None, typer.Option(help="ladder: scenes for its table.")] = None,
@@ -56,6 +58,7 @@ def train(
 
     from model.driving.scene_store import count_scenes, read_scenes
     from model.evaluation.curves import training_curves
+    from model.network.precision import bfloat16_is_fast
     from model.training.memory import keep_freed_memory
     from model.training.recipes import NANO, PAPER
     from model.training.run import RunSettings, create, run
@@ -96,12 +99,13 @@ def train(
             every = max(1, count_scenes(validation) // validation_scenes)
             held_out = list(islice(read_scenes(validation, dense=False), 0, every * validation_scenes, every))
         keep_freed_memory()
+        mixed = bfloat16_is_fast("cuda" if gpu else "cpu") if bf16 is None else bf16
         run(
             chosen,
             scenes,
             source,
             target,
-            RunSettings(cache, bf16=bf16, compiled=compiled, use_cpu=not gpu),
+            RunSettings(cache, bf16=mixed, compiled=compiled, use_cpu=not gpu),
             held_out,
             vision_from,
             reflections,

@@ -9,7 +9,7 @@ from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import torch
 
@@ -28,14 +28,7 @@ from model.engines.torch.runner import Runner
 from model.engines.torch.worker import Worker
 from model.engines.warm_up import warm_up
 from model.network.checkpoint import load
-
-
-def fast_products() -> torch.dtype | None:
-    """bfloat16 where the CPU multiplies matrices of it many times as fast as of float32, else None."""
-    # Known from torch 2.12 on; before, nothing is known.
-    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    return torch.bfloat16 if capabilities.get("amx_bf16") or capabilities.get("avx512_bf16") else None
-
+from model.network.precision import bfloat16_is_fast
 
 _DRAWS_A_SCENE: Final = 6
 """That most requests ask for."""
@@ -65,7 +58,9 @@ class TorchSettings:
     prompts: int | None = None
     clip_bytes: int = 256 << 20
     dtype: torch.dtype = torch.float32
-    products: torch.dtype | None = field(default_factory=fast_products)
+    products: torch.dtype | None = field(
+        default_factory=lambda: torch.bfloat16 if bfloat16_is_fast() else None
+    )
     device: str = "cpu"
     shortcuts: Shortcuts = field(default_factory=Shortcuts)
 

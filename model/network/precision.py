@@ -1,0 +1,19 @@
+"""What a machine multiplies fast."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+
+def bfloat16_is_fast(device: str = "cpu") -> bool:
+    """Whether matrices of bfloat16 are multiplied faster than of float32.
+
+    They are on accelerators, and on CPUs with units for it (AMX, AVX-512 BF16); others are many times slower.
+    """
+    if device != "cpu":
+        return True
+    # Known from torch 2.12 on; before, nothing is known.
+    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    return bool(capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
