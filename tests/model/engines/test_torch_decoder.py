@@ -226,6 +226,18 @@ def test_at_the_deadline_the_draft_is_the_answer(exact: Loaded) -> None:
     assert {(draw.branch, draw.cut) for draw in draws.values()} == {("Action:", "replaced")}
 
 
+def test_memory_for_drafts_is_kept_where_there_may_be_some(exact: Loaded) -> None:
+    def reserved(format: str, **controls: object) -> int:
+        decoder = Decoder(Runner(exact, 8), clock=Clock())
+        decoder.add(request("a", 0, format, n=3, **controls))
+        decoder.step()
+        return decoder.rows_used
+
+    assert reserved("cf_vla", deadline_ms=1000) == 6
+    assert reserved("cf_vla", deadline_ms=1000, thinking="never") == 3
+    assert reserved("traj_only", deadline_ms=1000) == 3
+
+
 class Steady(Pace):
     """Steps of 10 ms, 40 of them behind a text, whatever is seen."""
 
@@ -390,7 +402,7 @@ def test_habits_save_passes_and_change_nothing(exact: Loaded) -> None:
 
 def test_who_is_late_already_makes_nobody_else_late(exact: Loaded) -> None:
     clock = Clock()
-    decoder = Decoder(Runner(exact, 4), clock=clock)
+    decoder = Decoder(Runner(exact, 2), clock=clock)
     decoder.add(request("late", 0, "traj_only", n=2, deadline_ms=1_000))
     decoder.add(request("in-time", 1, "traj_only", n=2, deadline_ms=3_000))
     decoder.add(request("whenever", 2, "traj_only", n=2))
