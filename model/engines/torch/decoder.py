@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -168,11 +169,14 @@ class Decoder:
 
     def _drop_rows(self, request_id: str) -> None:
         for beginning in [each for each in self._beginnings if each.request.id == request_id]:
-            self._beginnings.remove(beginning)
-            if beginning.prompt is not None:
-                self._free_prompt(beginning.prompt)
+            self._drop_beginning(beginning)
         for row in [row for row in self._rows if row.request.id == request_id]:
             self._free_row(row)
+
+    def _drop_beginning(self, beginning: _Beginning) -> None:
+        self._beginnings.remove(beginning)
+        if beginning.prompt is not None:
+            self._free_prompt(beginning.prompt)
 
     def _pause(self, request: Request) -> None:
         """Give up a request's memory and keep what its draws have written."""
@@ -197,8 +201,14 @@ class Decoder:
                 groups.setdefault(row.draws[0] // self._schedule.draws_a_prompt(request), []).append(row)
             self._beginnings += [_Beginning(request, group) for group in groups.values()]
         events += self._bring_prompts_on()
-        if not self._rows:
-            return events
+        if self._rows:
+            events += self._feed_rows()
+            self._pace.saw_step(self._clock() - began_s)
+        return events + self._settle_for_drafts()
+
+    def _feed_rows(self) -> list[StepEvent]:
+        """Feed all rows once, and write what was chosen."""
+        events: list[StepEvent] = []
         rows = list(self._rows)
         feeds = [self._feed_of(row) for row in rows]
         self._count(rows, feeds)
@@ -211,9 +221,7 @@ class Decoder:
                 events.append(
                     self._fail(row.request, EngineError("the network gave logits that are no numbers"))
                 )
-        events += self._end_the_done()
-        self._pace.saw_step(self._clock() - began_s)
-        return events + self._settle_for_drafts()
+        return events + self._end_the_done()
 
     def check_integrity(self) -> None:
         """Raise `AssertionError` when the books do not agree with each other."""
@@ -385,43 +393,57 @@ class Decoder:
         return events
 
     def _settle_for_drafts(self) -> list[StepEvent]:
-        """Answer with drafts where the reflection will not end in time."""
+        """Answer with drafts where the reflection will not end in time, of requests that gave way too."""
         events: list[StepEvent] = []
         now_s = self._clock()
-        for row in list(self._rows):
+        for row in self._every_row():
             if row.draft or not self._pace.last_step(row.request.deadline_s, now_s):
                 continue
             ready = [draw for draw in row.draws if (row.request.id, draw) in self._drafts]
             if not ready:
                 continue
-            row.draws = tuple(draw for draw in row.draws if draw not in ready)
-            if not row.draws:
-                self._free_row(row)
+            self._take_out(row, ready)
             drafts = [self._drafts[row.request.id, draw] for draw in ready]
             events += self._answer(row.request, [replace(draft, cut="replaced") for draft in drafts])
         return events
 
     def _answer(self, request: Request, draws: list[Draw]) -> list[StepEvent]:
         """Finished draws; what was kept for them is forgotten, and the request with its last draw."""
-        answered = {draw.index for draw in draws}
+        answered = [draw.index for draw in draws]
         for index in answered:
             self._drafts.pop((request.id, index), None)
-        for row in [row for row in self._rows if row.request is request and row.draft]:
-            row.draws = tuple(draw for draw in row.draws if draw not in answered)
-            if not row.draws:
-                self._free_row(row)
-        if not self._at_work(request):
+        for row in self._every_row():
+            if row.request is request and row.draft:
+                self._take_out(row, answered)
+        if all(row.request is not request for row in self._every_row()):
             self._schedule.release(request.id)
+            self._paused.pop(request.id, None)
         return [(request.id, DrawFinished(draw)) for draw in draws]
+
+    def _every_row(self) -> list[Row]:
+        """Those that run, those that wait for their prompt, and those of requests that gave way."""
+        waiting = [each.rows for each in self._beginnings]
+        return [*self._rows, *chain.from_iterable([*waiting, *self._paused.values()])]
+
+    def _take_out(self, row: Row, draws: Collection[int]) -> None:
+        """Go on without some of a row's draws, and without the row when none are left."""
+        row.draws = tuple(draw for draw in row.draws if draw not in draws)
+        if row.draws:
+            return
+        if row in self._rows:
+            self._free_row(row)
+            return
+        if row in (paused := self._paused.get(row.request.id, [])):
+            paused.remove(row)
+            return
+        beginning = next(each for each in self._beginnings if row in each.rows)
+        beginning.rows.remove(row)
+        if not beginning.rows:
+            self._drop_beginning(beginning)
 
     def _fail(self, request: Request, error: Exception) -> StepEvent:
         self.cancel(request.id)
         return request.id, Failed(error)
-
-    def _at_work(self, request: Request) -> bool:
-        return any(row.request is request for row in self._rows) or any(
-            beginning.request is request for beginning in self._beginnings
-        )
 
     def _free_row(self, row: Row) -> None:
         """Give up a row, and its prompt if it was the last to use it; the last row moves into its place."""

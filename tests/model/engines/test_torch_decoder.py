@@ -226,6 +226,40 @@ def test_at_the_deadline_the_draft_is_the_answer(exact: Loaded) -> None:
     assert {(draw.branch, draw.cut) for draw in draws.values()} == {("Action:", "replaced")}
 
 
+@pytest.mark.parametrize("waits_for", ["room", "its prompt"])
+def test_who_gave_way_is_answered_with_drafts_at_the_deadline(exact: Loaded, waits_for: str) -> None:
+    clock = Clock()
+    decoder = Decoder(Runner(exact, 4), clock=clock, prompt_chunk=8)
+    decoder.add(request("a", n=2, seed=4, thinking="always", deadline_ms=9_000))
+    drafts, draws = {}, {}
+
+    def step() -> None:
+        for name, event in decoder.step():
+            if isinstance(event, DraftFinished):
+                drafts[event.draw.index] = event.draw
+            elif isinstance(event, DrawFinished):
+                draws[name, event.draw.index] = event.draw
+        decoder.check_integrity()
+
+    while len(drafts) < 2:
+        step()
+    decoder.add(request("urgent", 1, "traj_only", n=2, deadline_ms=5_000))
+    step()
+    if waits_for == "its prompt":
+        while ("urgent", 1) not in draws:
+            step()
+        step()
+    assert ("a", 0) not in draws
+    clock.now_s = 9.1
+    step()
+    assert (("urgent", 1) in draws) == (waits_for == "its prompt")
+    assert [draws["a", index].text for index in range(2)] == [drafts[index].text for index in range(2)]
+    assert {draws["a", index].cut for index in range(2)} == {"replaced"}
+    while not decoder.idle:
+        step()
+    assert len(draws) == 4
+
+
 def test_memory_for_drafts_is_kept_where_there_may_be_some(exact: Loaded) -> None:
     def reserved(format: str, **controls: object) -> int:
         decoder = Decoder(Runner(exact, 8), clock=Clock())
