@@ -87,13 +87,17 @@ class Counts:
         passes: through the network, for draws.
         row_passes: rows fed, over all passes.
         fan_out_row_passes: the same if every draw had a row of its own.
+        scene_passes: scenes whose draws were fed, over all passes.
         tokens: fed, over all rows.
+        kept: of these, what rows went on with; the others were guessed wrong.
     """
 
     passes: int = 0
     row_passes: int = 0
     fan_out_row_passes: int = 0
+    scene_passes: int = 0
     tokens: int = 0
+    kept: int = 0
 
 
 class Decoder:
@@ -317,6 +321,7 @@ class Decoder:
         """Choose at the decisions of a feed, one after the other, while what was fed is what is chosen."""
         events: list[StepEvent] = []
         row.passes += 1
+        held = row.held
         ahead = feed.tokens[len(row.pending) :]
         row.saw(min(len(row.pending), len(feed.tokens)))
         for logits in found:
@@ -328,6 +333,7 @@ class Decoder:
             ahead = ahead[agreed:]
             if row.pending:
                 break
+        self.counts.kept += row.held - held
         return events
 
     def _choose(self, row: Row, logits: Logits, proposed: int | None) -> list[StepEvent]:
@@ -359,6 +365,7 @@ class Decoder:
         counts.passes += 1
         counts.row_passes += len(rows)
         counts.fan_out_row_passes += sum(len(row.draws) for row in rows)
+        counts.scene_passes += len({id(row.prompt) for row in rows})
         counts.tokens += sum(len(feed.tokens) for feed in feeds)
 
     def _end_the_done(self) -> list[StepEvent]:

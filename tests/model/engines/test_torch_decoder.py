@@ -118,6 +118,8 @@ def test_shortcuts_save_what_they_are_for(exact: Loaded) -> None:
     unshared = counts(shared_rows=False)
     assert unshared.row_passes == unshared.fan_out_row_passes > everything.row_passes
     decision_by_decision = counts(speculate=False)
+    assert decision_by_decision.kept == decision_by_decision.tokens
+    assert everything.kept == decision_by_decision.kept < everything.tokens
     assert decision_by_decision.fan_out_row_passes == counts(speculate=False, shared_rows=False).row_passes
 
 
