@@ -22,9 +22,10 @@ SHORTCUTS = ("jump", "shared_prompts", "shared_rows", "speculate")
 
 @dataclass(frozen=True)
 class Response:
-    """One draw as the bench counts it: tokens, network passes, and whether it parses."""
+    """One draw as the bench counts it: tokens, those chosen, network passes, and whether it parses."""
 
     tokens: int
+    chosen: int
     passes: int
     valid: bool
 
@@ -98,7 +99,7 @@ class EngineContender(Contender):
 
 
 def _counted(draw: Draw) -> Response:
-    return Response(sum(draw.tokens.values()), draw.passes, valid=True)
+    return Response(sum(draw.tokens.values()), draw.chosen, draw.passes, valid=True)
 
 
 class PlainVllm(Contender):
@@ -188,10 +189,10 @@ class Transformers(Contender):
 
 
 def _read(ids: list[int], format: str, vocabulary: Vocabulary, steps: int | None = None) -> Response:
-    """A response written without a grammar; it took a pass for each token."""
+    """A response written without a grammar; each token was chosen, and took a pass."""
     try:
         parse(FORMATS[format], vocabulary.decode(ids))
         valid = True
     except FormatError:
         valid = False
-    return Response(len(ids), steps or len(ids), valid)
+    return Response(len(ids), len(ids), steps or len(ids), valid)

@@ -25,7 +25,11 @@ class Machine:
 
 @dataclass(frozen=True)
 class Work:
-    """What a plan takes: floating-point operations, and bytes moved (weights once a pass, keys, values)."""
+    """What a plan takes: floating-point operations, and bytes moved.
+
+    Weights are moved once a pass and shared by all scenes in it; a scene's keys and values are moved once
+    in each pass that it takes part in. Nothing that was fed in vain is counted.
+    """
 
     flops: float
     bytes: float
@@ -64,7 +68,15 @@ def _rate(act: Callable[[], Any], device: str) -> float:
 
 
 def work_of_plan(
-    config: Any, prompt_tokens: int, patches: int, tokens: float, passes: float, dtype: torch.dtype
+    config: Any,
+    prompt_tokens: int,
+    patches: int,
+    *,
+    tokens: float,
+    passes: float,
+    scene_passes: float,
+    together: int,
+    dtype: torch.dtype,
 ) -> Work:
     """A plan's work.
 
@@ -72,8 +84,10 @@ def work_of_plan(
         config: of the checkpoint's network.
         prompt_tokens: of its scene.
         patches: of its pictures.
-        tokens: that went through the decoder behind the prompt, over all draws.
-        passes: that they took.
+        tokens: behind the prompt that had to go through the decoder, over all draws.
+        passes: that they took, a pass with several scenes shared out among these.
+        scene_passes: that its scene took part in.
+        together: scenes whose prompts may share a pass.
         dtype: of weights, keys and values.
     """
     text, vision, size = config.text_config, config.vision_config, dtype.itemsize
@@ -89,5 +103,6 @@ def work_of_plan(
         + 2.0 * decoder * (prompt_tokens + tokens)
         + seen * (prompt_tokens**2 / 2 + tokens * prompt_tokens)
     )
-    kept = text.num_hidden_layers * kv * prompt_tokens
-    return Work(flops, float(size * (tower + decoder * (1 + passes) + kept * passes)))
+    held = text.num_hidden_layers * kv * prompt_tokens
+    moved = (tower + decoder) / together + decoder * passes + held * scene_passes
+    return Work(flops, float(size * moved))

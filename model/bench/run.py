@@ -45,7 +45,8 @@ class Job:
 class Row:
     """Figures of one contender at one workload; a plan is a request with all its draws.
 
-    ``plans_per_s_spread`` are the slowest and the fastest round; ``valid_share`` counts draws that parse.
+    ``plans_per_s_spread`` are the slowest and the fastest round; ``valid_share`` counts draws that parse,
+    ``forced_share`` tokens that the format left no choice about.
     """
 
     engine: str
@@ -61,6 +62,7 @@ class Row:
     passes_per_response: float
     tokens_per_response: float
     valid_share: float
+    forced_share: float
     peak_bytes: int
     counts: Mapping[str, float] = field(default_factory=dict)
 
@@ -259,7 +261,7 @@ def _row(name: str, load: Workload, replies: Sequence[Mapping[str, Any]]) -> Row
     latencies = [answer["latency_s"] for answer in answers]
     responses = [response for answer in answers for response in answer["responses"]]
     rates = [load.scenes / reply["wall_s"] for reply in replies]
-    plans = len(answers)
+    plans, tokens = len(answers), sum(each["tokens"] for each in responses)
     keys = replies[0]["counts"]
     return Row(
         engine=name,
@@ -271,10 +273,12 @@ def _row(name: str, load: Workload, replies: Sequence[Mapping[str, Any]]) -> Row
         latency_p95_s=float(np.percentile(latencies, 95)),
         plans_per_s=statistics.median(rates),
         plans_per_s_spread=(min(rates), max(rates)),
-        tokens_per_s=sum(each["tokens"] for each in responses) / sum(reply["wall_s"] for reply in replies),
+        tokens_per_s=tokens / sum(reply["wall_s"] for reply in replies),
         passes_per_response=statistics.mean(each["passes"] for each in responses),
         tokens_per_response=statistics.mean(each["tokens"] for each in responses),
         valid_share=statistics.mean(each["valid"] for each in responses),
+        forced_share=1
+        - sum(each["chosen"] for each in responses) / sum(each["tokens"] for each in responses),
         peak_bytes=max(reply["peak_bytes"] for reply in replies),
         counts={key: sum(reply["counts"][key] for reply in replies) / plans for key in keys},
     )

@@ -247,7 +247,16 @@ def _rooflines(rows: list[Row], checkpoint: Path, device: str) -> list[Roofline]
     for row in rows:
         if row.engine != "torch" or row.thinking != "adaptive":
             continue
-        work = work_of_plan(config, prompt, patches, row.counts["tokens"], row.counts["passes"], dtype)
+        work = work_of_plan(
+            config,
+            prompt,
+            patches,
+            tokens=row.counts["kept"],
+            passes=row.counts["passes"],
+            scene_passes=row.counts["scene_passes"],
+            together=row.scenes,
+            dtype=dtype,
+        )
         least_s, measured_s = work.seconds(machine), 1 / row.plans_per_s
         found.append(Roofline(machine, row.scenes, row.n, work, least_s, measured_s))
     return found

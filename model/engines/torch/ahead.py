@@ -64,7 +64,7 @@ class Ahead:
         ahead: list[int] = []
         context = [token.id for token in row.tokens[-_CONTEXT:]]
         repeated = self._repeated(row)[:repeats]
-        copied = row.proposal() if copy else []
+        copied: Sequence[int] = row.proposal() if copy else ()
         while True:
             ids, place, token = cursor.allowed().ids, len(ahead), None
             decisions.append((len(tokens) + place - 1, ids))
@@ -89,7 +89,7 @@ class Ahead:
             if cursor.done:
                 break
             # Where the format forces something else, as behind another prefill, they are left for good.
-            repeated, copied = (each if _agree(each[place:], new) else [] for each in (repeated, copied))
+            repeated, copied = (each if _agree(each[place:], new) else () for each in (repeated, copied))
         return tokens + ahead, decisions
 
     def _repeated(self, row: Row) -> Sequence[int]:

@@ -21,8 +21,8 @@ from model.engines.torch.places import IntArray, Written, count_up
 
 _SPAN: Final = 32
 """Places seen are a multiple of this: few sizes, few kernels."""
-_PADDING: Final = 15
-"""Tokens whose attention takes as long as a call of its own."""
+_PADDING: Final = 6_000
+"""Places looked at in vain, over all tokens, that take as long as a call of its own."""
 
 
 class PromptPart(NamedTuple):
@@ -69,7 +69,8 @@ class PromptPass:
 class DrawPass:
     """The next tokens of running draws, packed.
 
-    Scenes that bring about as many tokens ask together, padded to the most; others in a call of their own.
+    Scenes that bring about as many tokens and see about as many places ask together, padded to the most;
+    others in a call of their own.
 
     Args:
         heads: of queries; keys and values have as many or fewer.
@@ -81,45 +82,49 @@ class DrawPass:
     def __init__(self, heads: int, memory: KvRows, written: Written, size: int) -> None:
         prompts, places, seen = written
         groups, count = memory.heads, len(places)
-        span = -(-seen.shape[1] // _SPAN) * _SPAN
-        self._memory = memory.reach(int(prompts.max()) + 1, span)
+        brought = np.bincount(prompts)
+        last = seen.shape[1] - seen[:, ::-1].argmax(axis=1)
+        ends = np.full_like(brought, _SPAN)
+        np.maximum.at(ends, prompts, -(-last // _SPAN) * _SPAN)
+        self._memory = memory.reach(len(brought), int(ends.max()))
         self._flat, self._count = memory.flat, count
         device = self._memory.device
         slots = (prompts[:, None] * groups + np.arange(groups)) * memory.length + places[:, None]
         self._slots = _tensor(slots, device)
 
-        brought = np.bincount(prompts)
         order = np.argsort(prompts, kind="stable")
         number = np.empty_like(order)
         number[order] = count_up(brought)
-        together = _together(brought)
+        together = _together(brought, ends)
         widths = np.array([brought[part].max() for part in together])
+        spans = [int(ends[part].max()) for part in together]
         rows = np.array([part.stop - part.start for part in together])
         part_of = np.repeat(np.arange(len(together)), rows)
-        ends = np.cumsum(rows * widths)
-        first, width = ((ends - rows * widths)[part_of][prompts], widths[part_of][prompts])
+        sizes = rows * widths
+        starts = np.cumsum(sizes) - sizes
+        first, width = starts[part_of][prompts], widths[part_of][prompts]
         row = prompts - np.array([part.start for part in together])[part_of][prompts]
 
         # Of a part, queries lie as [row, group, token, head of the group].
         group, member = np.divmod(np.arange(heads), heads // groups)
         back = first[:, None] * heads + member
         back += (((row[:, None] * groups + group) * width[:, None]) + number[:, None]) * (heads // groups)
-        into = np.zeros(int(ends[-1]) * heads, np.int64)
+        into = np.zeros(int(sizes.sum()) * heads, np.int64)
         into[back] = np.arange(count * heads).reshape(back.shape)
         self._into = _tensor(into, device)
         self._back = _tensor(np.pad(back, ((0, size - count), (0, 0))), device)
-        # Where nobody asks, the first place is seen: softmax over nothing would be no number.
-        hidden = np.ones((int(ends[-1]), 1, span), np.bool_)
-        hidden[..., 0] = False
-        hidden[first + row * width + number, 0, : seen.shape[1]] = ~seen
-        mask = torch.zeros((len(hidden), heads // groups, span), dtype=self._memory.dtype, device=device)
-        mask.masked_fill_(torch.from_numpy(hidden).to(device), float("-inf"))
-        masks = torch.split(mask, (rows * widths).tolist())
-        self._asked = (rows * widths * heads).tolist()
-        self._parts = [
-            (part, each.view(part.stop - part.start, 1, -1, span))
-            for part, each in zip(together, masks, strict=True)
-        ]
+        self._asked = (sizes * heads).tolist()
+        place, part = row * width + number, part_of[prompts]
+        self._parts = []
+        for index, (scenes, span) in enumerate(zip(together, spans, strict=True)):
+            mine = part == index
+            # Where nobody asks, the first place is seen: softmax over nothing would be no number.
+            hidden = np.ones((sizes[index], 1, span), np.bool_)
+            hidden[:, 0, 0] = False
+            hidden[place[mine], 0, : seen.shape[1]] = ~seen[mine, :span]
+            mask = torch.zeros((sizes[index], heads // groups, span), dtype=self._memory.dtype, device=device)
+            mask.masked_fill_(torch.from_numpy(hidden).to(device), float("-inf"))
+            self._parts.append((scenes, mask.view(scenes.stop - scenes.start, 1, -1, span)))
 
     def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
         """Store ``key`` and ``value`` [t, g, d]; what ``query`` [t, h, d], scaled, sees: [t, h x d]."""
@@ -131,8 +136,8 @@ class DrawPass:
         seen = [
             functional.scaled_dot_product_attention(
                 queries.view(part.stop - part.start, keys.shape[1], -1, width),
-                keys[part],
-                values[part],
+                keys[part, :, : mask.shape[-1]],
+                values[part, :, : mask.shape[-1]],
                 attn_mask=mask,
                 scale=1.0,
             ).reshape(-1, width)
@@ -141,16 +146,18 @@ class DrawPass:
         return torch.cat(seen).index_select(0, self._back).view(len(query), -1)
 
 
-def _together(brought: IntArray) -> list[slice]:
-    """Runs of rows that ask in one call: row i brings so many tokens, and little is to be padded."""
-    parts, first, widest = [], 0, int(brought[0])
+def _together(brought: IntArray, ends: IntArray) -> list[slice]:
+    """Runs of rows that ask in one call: row i brings so many tokens that see places up to its end."""
+    parts, first, widest, longest = [], 0, int(brought[0]), int(ends[0])
     for row in range(1, len(brought)):
-        wider = max(widest, int(brought[row]))
-        if (wider - widest) * (row - first) + wider - int(brought[row]) <= _PADDING:
-            widest = wider
+        wider, longer = max(widest, int(brought[row])), max(longest, int(ends[row]))
+        joined = (row - first + 1) * wider * longer
+        apart = (row - first) * widest * longest + int(brought[row] * ends[row])
+        if joined - apart <= _PADDING:
+            widest, longest = wider, longer
         else:
             parts.append(slice(first, row))
-            first, widest = row, int(brought[row])
+            first, widest, longest = row, int(brought[row]), int(ends[row])
     return [*parts, slice(first, len(brought))]
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -86,13 +87,17 @@ class Counts:
         passes: through the network, for draws.
         row_passes: rows fed, over all passes.
         fan_out_row_passes: the same if every draw had a row of its own.
+        scene_passes: scenes whose draws were fed, over all passes.
         tokens: fed, over all rows.
+        kept: of these, what rows went on with; the others were guessed wrong.
     """
 
     passes: int = 0
     row_passes: int = 0
     fan_out_row_passes: int = 0
+    scene_passes: int = 0
     tokens: int = 0
+    kept: int = 0
 
 
 class Decoder:
@@ -168,11 +173,14 @@ class Decoder:
 
     def _drop_rows(self, request_id: str) -> None:
         for beginning in [each for each in self._beginnings if each.request.id == request_id]:
-            self._beginnings.remove(beginning)
-            if beginning.prompt is not None:
-                self._free_prompt(beginning.prompt)
+            self._drop_beginning(beginning)
         for row in [row for row in self._rows if row.request.id == request_id]:
             self._free_row(row)
+
+    def _drop_beginning(self, beginning: _Beginning) -> None:
+        self._beginnings.remove(beginning)
+        if beginning.prompt is not None:
+            self._free_prompt(beginning.prompt)
 
     def _pause(self, request: Request) -> None:
         """Give up a request's memory and keep what its draws have written."""
@@ -197,8 +205,14 @@ class Decoder:
                 groups.setdefault(row.draws[0] // self._schedule.draws_a_prompt(request), []).append(row)
             self._beginnings += [_Beginning(request, group) for group in groups.values()]
         events += self._bring_prompts_on()
-        if not self._rows:
-            return events
+        if self._rows:
+            events += self._feed_rows()
+            self._pace.saw_step(self._clock() - began_s)
+        return events + self._settle_for_drafts()
+
+    def _feed_rows(self) -> list[StepEvent]:
+        """Feed all rows once, and write what was chosen."""
+        events: list[StepEvent] = []
         rows = list(self._rows)
         feeds = [self._feed_of(row) for row in rows]
         self._count(rows, feeds)
@@ -211,9 +225,7 @@ class Decoder:
                 events.append(
                     self._fail(row.request, EngineError("the network gave logits that are no numbers"))
                 )
-        events += self._end_the_done()
-        self._pace.saw_step(self._clock() - began_s)
-        return events + self._settle_for_drafts()
+        return events + self._end_the_done()
 
     def check_integrity(self) -> None:
         """Raise `AssertionError` when the books do not agree with each other."""
@@ -309,6 +321,7 @@ class Decoder:
         """Choose at the decisions of a feed, one after the other, while what was fed is what is chosen."""
         events: list[StepEvent] = []
         row.passes += 1
+        held = row.held
         ahead = feed.tokens[len(row.pending) :]
         row.saw(min(len(row.pending), len(feed.tokens)))
         for logits in found:
@@ -320,6 +333,7 @@ class Decoder:
             ahead = ahead[agreed:]
             if row.pending:
                 break
+        self.counts.kept += row.held - held
         return events
 
     def _choose(self, row: Row, logits: Logits, proposed: int | None) -> list[StepEvent]:
@@ -351,6 +365,7 @@ class Decoder:
         counts.passes += 1
         counts.row_passes += len(rows)
         counts.fan_out_row_passes += sum(len(row.draws) for row in rows)
+        counts.scene_passes += len({id(row.prompt) for row in rows})
         counts.tokens += sum(len(feed.tokens) for feed in feeds)
 
     def _end_the_done(self) -> list[StepEvent]:
@@ -385,43 +400,57 @@ class Decoder:
         return events
 
     def _settle_for_drafts(self) -> list[StepEvent]:
-        """Answer with drafts where the reflection will not end in time."""
+        """Answer with drafts where the reflection will not end in time, of requests that gave way too."""
         events: list[StepEvent] = []
         now_s = self._clock()
-        for row in list(self._rows):
+        for row in self._every_row():
             if row.draft or not self._pace.last_step(row.request.deadline_s, now_s):
                 continue
             ready = [draw for draw in row.draws if (row.request.id, draw) in self._drafts]
             if not ready:
                 continue
-            row.draws = tuple(draw for draw in row.draws if draw not in ready)
-            if not row.draws:
-                self._free_row(row)
+            self._take_out(row, ready)
             drafts = [self._drafts[row.request.id, draw] for draw in ready]
             events += self._answer(row.request, [replace(draft, cut="replaced") for draft in drafts])
         return events
 
     def _answer(self, request: Request, draws: list[Draw]) -> list[StepEvent]:
         """Finished draws; what was kept for them is forgotten, and the request with its last draw."""
-        answered = {draw.index for draw in draws}
+        answered = [draw.index for draw in draws]
         for index in answered:
             self._drafts.pop((request.id, index), None)
-        for row in [row for row in self._rows if row.request is request and row.draft]:
-            row.draws = tuple(draw for draw in row.draws if draw not in answered)
-            if not row.draws:
-                self._free_row(row)
-        if not self._at_work(request):
+        for row in self._every_row():
+            if row.request is request and row.draft:
+                self._take_out(row, answered)
+        if all(row.request is not request for row in self._every_row()):
             self._schedule.release(request.id)
+            self._paused.pop(request.id, None)
         return [(request.id, DrawFinished(draw)) for draw in draws]
+
+    def _every_row(self) -> list[Row]:
+        """Those that run, those that wait for their prompt, and those of requests that gave way."""
+        waiting = [each.rows for each in self._beginnings]
+        return [*self._rows, *chain.from_iterable([*waiting, *self._paused.values()])]
+
+    def _take_out(self, row: Row, draws: Collection[int]) -> None:
+        """Go on without some of a row's draws, and without the row when none are left."""
+        row.draws = tuple(draw for draw in row.draws if draw not in draws)
+        if row.draws:
+            return
+        if row in self._rows:
+            self._free_row(row)
+            return
+        if row in (paused := self._paused.get(row.request.id, [])):
+            paused.remove(row)
+            return
+        beginning = next(each for each in self._beginnings if row in each.rows)
+        beginning.rows.remove(row)
+        if not beginning.rows:
+            self._drop_beginning(beginning)
 
     def _fail(self, request: Request, error: Exception) -> StepEvent:
         self.cancel(request.id)
         return request.id, Failed(error)
-
-    def _at_work(self, request: Request) -> bool:
-        return any(row.request is request for row in self._rows) or any(
-            beginning.request is request for beginning in self._beginnings
-        )
 
     def _free_row(self, row: Row) -> None:
         """Give up a row, and its prompt if it was the last to use it; the last row moves into its place."""

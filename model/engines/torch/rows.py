@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -51,10 +52,11 @@ class Request:
         deadline_ms = self.controls.deadline_ms
         return float("inf") if deadline_ms is None else self.submitted_s + deadline_ms / 1000
 
-    @property
+    @cached_property
     def drafts(self) -> bool:
         """Whether a direct trajectory is made beside every reflection."""
-        return self.controls.deadline_ms is not None and self.controls.thinking != "never"
+        reflects = BRANCH in self.start.compiled.format.sections() and self.controls.thinking != "never"
+        return self.controls.deadline_ms is not None and reflects
 
 
 @dataclass(eq=False)

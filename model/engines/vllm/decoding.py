@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from model.engines.engine import (
+    MAX_DRAWS,
     DrawFinished,
     EngineError,
     Event,
@@ -29,6 +30,16 @@ from model.network.checkpoint import Parts
 _SEEDS: Final = 2**63
 _FAR: Final = 700.0
 """A difference of log-probabilities beyond which the exponential overflows."""
+
+
+def seed_of(seed: int, draw: int, written: int) -> int:
+    """The seed for vLLM to write on with, from ``draw`` on, behind so many tokens.
+
+    vLLM gives the i-th of n draws this seed plus i, so seeds are spread: otherwise the draws of neighbouring
+    seeds were mostly the same, and draws that go on apart repeated the random numbers of their beginnings.
+    """
+    spread = np.random.SeedSequence([seed % _SEEDS, draw, written]).generate_state(1, np.uint64)
+    return int(spread[0]) % (_SEEDS - MAX_DRAWS)
 
 
 class VllmPrompt(NamedTuple):
@@ -139,16 +150,11 @@ class Decoding:
         from vllm.sampling_params import RequestOutputKind, StructuredOutputsParams
 
         controls, first = self._request.controls, draws[0]
-        seed = controls.seed
-        if first.tokens:
-            # Draws that go on apart must not repeat the random numbers of their beginnings.
-            place = [controls.seed % _SEEDS, first.index, len(first.tokens)]
-            seed = int(np.random.SeedSequence(place).generate_state(1, np.uint64)[0])
         return SamplingParams(
             n=len(draws),
             temperature=controls.temperature,
             top_p=controls.top_p,
-            seed=seed % _SEEDS,
+            seed=seed_of(controls.seed, first.index, len(first.tokens)),
             max_tokens=first.cursor.compiled.longest(),
             logprob_token_ids=self._branch_ids(first),
             structured_outputs=StructuredOutputsParams(grammar=self._grammar(first.cursor)),

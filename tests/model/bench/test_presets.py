@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from model.bench.presets import PRESETS, Preset, write_random
-from model.bench.roofline import work_of_plan
+from model.bench.roofline import Work, work_of_plan
 from model.engines.engine import Controls, DrawFinished, PlanRequest
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.network.checkpoint import read_config
@@ -46,7 +46,29 @@ def test_a_preset_plans_with_random_weights(untrained_checkpoint: Path, tmp_path
 
 def test_work_grows_with_what_is_done(untrained_checkpoint: Path) -> None:
     config = read_config(untrained_checkpoint)
-    few = work_of_plan(config, 100, 200, 50, 10, torch.float32)
-    assert work_of_plan(config, 100, 200, 100, 10, torch.float32).flops > few.flops
-    assert work_of_plan(config, 100, 200, 50, 20, torch.float32).bytes > few.bytes
-    assert work_of_plan(config, 100, 200, 50, 10, torch.bfloat16).bytes == few.bytes / 2
+
+    def work(
+        tokens: float = 50,
+        passes: float = 10,
+        scene_passes: float = 10,
+        together: int = 1,
+        dtype: torch.dtype = torch.float32,
+    ) -> Work:
+        return work_of_plan(
+            config,
+            100,
+            200,
+            tokens=tokens,
+            passes=passes,
+            scene_passes=scene_passes,
+            together=together,
+            dtype=dtype,
+        )
+
+    assert work(tokens=100).flops > work().flops
+    assert work(passes=20).bytes > work().bytes
+    assert work(scene_passes=20).bytes > work().bytes
+    assert work(dtype=torch.bfloat16).bytes == work().bytes / 2
+    shared = work(passes=1, together=10)
+    assert shared.flops == work().flops
+    assert shared.bytes < work().bytes

@@ -31,9 +31,12 @@ def test_engines_run_side_by_side(untrained_checkpoint: Path) -> None:
     ]
     ours, theirs, direct = rows
     assert ours.valid_share == direct.valid_share == 1.0
+    assert direct.forced_share > 0.5
+    assert theirs.forced_share == 0.0
     assert theirs.valid_share < 1.0, "an untrained model writes no plans of itself"
     assert direct.passes_per_response < 0.5 * direct.tokens_per_response
-    assert ours.counts["fan_out_row_passes"] >= ours.counts["row_passes"] > 0
+    assert ours.counts["fan_out_row_passes"] >= ours.counts["row_passes"] >= ours.counts["scene_passes"] > 0
+    assert ours.counts["tokens"] >= ours.counts["kept"] > 0
     assert all(row.peak_bytes > 50 << 20 and row.latency_p95_s >= row.latency_p50_s > 0 for row in rows)
     assert any("round 1 of 1" in line for line in told)
 
@@ -67,7 +70,21 @@ def test_memory_of_this_process_is_known() -> None:
 
 def row(engine: str, latency_s: float, plans_per_s: float) -> Row:
     return Row(
-        engine, 1, 6, "adaptive", 1.0, latency_s, latency_s, plans_per_s, (1, 2), 9, 20, 100, 1.0, 1 << 20
+        engine,
+        1,
+        6,
+        "adaptive",
+        1.0,
+        latency_s,
+        latency_s,
+        plans_per_s,
+        (1, 2),
+        9,
+        20,
+        100,
+        1.0,
+        0.7,
+        1 << 20,
     )
 
 

@@ -62,6 +62,21 @@ def test_each_token_sees_its_prompt_and_what_its_draw_has_written(seed: int) -> 
             start += count
 
 
+def test_a_scene_that_sees_far_leaves_the_others_their_span() -> None:
+    memory = KvRows(
+        layers=1,
+        heads=GROUPS,
+        head_dim=WIDTH,
+        rows=3,
+        length=3000,
+        dtype=torch.float32,
+        device=torch.device("cpu"),
+    )
+    written = Places(3, 40).write([Fed(0, 0, 8), Fed(1, 0, 8), Fed(2, 0, 8)], (20, 2000, 30))
+    spans = [mask.shape[-1] for _, mask in DrawPass(HEADS, memory, written, 24)._parts]
+    assert spans == [32, 2016, 64]
+
+
 def test_passes_have_few_sizes_and_little_padding() -> None:
     sizes = [pass_size(count) for count in range(1, 2001)]
     assert all(count <= size <= 1.25 * count for count, size in enumerate(sizes, start=1))

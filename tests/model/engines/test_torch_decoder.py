@@ -118,6 +118,8 @@ def test_shortcuts_save_what_they_are_for(exact: Loaded) -> None:
     unshared = counts(shared_rows=False)
     assert unshared.row_passes == unshared.fan_out_row_passes > everything.row_passes
     decision_by_decision = counts(speculate=False)
+    assert decision_by_decision.kept == decision_by_decision.tokens
+    assert everything.kept == decision_by_decision.kept < everything.tokens
     assert decision_by_decision.fan_out_row_passes == counts(speculate=False, shared_rows=False).row_passes
 
 
@@ -224,6 +226,52 @@ def test_at_the_deadline_the_draft_is_the_answer(exact: Loaded) -> None:
             clock.now_s = 101.0
     assert [draws[index].text for index in range(2)] == [drafts[index].text for index in range(2)]
     assert {(draw.branch, draw.cut) for draw in draws.values()} == {("Action:", "replaced")}
+
+
+@pytest.mark.parametrize("waits_for", ["room", "its prompt"])
+def test_who_gave_way_is_answered_with_drafts_at_the_deadline(exact: Loaded, waits_for: str) -> None:
+    clock = Clock()
+    decoder = Decoder(Runner(exact, 4), clock=clock, prompt_chunk=8)
+    decoder.add(request("a", n=2, seed=4, thinking="always", deadline_ms=9_000))
+    drafts, draws = {}, {}
+
+    def step() -> None:
+        for name, event in decoder.step():
+            if isinstance(event, DraftFinished):
+                drafts[event.draw.index] = event.draw
+            elif isinstance(event, DrawFinished):
+                draws[name, event.draw.index] = event.draw
+        decoder.check_integrity()
+
+    while len(drafts) < 2:
+        step()
+    decoder.add(request("urgent", 1, "traj_only", n=2, deadline_ms=5_000))
+    step()
+    if waits_for == "its prompt":
+        while ("urgent", 1) not in draws:
+            step()
+        step()
+    assert ("a", 0) not in draws
+    clock.now_s = 9.1
+    step()
+    assert (("urgent", 1) in draws) == (waits_for == "its prompt")
+    assert [draws["a", index].text for index in range(2)] == [drafts[index].text for index in range(2)]
+    assert {draws["a", index].cut for index in range(2)} == {"replaced"}
+    while not decoder.idle:
+        step()
+    assert len(draws) == 4
+
+
+def test_memory_for_drafts_is_kept_where_there_may_be_some(exact: Loaded) -> None:
+    def reserved(format: str, **controls: object) -> int:
+        decoder = Decoder(Runner(exact, 8), clock=Clock())
+        decoder.add(request("a", 0, format, n=3, **controls))
+        decoder.step()
+        return decoder.rows_used
+
+    assert reserved("cf_vla", deadline_ms=1000) == 6
+    assert reserved("cf_vla", deadline_ms=1000, thinking="never") == 3
+    assert reserved("traj_only", deadline_ms=1000) == 3
 
 
 class Steady(Pace):
@@ -390,7 +438,7 @@ def test_habits_save_passes_and_change_nothing(exact: Loaded) -> None:
 
 def test_who_is_late_already_makes_nobody_else_late(exact: Loaded) -> None:
     clock = Clock()
-    decoder = Decoder(Runner(exact, 4), clock=clock)
+    decoder = Decoder(Runner(exact, 2), clock=clock)
     decoder.add(request("late", 0, "traj_only", n=2, deadline_ms=1_000))
     decoder.add(request("in-time", 1, "traj_only", n=2, deadline_ms=3_000))
     decoder.add(request("whenever", 2, "traj_only", n=2))
