@@ -75,6 +75,8 @@ def serving(configuration: Path) -> Iterator[tuple[str, psutil.Process]]:
             env=os.environ | {"RAY_USAGE_STATS_ENABLED": "0"},
             stdout=told,
             stderr=told,
+            # A shell's background jobs ignore it, and `serve run` ends by nothing else.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
     try:
         until = time.monotonic() + START_S
