@@ -20,16 +20,15 @@ from model.formats.pieces import FormatError
 
 Ids = npt.NDArray[np.int64]
 
-GUESSES: Final = 24
-"""Decisions guessed from habits in a pass, over all its rows: two of three are right, but with many rows one
-that is wrong still holds up the pass, and what is fed costs more than it saves."""
-GUESSES_A_ROW: Final = 8
-"""And over one row: that all of more are right is rare."""
-REPEATS: Final = 768
-"""Tokens fed in a pass, over all its rows, as the last answers to the same pictures went on: mostly right, so
-what bounds them is how large a pass is still quick to make."""
-REPEATS_A_ROW: Final = 64
-"""And of one row: where a response leaves the last one, all behind is fed in vain."""
+_AHEAD: Final = 768
+"""Tokens fed ahead in a pass at most, over all its rows: with more it is too large to be quick."""
+_AHEAD_A_ROW: Final = 64
+"""And of one row: where a response leaves the last one to the same pictures, all behind is fed in vain."""
+_SURE: Final = 0.25
+"""Guesses from habits go on while the product of their shares is above this. A guess is right about as often
+as the root of its share: the number that selects it is the one that the sampler uses."""
+_MANY_ROWS: Final = 20
+"""With fewer rows a pass is mostly its own cost, so what may save one need not be as sure."""
 _HABITUAL: Final = 64
 """Decisions between more tokens than this (codes) are no matter of habit, unless they are a text's: what is
 said of a scene is said in much the same words of the next one."""
@@ -42,16 +41,12 @@ class Ahead:
     def __init__(self) -> None:
         self._habits, self._answers = Habits(), Answers()
 
-    def feed(
-        self, row: Row, *, copy: bool, guesses: int, repeats: int
-    ) -> tuple[list[int], list[tuple[int, Ids]]]:
+    def feed(self, row: Row, rows: int) -> tuple[list[int], list[tuple[int, Ids]]]:
         """A row's pending tokens and what may come behind them, and the decisions among both.
 
         Args:
             row: whose prompt is there.
-            copy: whether a revised plan is taken from the first one.
-            guesses: how many decisions at most are taken from habits.
-            repeats: how many tokens at most are fed as the last answer to the same pictures went on.
+            rows: that share the pass; 0 to feed nothing ahead.
 
         Returns:
             tokens: to be fed.
@@ -63,8 +58,10 @@ class Ahead:
         written, controls = len(row.tokens), row.request.controls
         ahead: list[int] = []
         context = [token.id for token in row.tokens[-_CONTEXT:]]
-        repeated = self._repeated(row)[:repeats]
-        copied: Sequence[int] = row.proposal() if copy else ()
+        most = min(_AHEAD_A_ROW, _AHEAD // rows) if rows else 0
+        least, sure = _SURE * min(1.0, rows / _MANY_ROWS), 1.0
+        repeated = self._repeated(row)[:most]
+        copied: Sequence[int] = row.proposal() if rows else ()
         while True:
             ids, place, token = cursor.allowed().ids, len(ahead), None
             decisions.append((len(tokens) + place - 1, ids))
@@ -72,10 +69,12 @@ class Ahead:
                 token = repeated[place]
             elif place < len(copied):
                 token = copied[place]
-            elif guesses and (len(ids) <= _HABITUAL or cursor.stop_id is not None):
-                guesses -= 1
+            elif place < most and (len(ids) <= _HABITUAL or cursor.stop_id is not None):
                 number = uniform(controls.seed, row.draws[0], written + place)
-                token = self._habits.likely(context, number if controls.temperature else None)
+                likely = self._habits.likely(context, number if controls.temperature else None)
+                if likely is not None:
+                    sure *= likely[1]
+                    token = likely[0] if sure > least else None
             if token is None:
                 break
             try:

@@ -22,7 +22,7 @@ from model.engines.engine import (
     Started,
 )
 from model.engines.requests import begin, branch_of, read
-from model.engines.torch.ahead import GUESSES, GUESSES_A_ROW, REPEATS, REPEATS_A_ROW, Ahead
+from model.engines.torch.ahead import Ahead
 from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
 from model.engines.torch.runner import ROWS_A_PROMPT, Feed, Prompt, Runner
@@ -54,9 +54,9 @@ class Shortcuts:
         jump: a forced run goes through the network in one pass with the token before it.
         shared_rows: draws that have written the same tokens are one row.
         shared_prompts: a scene's prompt is worked out and held once for all its draws.
-        speculate: a revised plan is fed as far as it may repeat the first one, any response as the last one
-            to the same pictures went on while it does, and, while few rows run, as others went on; what is
-            fed ahead is checked.
+        speculate: a revised plan is fed as far as it may repeat the first one, and any response as the last
+            one to the same pictures, or others, went on, as far as that is likely; what is fed ahead is
+            checked.
     """
 
     jump: bool = True
@@ -311,10 +311,7 @@ class Decoder:
         assert row.prompt is not None
         if not self._shortcuts.jump and len(row.pending) > 1:
             return Feed(row.prompt, row.held, row.pending[:1], ())
-        speculate, rows = self._shortcuts.speculate, len(self._rows)
-        guesses = min(GUESSES_A_ROW, GUESSES // rows) if speculate else 0
-        repeats = min(REPEATS_A_ROW, REPEATS // rows) if speculate else 0
-        tokens, wanted = self._ahead.feed(row, copy=speculate, guesses=guesses, repeats=repeats)
+        tokens, wanted = self._ahead.feed(row, len(self._rows) if self._shortcuts.speculate else 0)
         return Feed(row.prompt, row.held, tokens, wanted)
 
     def _apply(self, row: Row, feed: Feed, found: list[Logits]) -> list[StepEvent]:

@@ -25,20 +25,24 @@ class Habits:
 
     def saw(self, context: Sequence[int], token: int, times: int) -> None:
         """``token`` was chosen behind ``context``, so many times."""
-        for length in CONTEXTS:
-            key = tuple(context[-length:])
+        # Of a beginning, which is shorter than some of them, once.
+        for key in dict.fromkeys(tuple(context[-length:]) for length in CONTEXTS):
             counts = self._followed.setdefault(key, {})
             counts[token] = counts.get(token, 0) + times
             self._followed.move_to_end(key)
         while len(self._followed) > _MOST:
             self._followed.popitem(last=False)
 
-    def likely(self, context: Sequence[int], number: float | None) -> int | None:
+    def likely(self, context: Sequence[int], number: float | None) -> tuple[int, float] | None:
         """The token behind ``context`` that a random number in [0, 1) selects; None where nothing is known.
 
         The sampler selects with the same number in the same order of ids, so as far as habits are like the
         model's probabilities the two select the same token, however undecided both are. Without a number it
         is the most frequent token.
+
+        Returns:
+            token: the guess.
+            share: of what followed the context, as if something else had followed it once more.
         """
         for length in CONTEXTS:
             counts = self._followed.get(tuple(context[-length:]))
@@ -46,11 +50,13 @@ class Habits:
                 break
         else:
             return None
+        total = sum(counts.values())
         if number is None:
-            return max(counts, key=lambda token: counts[token])
-        left = number * sum(counts.values())
-        for token in sorted(counts):
-            left -= counts[token]
-            if left < 0:
-                return token
-        return max(counts)
+            token = max(counts, key=lambda token: counts[token])
+        else:
+            left = number * total
+            for token in sorted(counts):
+                left -= counts[token]
+                if left < 0:
+                    break
+        return token, counts[token] / (total + 1)

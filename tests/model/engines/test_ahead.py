@@ -36,7 +36,7 @@ def beginning(loaded: Loaded, **controls: Any) -> Row:
 
 def test_without_guesses_a_row_feeds_what_is_pending(loaded: Loaded) -> None:
     row = beginning(loaded)
-    tokens, decisions = Ahead().feed(row, copy=True, guesses=0, repeats=0)
+    tokens, decisions = Ahead().feed(row, rows=0)
     assert tokens == row.pending
     assert [place for place, _ in decisions] == [len(tokens) - 1]
 
@@ -48,7 +48,7 @@ def test_a_guess_is_what_the_draws_own_number_selects(loaded: Loaded) -> None:
         row, ahead = beginning(loaded, seed=seed), Ahead()
         ids = row.cursor.allowed().ids
         ahead.saw(row, len(ids), [(int(ids[0]), (0, 1, 2)), (int(ids[-1]), (3, 4, 5))])
-        tokens, decisions = ahead.feed(row, copy=False, guesses=1, repeats=0)
+        tokens, decisions = ahead.feed(row, rows=1)
         guess = tokens[len(row.pending)]
         assert guess == int(ids[0 if uniform(seed, 0, len(row.tokens)) < 0.5 else -1])
         assert len(decisions) == 2, "the decision guessed, and the next one, which is not"
@@ -56,11 +56,31 @@ def test_a_guess_is_what_the_draws_own_number_selects(loaded: Loaded) -> None:
     assert len(guessed) == 2
 
 
+def test_guesses_that_are_not_sure_are_made_while_few_rows_share_a_pass(loaded: Loaded) -> None:
+    row, ahead = beginning(loaded), Ahead()
+    ids = row.cursor.allowed().ids
+    ahead.saw(row, len(ids), [(int(token), (0,)) for token in ids[:8]])
+    assert len(ahead.feed(row, rows=4)[0]) > len(row.pending)
+    assert ahead.feed(row, rows=40)[0] == row.pending
+    ahead.saw(row, len(ids), [(int(ids[0]), tuple(range(56))), (int(ids[-1]), tuple(range(56)))])
+    assert len(ahead.feed(row, rows=40)[0]) > len(row.pending)
+
+
+def test_the_more_rows_the_less_of_the_last_answer_is_fed(loaded: Loaded) -> None:
+    ahead, first = Ahead(), beginning(loaded, seed=1)
+    while not first.cursor.done:
+        first.write((int(first.cursor.allowed().ids[-1]),), loaded.vocabulary)
+    ahead.finished(first)
+    row = beginning(loaded, seed=1)
+    few, many = (len(ahead.feed(row, rows=rows)[0]) - len(row.pending) for rows in (6, 96))
+    assert few > many > 0
+
+
 def test_at_temperature_zero_the_most_frequent_is_guessed(loaded: Loaded) -> None:
     row, ahead = beginning(loaded, temperature=0.0), Ahead()
     ids = row.cursor.allowed().ids
     ahead.saw(row, len(ids), [(int(ids[0]), (0,)), (int(ids[1]), (1, 2))])
-    tokens, _ = ahead.feed(row, copy=False, guesses=1, repeats=0)
+    tokens, _ = ahead.feed(row, rows=1)
     assert tokens[len(row.pending)] == int(ids[1])
 
 
@@ -75,7 +95,7 @@ def test_texts_are_guessed_though_any_word_may_follow(loaded: Loaded) -> None:
     ids = row.cursor.allowed().ids
     assert len(ids) > 64
     ahead.saw(row, len(ids), [(int(ids[5]), (0,))])
-    tokens, _ = ahead.feed(row, copy=False, guesses=1, repeats=0)
+    tokens, _ = ahead.feed(row, rows=1)
     assert tokens[len(row.pending) :] == [int(ids[5])]
 
 
@@ -85,7 +105,7 @@ def test_the_last_answer_to_the_same_pictures_is_repeated(loaded: Loaded) -> Non
         first.write((int(first.cursor.allowed().ids[-1]),), loaded.vocabulary)
     ahead.finished(first)
     row = beginning(loaded, seed=1)
-    tokens, decisions = ahead.feed(row, copy=False, guesses=0, repeats=64)
+    tokens, decisions = ahead.feed(row, rows=1)
     repeated = [token.id for token in first.tokens]
     assert tokens[1:] == repeated[: len(tokens) - 1]
     assert len(tokens) > len(row.pending) + 10
@@ -99,8 +119,8 @@ def test_a_response_that_goes_another_way_than_the_last_one_is_guessed_from_habi
     ahead.finished(first)
     row = beginning(loaded, seed=1)
     row.write((int(row.cursor.allowed().ids[0]),), loaded.vocabulary)
-    assert ahead.feed(row, copy=False, guesses=0, repeats=64)[0] == row.pending
+    assert ahead.feed(row, rows=1)[0] == row.pending
     ids = row.cursor.allowed().ids
     ahead.saw(row, len(ids), [(int(ids[1]), (0,))])
-    tokens, _ = ahead.feed(row, copy=False, guesses=1, repeats=64)
+    tokens, _ = ahead.feed(row, rows=1)
     assert tokens[len(row.pending)] == int(ids[1])
