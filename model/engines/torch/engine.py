@@ -25,6 +25,7 @@ from model.engines.engine import (
 from model.engines.torch.decoder import Counts, Decoder, Failed, Shortcuts
 from model.engines.torch.frames import Frames
 from model.engines.torch.runner import Runner
+from model.engines.torch.threads import fit_threads
 from model.engines.torch.worker import Worker
 from model.engines.warm_up import warm_up
 from model.network.checkpoint import load
@@ -78,6 +79,7 @@ class TorchEngine:
     def __init__(self, checkpoint: Path, settings: TorchSettings = TorchSettings()) -> None:
         self._settings = settings
         self._worker: Worker | None = Worker(_THREAD)
+        self._worker.submit(fit_threads).result()
         loading = self._worker.submit(lambda: load(checkpoint, settings.dtype, settings.device))
         self._loaded = loading.result()
         self._frames = Frames(self._loaded.inputs)
@@ -106,7 +108,9 @@ class TorchEngine:
         """Start the decoding thread and plan once for a grey scene in every format."""
         if self._decoding is not None:
             raise EngineError("the engine runs already")
-        self._worker = self._worker or Worker(_THREAD)
+        if self._worker is None:
+            self._worker = Worker(_THREAD)
+            self._worker.submit(fit_threads)
         self._broke = None
         # What was asked of a thread that broke is answered already.
         self._commands = queue.SimpleQueue()
