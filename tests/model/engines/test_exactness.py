@@ -33,8 +33,8 @@ REQUESTS, ROWS = ((1, 4), (10, 20)) if MIXES <= 100 else ((4, 16), (12, 64))
 """Of a mix; in a longer run many draws share the time of a pass."""
 CHECKPOINT = os.environ.get("LOOKTWICE_EXACTNESS_CHECKPOINT")
 TOGETHER = 6 if MIXES <= 100 else 3
-"""Mixes whose plain decoding is one batch: a token a pass takes as long for a hundred draws as for ten. Of large
-mixes fewer, or the memory that it reserves is more than machines have."""
+"""Mixes whose plain decoding is one batch: a token a pass takes as long for a hundred draws as for ten. Fewer
+of large mixes, or the memory that it reserves is more than machines have."""
 SEED = int(os.environ.get("LOOKTWICE_EXACTNESS_SEED", "0"))
 SCENES = [noisy_scene(index, route=index % 2 == 1) for index in range(4)]
 
