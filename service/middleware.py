@@ -63,7 +63,9 @@ class Around:
         method = scope["method"] if scope["method"] in _METHODS else "other"
         with (
             structlog.contextvars.bound_contextvars(request_id=request_id),
-            self._traces.request(method, scope["path"], Headers(scope=scope)) as span,
+            self._traces.request(
+                method, scope["path"], Headers(scope=scope), quiet=scope["path"] in _QUIET
+            ) as span,
         ):
             try:
                 await self._app(scope, receive, send_with_id)
@@ -80,12 +82,12 @@ class Around:
                 stopped = ProblemError(DRAINING, "the service stopped before this was answered; ask another")
                 await problem_response(stopped, request_id)(scope, receive, send_with_id)
             finally:
-                if span is not None:
-                    span.set_attribute("http.response.status_code", status)
-                self._account(scope, method, status, time.monotonic() - began_s)
+                route = getattr(scope.get("route"), "path", None)
+                span.answered(route, status)
+                self._account(scope, method, route, status, time.monotonic() - began_s)
 
-    def _account(self, scope: Scope, method: str, status: int, seconds: float) -> None:
-        endpoint = getattr(scope.get("route"), "path", _NO_ROUTE)
+    def _account(self, scope: Scope, method: str, route: str | None, status: int, seconds: float) -> None:
+        endpoint = route or _NO_ROUTE
         self._metrics.request_answered(endpoint, method, status, seconds)
         if endpoint not in _QUIET:
             log.info(

@@ -24,6 +24,13 @@ class PlanningSpan(Protocol):
         """The scene was planned for."""
 
 
+class RequestSpan(Protocol):
+    """The span of a request."""
+
+    def answered(self, route: str | None, status: int) -> None:
+        """It was answered; ``route`` is the template that its path fits, None where none does."""
+
+
 class Traces:
     """Where spans go to: nowhere, until a tracer is given.
 
@@ -35,19 +42,25 @@ class Traces:
         self._tracer = tracer
 
     @contextmanager
-    def request(self, method: str, path: str, headers: Mapping[str, str]) -> Generator[Any]:
-        """The span of an HTTP request, within the trace that its caller names (W3C ``traceparent``)."""
-        if self._tracer is None:
-            yield None
+    def request(
+        self, method: str, path: str, headers: Mapping[str, str], *, quiet: bool = False
+    ) -> Generator[RequestSpan]:
+        """The span of an HTTP request, within the trace that its caller names (W3C ``traceparent``).
+
+        Its name is the method until it is answered: paths are callers' and without number. A ``quiet``
+        request, a probe's, has none.
+        """
+        if self._tracer is None or quiet:
+            yield _Nowhere()
             return
         from opentelemetry.propagate import extract
         from opentelemetry.trace import SpanKind
 
         attributes = {"http.request.method": method, "url.path": path}
         with self._tracer.start_as_current_span(
-            f"{method} {path}", extract(headers), SpanKind.SERVER, attributes
+            method, extract(headers), SpanKind.SERVER, attributes
         ) as span:
-            yield span
+            yield _RequestSpan(span, method)
 
     @contextmanager
     def planning(
@@ -85,6 +98,24 @@ class Traces:
 class _Nowhere:
     def drew(self, draws: Sequence[Draw]) -> None:
         pass
+
+    def answered(self, route: str | None, status: int) -> None:
+        pass
+
+
+class _RequestSpan:
+    def __init__(self, span: Any, method: str) -> None:
+        self._span, self._method = span, method
+
+    def answered(self, route: str | None, status: int) -> None:
+        from opentelemetry.trace import StatusCode
+
+        self._span.set_attribute("http.response.status_code", status)
+        if route is not None:
+            self._span.update_name(f"{self._method} {route}")
+            self._span.set_attribute("http.route", route)
+        if status >= 500:
+            self._span.set_status(StatusCode.ERROR)
 
 
 class _Span:

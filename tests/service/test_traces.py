@@ -13,6 +13,7 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from opentelemetry.sdk.trace import TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 
+from model.engines.engine import EngineError
 from service.app import create_app
 from service.settings import Settings
 from service.traces import Traces, traces_from_environment
@@ -77,7 +78,10 @@ def test_a_plan_is_a_span_within_its_request_and_its_callers_trace(
         headers = {"traceparent": f"00-{trace_id}-b7ad6b7169203331-01"}
         http.post("/v1/plan", json=body(n=3, thinking="always", deadline_ms=9000), headers=headers)
         http.post("/v1/plan", json=body() | {"format": "haiku"})
-        served.until(lambda: sum(span.name.startswith("POST") for span in collector.spans) == 2)
+        http.get("/cars/7")
+        engine.failure = EngineError("broke")
+        http.post("/v1/plan", json=body())
+        served.until(lambda: sum(span.name.startswith("POST") for span in collector.spans) == 3)
     provider.shutdown()
     plan = next(span for span in collector.spans if span.name == "generate_content scripted")
     request = next(span for span in collector.spans if span.span_id == plan.parent_span_id)
@@ -90,8 +94,15 @@ def test_a_plan_is_a_span_within_its_request_and_its_callers_trace(
     assert told["gen_ai.usage.output_tokens"].int_value == 3 * 149
     assert told["looktwice.think_rate"].double_value == 1.0
     assert told["looktwice.deadline_ms"].int_value == 9000
+    names = [span.name for span in collector.spans if not span.name.startswith("generate")]
+    assert sorted(names) == ["GET", "POST /v1/plan", "POST /v1/plan", "POST /v1/plan"]
+    failed = [span for span in collector.spans if span.status.code == span.status.STATUS_CODE_ERROR]
+    assert [attributes(span)["http.response.status_code"].int_value for span in failed] == [503]
     refused = [span for span in collector.spans if span.name.startswith("generate") and span is not plan]
-    assert [attributes(span)["error.type"].string_value for span in refused] == ["unknown-format"]
+    assert [attributes(span)["error.type"].string_value for span in refused] == [
+        "unknown-format",
+        "engine-failed",
+    ]
 
 
 def test_nothing_is_sent_unless_asked_for() -> None:
