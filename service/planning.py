@@ -6,9 +6,9 @@ import asyncio
 import secrets
 import time
 from collections.abc import AsyncGenerator, Generator
-from contextlib import ExitStack, aclosing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, aclosing, contextmanager
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import structlog
 
@@ -49,6 +49,7 @@ _ANSWERING_MS: Final = 3
 """Of a deadline, left for writing the answer."""
 
 Asked = wire.PlanRequest | wire.ReflectRequest
+_Held = TypeVar("_Held")
 
 log = structlog.stdlib.get_logger()
 
@@ -119,9 +120,7 @@ class Planning:
     @contextmanager
     def batch(self, scenes: int) -> Generator[None]:
         """Let a batch in until it is answered; raises `ProblemError` where there are too many."""
-        with self._lifecycle.accepted(), ExitStack() as stack:
-            with full_as_problem():
-                stack.enter_context(self._admission.batch(scenes))
+        with self._lifecycle.accepted(), let_in(self._admission.batch(scenes)):
             yield
 
     async def spend(self, owner: str, draws: int) -> None:
@@ -138,9 +137,7 @@ class Planning:
         Raises:
             ProblemError: at the first iteration where it is not let in; later where it fails.
         """
-        with self._lifecycle.accepted(), ExitStack() as stack:
-            with full_as_problem():
-                place = stack.enter_context(self._admission.place(asked.controls.n))
+        with self._lifecycle.accepted(), let_in(self._admission.place(asked.controls.n)) as place:
             await self.spend(arrival.owner, asked.controls.n)
             async with aclosing(self._plan(asked, arrival, place)) as events:
                 async for event in events:
@@ -248,6 +245,15 @@ def full_as_problem() -> Generator[None]:
         yield
     except Full as full:
         raise ProblemError(QUEUE_FULL, str(full), retry_after_s=whole_seconds(full.retry_after_s)) from None
+
+
+@contextmanager
+def let_in(place: AbstractContextManager[_Held]) -> Generator[_Held]:
+    """Hold what an `Admission` gives until the block ends; raises `ProblemError` where it is full."""
+    with ExitStack() as stack:
+        with full_as_problem():
+            held = stack.enter_context(place)
+        yield held
 
 
 def _met(deadline_ms: int | None, arrival: Arrival) -> bool | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Header, Request
@@ -92,16 +93,12 @@ IdempotencyKey = Annotated[
 def planning_router(parts: Parts) -> APIRouter:
     """The endpoints that the engine works for."""
 
-    def check_open(request: Request) -> None:
+    def check_open(request: Request, *, batch: bool = False) -> None:
         if not _made_before(request, parts):
-            parts.planning.check_open()
-
-    def check_open_for_batch(request: Request) -> None:
-        if not _made_before(request, parts):
-            parts.planning.check_open(batch=True)
+            parts.planning.check_open(batch=batch)
 
     router = APIRouter(route_class=payload_route(check_open), tags=["planning"])
-    batches = APIRouter(route_class=payload_route(check_open_for_batch), tags=["planning"])
+    batches = APIRouter(route_class=payload_route(partial(check_open, batch=True)), tags=["planning"])
     refusals = problems(*REFUSALS)
 
     @router.post(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-from contextlib import ExitStack
 from typing import Any, Final
 
 import prometheus_client
@@ -21,7 +20,7 @@ from service.openai_routes import openai_router
 from service.openapi import Responses, payloads, problems
 from service.parts import Parts
 from service.payloads import payload_route
-from service.planning import full_as_problem
+from service.planning import full_as_problem, let_in
 from service.planning_routes import arrival_of, planning_router, respond
 from service.problems import (
     BODY_TIMEOUT,
@@ -101,9 +100,7 @@ def _add_labelling(router: APIRouter, parts: Parts) -> None:
     async def write_label(request: Request, asked: wire.LabelRequest) -> Any:
         """Why a plan is less good than another: a teacher's paragraph, checked, to train on."""
         arrival = arrival_of(request)
-        with parts.lifecycle.accepted(), ExitStack() as stack:
-            with full_as_problem():
-                stack.enter_context(admission.place(1))
+        with parts.lifecycle.accepted(), let_in(admission.place(1)):
             await parts.planning.spend(arrival.owner, 1)
             written = label(asked, parts.teacher, parts.metrics, arrival.request_id)
             return respond(request, await while_connected(request, written))

@@ -277,8 +277,7 @@ def _row(name: str, load: Workload, replies: Sequence[Mapping[str, Any]]) -> Row
         passes_per_response=statistics.mean(each["passes"] for each in responses),
         tokens_per_response=statistics.mean(each["tokens"] for each in responses),
         valid_share=statistics.mean(each["valid"] for each in responses),
-        forced_share=1
-        - sum(each["chosen"] for each in responses) / sum(each["tokens"] for each in responses),
+        forced_share=1 - sum(each["chosen"] for each in responses) / tokens,
         peak_bytes=max(reply["peak_bytes"] for reply in replies),
         counts={key: sum(reply["counts"][key] for reply in replies) / plans for key in keys},
     )

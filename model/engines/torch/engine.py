@@ -73,13 +73,18 @@ class TorchSettings:
         return cls(rows=rows, dtype=torch.bfloat16, products=None, device=device)
 
 
+def _worker() -> Worker:
+    worker = Worker(_THREAD)
+    worker.submit(fit_threads)
+    return worker
+
+
 class TorchEngine:
     """`model.engines.engine.Engine` over a checkpoint folder; see there for the contract."""
 
     def __init__(self, checkpoint: Path, settings: TorchSettings = TorchSettings()) -> None:
         self._settings = settings
-        self._worker: Worker | None = Worker(_THREAD)
-        self._worker.submit(fit_threads).result()
+        self._worker: Worker | None = _worker()
         loading = self._worker.submit(lambda: load(checkpoint, settings.dtype, settings.device))
         self._loaded = loading.result()
         self._frames = Frames(self._loaded.inputs)
@@ -108,9 +113,7 @@ class TorchEngine:
         """Start the decoding thread and plan once for a grey scene in every format."""
         if self._decoding is not None:
             raise EngineError("the engine runs already")
-        if self._worker is None:
-            self._worker = Worker(_THREAD)
-            self._worker.submit(fit_threads)
+        self._worker = self._worker or _worker()
         self._broke = None
         # What was asked of a thread that broke is answered already.
         self._commands = queue.SimpleQueue()

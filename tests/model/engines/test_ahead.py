@@ -34,6 +34,14 @@ def beginning(loaded: Loaded, **controls: Any) -> Row:
     return row
 
 
+def whole(loaded: Loaded) -> Row:
+    """A row that has written a response of its last choices."""
+    row = beginning(loaded, seed=1)
+    while not row.cursor.done:
+        row.write((int(row.cursor.allowed().ids[-1]),), loaded.vocabulary)
+    return row
+
+
 def test_without_guesses_a_row_feeds_what_is_pending(loaded: Loaded) -> None:
     row = beginning(loaded)
     tokens, decisions = Ahead().feed(row, rows=0)
@@ -67,9 +75,7 @@ def test_guesses_that_are_not_sure_are_made_while_few_rows_share_a_pass(loaded: 
 
 
 def test_the_more_rows_the_less_of_the_last_answer_is_fed(loaded: Loaded) -> None:
-    ahead, first = Ahead(), beginning(loaded, seed=1)
-    while not first.cursor.done:
-        first.write((int(first.cursor.allowed().ids[-1]),), loaded.vocabulary)
+    ahead, first = Ahead(), whole(loaded)
     ahead.finished(first)
     row = beginning(loaded, seed=1)
     few, many = (len(ahead.feed(row, rows=rows)[0]) - len(row.pending) for rows in (6, 96))
@@ -100,9 +106,7 @@ def test_texts_are_guessed_though_any_word_may_follow(loaded: Loaded) -> None:
 
 
 def test_the_last_answer_to_the_same_pictures_is_repeated(loaded: Loaded) -> None:
-    ahead, first = Ahead(), beginning(loaded, seed=1)
-    while not first.cursor.done:
-        first.write((int(first.cursor.allowed().ids[-1]),), loaded.vocabulary)
+    ahead, first = Ahead(), whole(loaded)
     ahead.finished(first)
     row = beginning(loaded, seed=1)
     tokens, decisions = ahead.feed(row, rows=1)
@@ -113,9 +117,7 @@ def test_the_last_answer_to_the_same_pictures_is_repeated(loaded: Loaded) -> Non
 
 
 def test_a_response_that_goes_another_way_than_the_last_one_is_guessed_from_habits(loaded: Loaded) -> None:
-    ahead, first = Ahead(), beginning(loaded, seed=1)
-    while not first.cursor.done:
-        first.write((int(first.cursor.allowed().ids[-1]),), loaded.vocabulary)
+    ahead, first = Ahead(), whole(loaded)
     ahead.finished(first)
     row = beginning(loaded, seed=1)
     row.write((int(row.cursor.allowed().ids[0]),), loaded.vocabulary)

@@ -13,20 +13,19 @@ PROMPTS = (5, 3, 9)
 HEADS, GROUPS, WIDTH = 4, 2, 8
 
 
+def empty(*, layers: int, rows: int, length: int, dtype: torch.dtype) -> KvRows:
+    cpu = torch.device("cpu")
+    return KvRows(
+        layers=layers, heads=GROUPS, head_dim=WIDTH, rows=rows, length=length, dtype=dtype, device=cpu
+    )
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_each_token_sees_its_prompt_and_what_its_draw_has_written(seed: int) -> None:
     """Passes over draws that part and write by chance, against attention worked out draw by draw."""
     random = np.random.default_rng(seed)
     torch.manual_seed(seed)
-    memory = KvRows(
-        layers=2,
-        heads=GROUPS,
-        head_dim=WIDTH,
-        rows=4,
-        length=200,
-        dtype=torch.float64,
-        device=torch.device("cpu"),
-    )
+    memory = empty(layers=2, rows=4, length=200, dtype=torch.float64)
     prompts = [torch.randn(2, 2, GROUPS, length, WIDTH, dtype=torch.float64) for length in PROMPTS]
     for row, prompt in enumerate(prompts):
         memory.row(row, prompt.shape[-2]).copy_(prompt)
@@ -63,15 +62,7 @@ def test_each_token_sees_its_prompt_and_what_its_draw_has_written(seed: int) -> 
 
 
 def test_a_scene_that_sees_far_leaves_the_others_their_span() -> None:
-    memory = KvRows(
-        layers=1,
-        heads=GROUPS,
-        head_dim=WIDTH,
-        rows=3,
-        length=3000,
-        dtype=torch.float32,
-        device=torch.device("cpu"),
-    )
+    memory = empty(layers=1, rows=3, length=3000, dtype=torch.float32)
     written = Places(3, 40).write([Fed(0, 0, 8), Fed(1, 0, 8), Fed(2, 0, 8)], (20, 2000, 30))
     spans = [mask.shape[-1] for _, mask in DrawPass(HEADS, memory, written, 24)._parts]
     assert spans == [32, 2016, 64]
