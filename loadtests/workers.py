@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import gc
 import multiprocessing
+import os
+import threading
 import time
 from multiprocessing.connection import Connection
 from typing import Final
@@ -75,7 +77,16 @@ def _told(pipe: Connection[object, object]) -> object:
         raise WorkerDied("a worker process of the load generator died; its own output says why") from None
 
 
+def _end_with_parent() -> None:
+    """A generator that was killed must not go on sending: the next run would share the service with it."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
 def _work(load: Load, target: Target, pipe: Connection[object, object]) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     pipe.send("ready")
     starts_at = pipe.recv()
     assert isinstance(starts_at, float)

@@ -21,6 +21,7 @@ from model.bench.memory import peak_bytes
 from model.bench.workload import Workload
 from model.driving.scene_store import read_scenes
 from model.engines.engine import PlanRequest
+from model.network.precision import bfloat16_is_fast
 
 _ROWS = 96
 _MAX_TOKENS = 600
@@ -28,20 +29,26 @@ _MAX_TOKENS = 600
 
 
 def contenders(names: list[str], checkpoint: Path, device: str) -> dict[str, Contender]:
-    """The contenders of one process; those with ``vllm`` in their name share one engine."""
+    """The contenders of one process; those with ``vllm`` in their name share one engine.
+
+    All work in what the device multiplies fast, as ours does by itself.
+    """
     made: dict[str, Contender] = {}
+    dtype = "bfloat16" if bfloat16_is_fast(device) else "float32"
     for name in names:
         if name.startswith("vllm"):
             from model.engines.vllm.engine import VllmEngine, VllmSettings
 
             if "vllm-grammar" not in made:
-                engine = VllmEngine(checkpoint, VllmSettings(_ROWS, "bfloat16", {"enforce_eager": True}))
+                engine = VllmEngine(checkpoint, VllmSettings(_ROWS, dtype, {"enforce_eager": True}))
                 made["vllm-grammar"] = EngineContender(engine)
                 made["vllm"] = PlainVllm(checkpoint, engine, _MAX_TOKENS)
         elif name == "transformers":
             import torch
 
-            made[name] = Transformers(checkpoint, dtype=torch.bfloat16, device=device, max_tokens=_MAX_TOKENS)
+            made[name] = Transformers(
+                checkpoint, dtype=getattr(torch, dtype), device=device, max_tokens=_MAX_TOKENS
+            )
         else:
             made[name] = EngineContender(_torch_engine(name, checkpoint, device))
     return made

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from model.driving.plan import Plan
 from model.engines.engine import Branch, Draw, ModelCard, PlanRequest, RequestError
 from model.engines.response import Response
-from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat, Cursor
 from model.formats.pieces import ACTION, BRANCH, THINKING, FormatError
 from model.formats.text import parse
@@ -56,7 +55,7 @@ def read(
         FormatError: the text is no response of the format.
     """
     text = vocabulary.decode([token.id for token in response.tokens])
-    values = parse(FORMATS[request.format], text)
+    values = parse(response.cursor.compiled.format, text)
     codes, branch, thinking = values["trajectory"], values.get(BRANCH), values.get("thinking")
     assert isinstance(codes, tuple)
     plan, revised = values.get("plan"), values.get("revised_plan")

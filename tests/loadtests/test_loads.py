@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import signal
+import subprocess
+import sys
 import time
-from itertools import pairwise
+from collections.abc import Callable
+from itertools import count, pairwise
 
 import numpy as np
 
@@ -78,3 +82,30 @@ def test_work_split_between_workers_is_the_same_work() -> None:
     assert again == [(due_s, CALLS[(4 + due_s) % 10].body) for due_s in range(7)]
     fleet = Fleet(tuple(Planner(CALLS, 0.1, offset) for offset in (0.0, 0.01, 0.02)), 1)
     assert {planner.offset_s for part in fleet.split(2) for planner in part.planners} == {0.0, 0.01, 0.02}
+
+
+def test_a_generator_that_is_killed_sends_no_more() -> None:
+    service = StandIn()
+    asks = ["loadtest", "--rate", "20", "--seconds", "300", "--distinct", "4", "--service"]
+    with standing_in(service) as url:
+        generator = subprocess.Popen([sys.executable, "-m", "service.cli", *asks, url])
+        try:
+            wait_until(lambda: len(service.seen) > 5, 60)
+        finally:
+            generator.send_signal(signal.SIGKILL)
+            generator.wait()
+        seen = [-1]
+
+        def silent() -> bool:
+            seen.append(len(service.seen))
+            return seen[-1] == seen[-2]
+
+        wait_until(silent, 20, every_s=1.0)
+
+
+def wait_until(holds: Callable[[], bool], most_s: float, every_s: float = 0.1) -> None:
+    for tried in count():
+        if holds():
+            return
+        assert tried * every_s < most_s
+        time.sleep(every_s)

@@ -23,6 +23,7 @@ from model.engines.torch.packed import PackedDecoder, Rotation, pass_size
 from model.engines.torch.places import Fed, Places
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat
+from model.formats.pieces import Format
 from model.network.checkpoint import Loaded
 
 ROWS_A_PROMPT: Final = 12
@@ -100,6 +101,7 @@ class Runner:
         clip_bytes: of vision tokens kept for pictures that come again, and as many of keys and values.
         frames: where pictures are decoded; by default a new one.
         products: what matrix products are worked out in; None for the weights' own type.
+        formats: of them those that the checkpoint writes are served.
 
     Attributes:
         prompt_tokens: that the longest prompt holds.
@@ -114,11 +116,12 @@ class Runner:
         clip_bytes: int = 0,
         frames: Frames | None = None,
         products: torch.dtype | None = None,
+        formats: Mapping[str, Format] = FORMATS,
     ) -> None:
         self.loaded = loaded
         self.rows, self.prompts = rows, prompts or rows
         self.formats = {
-            name: CompiledFormat(FORMATS[name], loaded.vocabulary) for name in loaded.card.formats
+            name: CompiledFormat(formats[name], loaded.vocabulary) for name in loaded.card.formats
         }
         # A draw's row holds the prompt's last token too.
         length = 1 + max(format.longest() for format in self.formats.values())

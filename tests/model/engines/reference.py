@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from model.engines.engine import Draw, PlanRequest
 from model.engines.torch.sampler import choose, probabilities, uniform
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat, Token
-from model.formats.pieces import BRANCH
+from model.formats.pieces import BRANCH, Format
 from model.formats.text import parse
 from model.network.checkpoint import Loaded
 
@@ -49,12 +50,15 @@ def exactly(loaded: Loaded) -> Loaded:
     return loaded
 
 
-def reference_draws(loaded: Loaded, request: PlanRequest) -> list[Draw]:
+def reference_draws(
+    loaded: Loaded, request: PlanRequest, formats: Mapping[str, Format] = FORMATS
+) -> list[Draw]:
     """All draws of a request, each from its own prompt."""
-    return [_draw(loaded, request, index) for index in range(request.controls.n)]
+    format = formats[request.format]
+    return [_draw(loaded, request, format, index) for index in range(request.controls.n)]
 
 
-def _draw(loaded: Loaded, request: PlanRequest, index: int) -> Draw:
+def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> Draw:
     model: Any = loaded.model
     controls = request.controls
     inputs = loaded.inputs.build(request.scene, request.format)
@@ -67,7 +71,7 @@ def _draw(loaded: Loaded, request: PlanRequest, index: int) -> Draw:
         use_cache=True,
     ).logits[0, -1]
     given = {} if controls.prefill is None else {"plan": controls.prefill}
-    cursor = CompiledFormat(FORMATS[request.format], loaded.vocabulary).start(given)
+    cursor = CompiledFormat(format, loaded.vocabulary).start(given)
     tokens: list[Token] = []
     think_probability = None
     while not cursor.done:
@@ -93,7 +97,7 @@ def _draw(loaded: Loaded, request: PlanRequest, index: int) -> Draw:
             use_cache=True,
         ).logits[0, -1]
     text = loaded.vocabulary.decode([token.id for token in tokens])
-    values: Any = parse(FORMATS[request.format], text)
+    values: Any = parse(format, text)
     return Draw(
         index=index,
         text=text,

@@ -1,4 +1,4 @@
-"""The gate: no shortcut, batch, arrival, cancellation or chunk changes a response. In float64.
+"""The gate: no shortcut, batch, arrival, cancellation or chunk changes a response, in any format. In float64.
 
 `LOOKTWICE_EXACTNESS_MIXES=2000 pytest -s tests/model/engines/test_exactness.py` looks longer,
 `LOOKTWICE_EXACTNESS_SEED=7` at other mixes, and `LOOKTWICE_EXACTNESS_CHECKPOINT=model/bundled/looktwice-nano`
@@ -8,7 +8,7 @@ at a trained network, whose responses are shorter.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -22,9 +22,12 @@ from model.driving.plan import plan_from_bins
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thinking
 from model.engines.torch.decoder import Decoder, Failed, Shortcuts
 from model.engines.torch.runner import Runner
+from model.formats.cf_vla import FORMATS
+from model.formats.pieces import Format
 from model.network.checkpoint import Loaded, load
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.model.engines.reference import exactly, reference_draws
+from tests.model.formats.strategies import branching_formats
 
 pytestmark = pytest.mark.filterwarnings("ignore:Generating overly large repr")
 
@@ -100,6 +103,13 @@ mixes = st.builds(
 )
 
 
+Formats = Mapping[str, Format]
+made_up: st.SearchStrategy[Formats] = st.one_of(
+    st.just(FORMATS), branching_formats().map(lambda format: {**FORMATS, "cf_vla": format})
+)
+"""Those that there are, or one that nobody thought of in the place of `cf_vla`."""
+
+
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> Loaded:
     folder = CHECKPOINT or write_untrained(tmp_path_factory.mktemp("narrow") / "untrained", narrow=True)
@@ -135,10 +145,11 @@ def decode(decoder: Decoder, mix: list[Arrival]) -> dict[tuple[str, int], Draw]:
 compared = 0
 
 
-def plainly(exact: Loaded, requests: list[PlanRequest]) -> dict[tuple[str, int], Draw]:
+def plainly(exact: Loaded, requests: list[PlanRequest], formats: Formats) -> dict[tuple[str, int], Draw]:
     """What the decoder without shortcuts writes for requests that arrive together and stay."""
     rows = sum(2 * request.controls.n for request in requests)
-    decoder = Decoder(Runner(exact, rows, prompts=rows // 2), Shortcuts.none(), clock=lambda: 0.0)
+    runner = Runner(exact, rows, prompts=rows // 2, formats=formats)
+    decoder = Decoder(runner, Shortcuts.none(), clock=lambda: 0.0)
     return decode(decoder, [Arrival(request, 0, None) for request in requests])
 
 
@@ -154,14 +165,15 @@ def named(mix: int, request: PlanRequest) -> PlanRequest:
     suppress_health_check=list(HealthCheck),
     database=None,
 )
-@given(together=st.lists(mixes, min_size=TOGETHER, max_size=TOGETHER))
-def test_nothing_that_makes_it_fast_changes_a_response(exact: Loaded, together: list[Mix]) -> None:
+@given(together=st.lists(mixes, min_size=TOGETHER, max_size=TOGETHER), made_up=made_up)
+def test_nothing_that_makes_it_fast_changes_a_response(
+    exact: Loaded, together: list[Mix], made_up: Formats
+) -> None:
     global compared
-    plain = plainly(
-        exact, [named(number, each.request) for number, mix in enumerate(together) for each in mix.arrivals]
-    )
+    requests = [named(number, each.request) for number, mix in enumerate(together) for each in mix.arrivals]
+    plain = plainly(exact, requests, made_up)
     for number, mix in enumerate(together):
-        runner = Runner(exact, mix.rows, clip_bytes=1 << 20)
+        runner = Runner(exact, mix.rows, clip_bytes=1 << 20, formats=made_up)
         decoder = Decoder(runner, mix.shortcuts, prompt_chunk=mix.chunk, clock=lambda: 0.0)
         fast = decode(decoder, mix.arrivals)
         assert {each.request.request_id for each in mix.arrivals if each.cancelled is None} <= {
@@ -182,10 +194,12 @@ def test_nothing_that_makes_it_fast_changes_a_response(exact: Loaded, together: 
     suppress_health_check=list(HealthCheck),
     database=None,
 )
-@given(mix=arrivals())
-def test_the_decoder_without_shortcuts_is_the_one_of_transformers(exact: Loaded, mix: list[Arrival]) -> None:
-    draws = plainly(exact, [each.request for each in mix])
-    for reference in reference_draws(exact, mix[0].request):
+@given(mix=arrivals(), made_up=made_up)
+def test_the_decoder_without_shortcuts_is_the_one_of_transformers(
+    exact: Loaded, mix: list[Arrival], made_up: Formats
+) -> None:
+    draws = plainly(exact, [each.request for each in mix], made_up)
+    for reference in reference_draws(exact, mix[0].request, made_up):
         same(draws[mix[0].request.request_id, reference.index], reference)
 
 

@@ -12,7 +12,7 @@ from model.formats.cf_vla import CF_VLA, FORMATS, MAX_THINKING_TOKENS, TRAJ_ONLY
 from model.formats.cursor import CompiledFormat, Cursor, Token
 from model.formats.pieces import MAX_SEGMENTS, Choice, Format, FormatError, Literal, Option, Values
 from model.formats.text import parse
-from tests.model.formats.strategies import cf_vla_values, plans
+from tests.model.formats.strategies import branching_formats, cf_vla_values, plans
 from tests.model.formats.vocabulary import ByteVocabulary
 
 VOCABULARY = ByteVocabulary()
@@ -59,6 +59,15 @@ def test_whatever_is_written_parses_and_renders_back(name: str, seed: int) -> No
     rendered = compiled.render(values)
     keep = [token for token in tokens if token.section != "thinking"]
     assert [token for token in rendered if token.section != "thinking"] == keep
+
+
+@given(branching_formats(), st.integers(0, 2**32 - 1))
+def test_whatever_is_written_in_a_made_up_format_parses(format: Format, seed: int) -> None:
+    compiled = CompiledFormat(format, VOCABULARY)
+    tokens = walk(compiled.start(), seed)
+    assert len(tokens) <= compiled.longest()
+    values = parse(format, VOCABULARY.decode([token.id for token in tokens]))
+    assert {token.section for token in tokens} >= values.keys() >= {"plan", "branch", "trajectory"}
 
 
 @given(plans(), st.integers(0, 1000))
