@@ -25,7 +25,7 @@ from model.engines.engine import (
 from model.engines.torch.decoder import Counts, Decoder, Failed, Shortcuts
 from model.engines.torch.frames import Frames
 from model.engines.torch.runner import Runner
-from model.engines.torch.threads import fit_threads
+from model.engines.torch.threads import FreeCores, fit_threads
 from model.engines.torch.worker import Worker
 from model.engines.warm_up import warm_up
 from model.network.checkpoint import load
@@ -193,7 +193,10 @@ class TorchEngine:
                 decoder = Decoder(runner, settings.shortcuts, clock=time.monotonic)
                 self._counts = decoder.counts
                 runner.warm_up(_WARM_TOKENS)
+                cores = FreeCores(torch.get_num_threads())
                 while self._obey(decoder):
+                    if cores.threads != cores.look():
+                        torch.set_num_threads(cores.threads)
                     events = decoder.step()
                     # Before anybody hears of an end: who asks then must not find its rows in use.
                     self._rows_used = decoder.rows_used

@@ -1,15 +1,25 @@
-"""How many CPU threads a container may really use."""
+"""How many CPU threads an engine may use, and how many of them have a core to themselves."""
 
 from __future__ import annotations
 
 import math
 import os
+import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 
 _CGROUP: Final = Path("/sys/fs/cgroup")
+_STAT: Final = Path("/proc/stat")
+_EVERY_S: Final = 1.0
+_STALE_S: Final = 5.0
+"""What cores did longer ago than this says nothing about now."""
+_WAIT_S: Final = 5.0
+"""A core that was in use must be free for so long before a thread is put on it again."""
+_SPARE: Final = 0.25
+"""Of a core, that others may use while a thread of ours still counts as having it."""
 
 
 def granted_cpus(cgroup: Path = _CGROUP) -> int | None:
@@ -41,3 +51,68 @@ def fit_threads() -> None:
     granted = granted_cpus()
     if granted is not None and "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(min(granted, torch.get_num_threads()))
+
+
+class CpuTimes(NamedTuple):
+    """Seconds that processors worked for others, or were kept from working for anybody here, since some time
+    long ago; and how many processors there are."""
+
+    others_s: float
+    processors: int
+
+
+def cpu_times(stat: Path = _STAT) -> CpuTimes | None:
+    """From the kernel's count of all processors, less what this process used; None where there is none."""
+    try:
+        lines = stat.read_text().splitlines()
+    except OSError:
+        return None
+    user, nice, system, _, _, irq, softirq, stolen, *_ = map(int, lines[0].split()[1:])
+    ticks = user + nice + system + irq + softirq + stolen
+    own = os.times()
+    processors = sum(line.startswith("cpu") for line in lines) - 1
+    return CpuTimes(ticks / os.sysconf("SC_CLK_TCK") - own.user - own.system, processors)
+
+
+class FreeCores:
+    """How many threads to use: as many as have a core to themselves.
+
+    The threads of an operation wait for the last of them, and a pass is hundreds of operations. Where
+    something else wants one of two cores (a planner on the same machine, a neighbour on the same host), two
+    threads take three to ten times as long as one.
+
+    Args:
+        most: threads that may be used.
+        read: what the machine's processors did.
+        clock: seconds, ever growing.
+
+    Attributes:
+        threads: to be used now.
+    """
+
+    def __init__(
+        self,
+        most: int,
+        read: Callable[[], CpuTimes | None] = cpu_times,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.threads = self._most = most
+        self._read, self._clock = read, clock
+        self._before, self._read_s, self._crowded_s = read(), clock(), -math.inf
+
+    def look(self) -> int:
+        """``threads``, after a look at the machine where the last one was a while ago."""
+        now_s = self._clock()
+        past_s = now_s - self._read_s
+        if self._most == 1 or self._before is None or past_s < _EVERY_S:
+            return self.threads
+        before, self._before, self._read_s = self._before, self._read(), now_s
+        if self._before is None or past_s > _STALE_S:
+            return self.threads
+        free = self._before.processors - (self._before.others_s - before.others_s) / past_s
+        fitting = min(self._most, max(1, math.floor(free + _SPARE)))
+        if fitting <= self.threads and fitting < self._most:
+            self._crowded_s = now_s
+        if fitting < self.threads or now_s - self._crowded_s >= _WAIT_S:
+            self.threads = fitting
+        return self.threads

@@ -1,11 +1,17 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 
 from model.engines.torch import threads
+from model.engines.torch.threads import CpuTimes, FreeCores, cpu_times
 from model.engines.torch.worker import Worker
 
 
@@ -45,3 +51,84 @@ def test_the_engines_thread_uses_no_more(monkeypatch: pytest.MonkeyPatch) -> Non
         assert worker.submit(torch.get_num_threads).result() == 1
     finally:
         worker.close()
+
+
+class Machine:
+    """Eight processors, so many of them in use by others, and a clock."""
+
+    def __init__(self, most: int = 8) -> None:
+        self.now_s, self.others_s, self.known = 0.0, 0.0, True
+        self.cores = FreeCores(most, self.read, lambda: self.now_s)
+
+    def read(self) -> CpuTimes | None:
+        return CpuTimes(self.others_s, 8) if self.known else None
+
+    def after(self, seconds: float, others: float) -> int:
+        self.now_s += seconds
+        self.others_s += seconds * others
+        return self.cores.look()
+
+
+def test_a_core_that_others_want_is_left_to_them_at_once() -> None:
+    machine = Machine()
+    assert machine.after(1, others=0.2) == 8
+    assert machine.after(1, others=0.5) == 7
+    assert machine.after(1, others=3.0) == 5
+    assert machine.after(1, others=20.0) == 1
+
+
+def test_a_core_is_taken_again_when_it_was_free_for_a_while() -> None:
+    machine = Machine()
+    assert machine.after(1, others=6.0) == 2
+    assert [machine.after(1, others=0.0) for _ in range(5)] == [2, 2, 2, 2, 8]
+    assert machine.after(1, others=6.0) == 2
+    assert [machine.after(1, others=other) for other in (0.0, 0.0, 6.0, 0.0, 0.0, 0.0, 0.0)] == [2] * 7
+    assert machine.after(1, others=0.0) == 8
+
+
+def test_no_more_are_used_than_are_granted() -> None:
+    machine = Machine(most=2)
+    assert machine.after(1, others=5.0) == 2
+    assert machine.after(1, others=6.9) == 1
+    assert [machine.after(2, others=5.0) for _ in range(3)] == [1, 1, 2]
+
+
+def test_what_was_long_ago_and_what_is_not_known_change_nothing() -> None:
+    machine = Machine()
+    assert machine.after(60, others=8.0) == 8
+    assert machine.after(0.5, others=8.0) == 8, "looked at a moment ago"
+    machine.known = False
+    assert machine.after(1, others=8.0) == 8
+    assert machine.after(1, others=8.0) == 8
+
+
+def test_what_the_kernel_tells(tmp_path: Path) -> None:
+    stat = tmp_path / "stat"
+    stat.write_text("cpu  100 20 30 4000 50 6 7 80 9 0\ncpu0 1 1\ncpu1 1 1\nintr 5\nctxt 6\n")
+    own = os.times()
+    told = cpu_times(stat)
+    assert told is not None
+    assert told.processors == 2
+    assert told.others_s == pytest.approx(243 / os.sysconf("SC_CLK_TCK") - own.user - own.system, abs=0.5)
+    assert cpu_times(tmp_path / "none") is None
+
+
+@pytest.fixture
+def crowd() -> Iterator[None]:
+    """As many processes that never rest as there are processors."""
+    everyone = [subprocess.Popen([sys.executable, "-c", "while 1: 0"]) for _ in range(os.cpu_count() or 1)]
+    yield
+    for each in everyone:
+        each.kill()
+        each.wait()
+
+
+@pytest.mark.skipif(cpu_times() is None, reason="this system does not tell what processors do")
+@pytest.mark.usefixtures("crowd")
+def test_on_a_crowded_machine_one_thread_is_used() -> None:
+    cores = FreeCores(os.cpu_count() or 1)
+    for _ in range(20):
+        time.sleep(1.1)
+        if cores.look() == 1:
+            return
+    raise AssertionError(cores.threads)
