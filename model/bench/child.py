@@ -21,7 +21,7 @@ from model.bench.memory import peak_bytes
 from model.bench.workload import Workload
 from model.driving.scene_store import read_scenes
 from model.engines.engine import PlanRequest
-from model.network.precision import bfloat16_is_fast
+from model.network.precision import fast_dtype
 
 _ROWS = 96
 _MAX_TOKENS = 600
@@ -34,21 +34,20 @@ def contenders(names: list[str], checkpoint: Path, device: str) -> dict[str, Con
     All work in what the device multiplies fast, as ours does by itself.
     """
     made: dict[str, Contender] = {}
-    dtype = "bfloat16" if bfloat16_is_fast(device) else "float32"
+    dtype = fast_dtype(device)
     for name in names:
         if name.startswith("vllm"):
             from model.engines.vllm.engine import VllmEngine, VllmSettings
 
             if "vllm-grammar" not in made:
-                engine = VllmEngine(checkpoint, VllmSettings(_ROWS, dtype, {"enforce_eager": True}))
+                engine = VllmEngine(
+                    checkpoint,
+                    VllmSettings(_ROWS, str(dtype).removeprefix("torch."), {"enforce_eager": True}),
+                )
                 made["vllm-grammar"] = EngineContender(engine)
                 made["vllm"] = PlainVllm(checkpoint, engine, _MAX_TOKENS)
         elif name == "transformers":
-            import torch
-
-            made[name] = Transformers(
-                checkpoint, dtype=getattr(torch, dtype), device=device, max_tokens=_MAX_TOKENS
-            )
+            made[name] = Transformers(checkpoint, dtype=dtype, device=device, max_tokens=_MAX_TOKENS)
         else:
             made[name] = EngineContender(_torch_engine(name, checkpoint, device))
     return made

@@ -17,3 +17,8 @@ def bfloat16_is_fast(device: str = "cpu") -> bool:
     # Known from torch 2.12 on; before, nothing is known.
     capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     return bool(capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
+
+
+def fast_dtype(device: str = "cpu") -> torch.dtype:
+    """The type whose matrices a device multiplies fastest: bfloat16 or float32."""
+    return torch.bfloat16 if bfloat16_is_fast(device) else torch.float32

@@ -231,14 +231,12 @@ def _random_checkpoint(preset: str, words_of: Path, folder: Path, device: str, a
 
 
 def _rooflines(rows: list[Row], checkpoint: Path, device: str) -> list[Roofline]:
-    import torch
-
     from model.bench.report import Roofline
     from model.bench.roofline import measure, work_of_plan
     from model.network.checkpoint import read_config, read_parts
-    from model.network.precision import bfloat16_is_fast
+    from model.network.precision import fast_dtype
 
-    dtype = torch.bfloat16 if bfloat16_is_fast(device) else torch.float32
+    dtype = fast_dtype(device)
     machine, parts, config = measure(device, dtype), read_parts(checkpoint), read_config(checkpoint)
     prompt = len(parts.inputs.prompt("cf_vla", route=parts.settings.with_route).ids)
     slices, grid_rows, columns = parts.settings.grid

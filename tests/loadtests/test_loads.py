@@ -7,8 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from itertools import count, pairwise
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from loadtests.sending import Target
 from loadtests.workers import run_load
 from tests.loadtests.scenes import labelled_scenes
 from tests.loadtests.stand_in import StandIn, standing_in
+from tests.waiting import until
 
 CALLS = tuple(make_calls(labelled_scenes(), Mix(draws={1: 1}), 10, seed=0))
 GOAL_S = 0.2
@@ -90,7 +90,7 @@ def test_a_generator_that_is_killed_sends_no_more() -> None:
     with standing_in(service) as url:
         generator = subprocess.Popen([sys.executable, "-m", "service.cli", *asks, url])
         try:
-            wait_until(lambda: len(service.seen) > 5, 60)
+            until(lambda: len(service.seen) > 5, 60)
         finally:
             generator.send_signal(signal.SIGKILL)
             generator.wait()
@@ -100,12 +100,4 @@ def test_a_generator_that_is_killed_sends_no_more() -> None:
             seen.append(len(service.seen))
             return seen[-1] == seen[-2]
 
-        wait_until(silent, 20, every_s=1.0)
-
-
-def wait_until(holds: Callable[[], bool], most_s: float, every_s: float = 0.1) -> None:
-    for tried in count():
-        if holds():
-            return
-        assert tried * every_s < most_s
-        time.sleep(every_s)
+        until(silent, 20, every_s=1.0)

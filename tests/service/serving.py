@@ -26,6 +26,7 @@ from service.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
 from tests.sockets import PATIENCE_S, listening
+from tests.waiting import until
 
 ServedEngine = TypeVar("ServedEngine", bound=Engine, default=ScriptedEngine)
 
@@ -52,12 +53,7 @@ class Served(Generic[ServedEngine]):
 
     def until(self, condition: Callable[[], bool]) -> None:
         """Wait for what must come; fails when it does not."""
-        pause = threading.Event()
-        for _ in range(PATIENCE_S * 100):
-            if condition():
-                return
-            pause.wait(0.01)
-        raise AssertionError("what was waited for did not happen")
+        until(condition)
 
     def until_ready(self) -> None:
         self.until(lambda: self.http.get("/readyz").status_code == 200)

@@ -59,7 +59,7 @@ def cf_vla_values(draw: st.DrawFn, codes: int = 16) -> Values:
 
 _LEADS = st.text(string.ascii_letters + " :,", max_size=30).map(Literal)
 _STOPS = st.sampled_from(["\n", "\n\n", "\nSo:\n"])
-# None begins as another ends, neither in letters nor in tokens.
+# Written with a mark behind, so that none is the beginning of another.
 _MOODS = ("calm", "hasty", "wary", "lost in thought", "lost", "calmer than before")
 
 
