@@ -46,8 +46,14 @@ def contenders(names: list[str], checkpoint: Path, device: str) -> dict[str, Con
                 )
                 made["vllm-grammar"] = EngineContender(engine)
                 made["vllm"] = PlainVllm(checkpoint, engine, _MAX_TOKENS)
-        elif name == "transformers":
-            made[name] = Transformers(checkpoint, dtype=dtype, device=device, max_tokens=_MAX_TOKENS)
+        elif name.startswith("transformers"):
+            made[name] = Transformers(
+                checkpoint,
+                dtype=dtype,
+                device=device,
+                max_tokens=_MAX_TOKENS,
+                cache="static" if name == "transformers-static" else "dynamic",
+            )
         else:
             made[name] = EngineContender(_torch_engine(name, checkpoint, device))
     return made

@@ -141,13 +141,17 @@ class PlainVllm(Contender):
 
 
 class Transformers(Contender):
-    """`generate` over one batch of all requests' draws; pictures are encoded once a scene."""
+    """`generate` over one batch of all requests' draws; pictures are encoded once a scene.
 
-    def __init__(self, checkpoint: Path, *, dtype: Any, device: str, max_tokens: int) -> None:
+    Args:
+        cache: ``dynamic``, or ``static``, with which `generate` compiles its steps where there is a GPU.
+    """
+
+    def __init__(self, checkpoint: Path, *, dtype: Any, device: str, max_tokens: int, cache: str) -> None:
         from model.network.checkpoint import load
 
         self._loaded = load(checkpoint, dtype, device)
-        self._max_tokens = max_tokens
+        self._max_tokens, self._cache = max_tokens, cache
 
     async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
         """Answer requests as one batch, on this thread: torch gets slower where a second one uses it."""
@@ -174,6 +178,7 @@ class Transformers(Contender):
                 top_k=0,
                 top_p=1.0,
                 max_new_tokens=self._max_tokens,
+                cache_implementation=self._cache,
                 eos_token_id=vocabulary.id_of(IM_END),
                 pad_token_id=vocabulary.id_of(END_OF_TEXT),
             )

@@ -69,7 +69,7 @@ class Row:
 
 def can_do(contender: str, workload: Workload) -> bool:
     """Without a grammar nothing decides the branch but the model."""
-    return workload.thinking == "adaptive" or contender not in ("transformers", "vllm")
+    return workload.thinking == "adaptive" or contender not in ("transformers", "transformers-static", "vllm")
 
 
 def run(job: Job, tell: Callable[[str], None]) -> list[Row]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 bench = typer.Typer(help="Measure speed, as ratios within one run.", no_args_is_help=True)
 
-_ENGINES = "torch,transformers,vllm,vllm-grammar"
+_ENGINES = "torch,transformers,transformers-static,vllm,vllm-grammar"
 
 
 @bench.command()

@@ -23,16 +23,18 @@ def job(checkpoint: Path, *contenders: str, loads: tuple[Workload, ...]) -> Job:
 def test_engines_run_side_by_side(untrained_checkpoint: Path) -> None:
     loads = (Workload(2, 2, "adaptive"), Workload(1, 1, "never"))
     told: list[str] = []
-    rows = run(job(untrained_checkpoint, "torch", "transformers", loads=loads), told.append)
+    names = ("torch", "transformers", "transformers-static")
+    rows = run(job(untrained_checkpoint, *names, loads=loads), told.append)
     assert [(row.engine, row.scenes, row.n, row.thinking) for row in rows] == [
         ("torch", 2, 2, "adaptive"),
         ("transformers", 2, 2, "adaptive"),
+        ("transformers-static", 2, 2, "adaptive"),
         ("torch", 1, 1, "never"),
     ]
-    ours, theirs, direct = rows
+    ours, theirs, static, direct = rows
     assert ours.valid_share == direct.valid_share == 1.0
     assert direct.forced_share > 0.5
-    assert theirs.forced_share == 0.0
+    assert theirs.forced_share == static.forced_share == 0.0
     assert theirs.valid_share < 1.0, "an untrained model writes no plans of itself"
     assert direct.passes_per_response < 0.5 * direct.tokens_per_response
     assert ours.counts["fan_out_row_passes"] >= ours.counts["row_passes"] >= ours.counts["scene_passes"] > 0

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 from transformers import DynamicCache
@@ -50,15 +51,26 @@ def exactly(loaded: Loaded) -> Loaded:
     return loaded
 
 
+Shares = dict[int, npt.NDArray[np.float64]]
+"""Of each decision, by its position, the probabilities of the tokens that were allowed."""
+
+
 def reference_draws(
     loaded: Loaded, request: PlanRequest, formats: Mapping[str, Format] = FORMATS
 ) -> list[Draw]:
     """All draws of a request, each from its own prompt."""
+    return [draw for draw, _ in reference(loaded, request, formats)]
+
+
+def reference(
+    loaded: Loaded, request: PlanRequest, formats: Mapping[str, Format]
+) -> list[tuple[Draw, Shares]]:
+    """The same, with what each draw had to choose from."""
     format = formats[request.format]
     return [_draw(loaded, request, format, index) for index in range(request.controls.n)]
 
 
-def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> Draw:
+def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> tuple[Draw, Shares]:
     model: Any = loaded.model
     controls = request.controls
     inputs = loaded.inputs.build(request.scene, request.format)
@@ -74,10 +86,13 @@ def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> D
     cursor = CompiledFormat(format, loaded.vocabulary).start(given)
     tokens: list[Token] = []
     think_probability = None
+    shares: Shares = {}
     while not cursor.done:
         allowed = cursor.allowed()
         scores = logits.double().numpy()[allowed.ids]
         left = np.ones(len(allowed.ids), np.bool_)
+        if len(allowed.ids) > 1:
+            shares[len(tokens)] = probabilities(scores)
         if allowed.choice == BRANCH and len(allowed.ids) > 1:
             thinks = np.array(["Thinking:" in cursor.option_texts(int(id)) for id in allowed.ids])
             think_probability = float(probabilities(scores)[thinks].sum())
@@ -98,7 +113,7 @@ def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> D
         ).logits[0, -1]
     text = loaded.vocabulary.decode([token.id for token in tokens])
     values: Any = parse(format, text)
-    return Draw(
+    draw = Draw(
         index=index,
         text=text,
         plan=values.get("plan"),
@@ -110,3 +125,4 @@ def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> D
         codes=values["trajectory"],
         tokens=dict(Counter(token.section for token in tokens)),
     )
+    return draw, shares

@@ -8,11 +8,15 @@ at a trained network, whose responses are shorter.
 from __future__ import annotations
 
 import os
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import torch
 from hypothesis import HealthCheck, given, seed, settings
@@ -21,12 +25,15 @@ from hypothesis import strategies as st
 from model.driving.plan import plan_from_bins
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thinking
 from model.engines.torch.decoder import Decoder, Failed, Shortcuts
+from model.engines.torch.pace import TimeFor
+from model.engines.torch.rows import Row
 from model.engines.torch.runner import Runner
+from model.engines.torch.sampler import probabilities
 from model.formats.cf_vla import FORMATS
 from model.formats.pieces import Format
 from model.network.checkpoint import Loaded, load
 from tests.checkpoints import noisy_scene, write_untrained
-from tests.model.engines.reference import exactly, reference_draws
+from tests.model.engines.reference import Shares, exactly, reference
 from tests.model.formats.strategies import branching_formats
 
 pytestmark = pytest.mark.filterwarnings("ignore:Generating overly large repr")
@@ -142,6 +149,22 @@ def decode(decoder: Decoder, mix: list[Arrival]) -> dict[tuple[str, int], Draw]:
     return draws
 
 
+@contextmanager
+def noted() -> Iterator[Mapping[tuple[str, int], Shares]]:
+    """What each draw (request, index) has to choose from meanwhile."""
+    shares: dict[tuple[str, int], Shares] = defaultdict(dict)
+    choices = Row.choices
+
+    def noting(row: Row, logits: npt.NDArray[np.float64], time_for: TimeFor) -> object:
+        if not row.draft:
+            for draw in row.draws:
+                shares[row.request.id, draw][len(row.tokens)] = probabilities(logits)
+        return choices(row, logits, time_for)
+
+    with patch.object(Row, "choices", noting):
+        yield shares
+
+
 compared = 0
 
 
@@ -171,16 +194,19 @@ def test_nothing_that_makes_it_fast_changes_a_response(
 ) -> None:
     global compared
     requests = [named(number, each.request) for number, mix in enumerate(together) for each in mix.arrivals]
-    plain = plainly(exact, requests, made_up)
+    with noted() as plain_shares:
+        plain = plainly(exact, requests, made_up)
     for number, mix in enumerate(together):
         runner = Runner(exact, mix.rows, clip_bytes=1 << 20, formats=made_up)
         decoder = Decoder(runner, mix.shortcuts, prompt_chunk=mix.chunk, clock=lambda: 0.0)
-        fast = decode(decoder, mix.arrivals)
+        with noted() as shares:
+            fast = decode(decoder, mix.arrivals)
         assert {each.request.request_id for each in mix.arrivals if each.cancelled is None} <= {
             name for name, _ in fast
         }
         for (name, index), draw in fast.items():
             same(draw, plain[f"{number}.{name}", index])
+            same_shares(shares[name, index], plain_shares[f"{number}.{name}", index])
         compared += len(fast)
     if MIXES > 100:
         print(f"{compared} responses compared, no difference", flush=True)
@@ -198,9 +224,12 @@ def test_nothing_that_makes_it_fast_changes_a_response(
 def test_the_decoder_without_shortcuts_is_the_one_of_transformers(
     exact: Loaded, mix: list[Arrival], made_up: Formats
 ) -> None:
-    draws = plainly(exact, [each.request for each in mix], made_up)
-    for reference in reference_draws(exact, mix[0].request, made_up):
-        same(draws[mix[0].request.request_id, reference.index], reference)
+    with noted() as shares:
+        draws = plainly(exact, [each.request for each in mix], made_up)
+    for expected, expected_shares in reference(exact, mix[0].request, made_up):
+        key = mix[0].request.request_id, expected.index
+        same(draws[key], expected)
+        same_shares(shares[key], expected_shares)
 
 
 def same(draw: Draw, other: Draw) -> None:
@@ -210,6 +239,13 @@ def same(draw: Draw, other: Draw) -> None:
     assert draw.branch == other.branch
     if other.think_probability is not None:
         assert draw.think_probability == pytest.approx(other.think_probability, rel=1e-9)
+
+
+def same_shares(shares: Shares, others: Shares) -> None:
+    """The same decisions, between tokens as likely within rounding."""
+    assert shares.keys() == others.keys()
+    for position, found in shares.items():
+        np.testing.assert_allclose(found, others[position], rtol=1e-9)
 
 
 def test_a_soak_leaves_nothing_behind(exact: Loaded) -> None:
