@@ -156,7 +156,7 @@ def run_deadlines(job: Job, n: int, deadline_ms: int, requests: int = 500) -> De
     """Ask the torch engine at the knee of its load curve, by a Poisson process.
 
     The knee is the largest load that is kept up with, at a median latency of at most twice that of a scene
-    alone; found by a hundred requests at each of a few loads.
+    alone; found by a hundred such requests at each of a few loads.
     """
     load = Workload(requests, n, "adaptive", deadline_ms=deadline_ms)
     with _process(job, ["torch"]) as process:
@@ -166,7 +166,8 @@ def run_deadlines(job: Job, n: int, deadline_ms: int, requests: int = 500) -> De
         per_s = 1 / alone_s
         for number, share in enumerate((0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0), start=23):
             arrivals_s = _arrivals(share / alone_s, 100)
-            reply = process.ask("torch", Workload(100, n, "adaptive"), number, arrivals_s=arrivals_s)
+            asked = Workload(100, n, "adaptive", deadline_ms=deadline_ms)
+            reply = process.ask("torch", asked, number, arrivals_s=arrivals_s)
             behind_s = reply["wall_s"] - arrivals_s[-1]
             if _median([reply]) > 2 * alone_s or behind_s > _BEHIND * alone_s:
                 break
