@@ -10,13 +10,19 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from model.bench.workload import Workload
+
+_SHARES: Final = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
+"""Loads among which the knee is looked for, in requests during the latency of a scene alone."""
+_BEHIND: Final = 3
+"""Latencies of a scene alone: where the last of many answers comes so long after the last request, or later,
+a load is not kept up with."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,9 @@ class Row:
 
 def can_do(contender: str, workload: Workload) -> bool:
     """Without a grammar nothing decides the branch but the model."""
-    return workload.thinking == "adaptive" or contender not in ("transformers", "transformers-static", "vllm")
+    return workload.thinking == "adaptive" or not (
+        contender == "vllm" or contender.startswith("transformers")
+    )
 
 
 def run(job: Job, tell: Callable[[str], None]) -> list[Row]:
@@ -131,11 +139,6 @@ def run_planner(job: Job, n: int, steps: int = 4) -> Planner:
     return Planner(n, statistics.median(cold), statistics.median(next_))
 
 
-_BEHIND: Final = 3
-"""Latencies of a scene alone: where the last of many answers comes so long after the last request, or later,
-a load is not kept up with."""
-
-
 @dataclass(frozen=True)
 class Deadlines:
     """Requests that arrive by chance at ``per_s`` on average, each with a deadline.
@@ -156,23 +159,23 @@ def run_deadlines(job: Job, n: int, deadline_ms: int, requests: int = 500) -> De
     """Ask the torch engine at the knee of its load curve, by a Poisson process.
 
     The knee is the largest load that is kept up with, at a median latency of at most twice that of a scene
-    alone; found by a hundred such requests at each of a few loads.
+    alone; found by a hundred such requests at each of a few loads. Where none is, it is the smallest.
     """
     load = Workload(requests, n, "adaptive", deadline_ms=deadline_ms)
+    tried = replace(load, scenes=100)
     with _process(job, ["torch"]) as process:
         for number in range(3):
             process.ask("torch", Workload(16, n, "adaptive"), number)
         alone_s = _median([process.ask("torch", Workload(1, n, "adaptive"), 3 + k) for k in range(20)])
-        per_s = 1 / alone_s
-        for number, share in enumerate((0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0), start=23):
-            arrivals_s = _arrivals(share / alone_s, 100)
-            asked = Workload(100, n, "adaptive", deadline_ms=deadline_ms)
-            reply = process.ask("torch", asked, number, arrivals_s=arrivals_s)
+        per_s = _SHARES[0] / alone_s
+        for number, share in enumerate(_SHARES, start=23):
+            arrivals_s = _arrivals(share / alone_s, tried.scenes)
+            reply = process.ask("torch", tried, number, arrivals_s=arrivals_s)
             behind_s = reply["wall_s"] - arrivals_s[-1]
             if _median([reply]) > 2 * alone_s or behind_s > _BEHIND * alone_s:
                 break
             per_s = share / alone_s
-        answers = process.ask("torch", load, 30, arrivals_s=_arrivals(per_s, requests))["answers"]
+        answers = process.ask("torch", load, 31, arrivals_s=_arrivals(per_s, requests))["answers"]
     latencies = [answer["latency_s"] for answer in answers]
     in_time = [
         answer["latency_s"] * 1000 <= deadline_ms
