@@ -97,7 +97,7 @@ def _margin(exact: Runner, request: PlanRequest, draw: int, written: Sequence[in
     [prompt] = exact.begin_prompts([(request.scene, request.format)], 0)
     assert isinstance(prompt, Prompt)
     exact.feed_prompts([(prompt, exact.prompt_tokens)])
-    feed = Feed(prompt, 0, [prompt.last_token, *written], [(len(written), cursor.allowed().ids)])
+    feed = Feed(0, prompt, 0, [prompt.last_token, *written], [(len(written), cursor.allowed().ids)])
     [[logits]] = exact.feed([feed])
     borders = np.cumsum(probabilities(logits, request.controls.temperature))[:-1]
     return float(np.abs(borders - uniform(request.controls.seed, draw, len(written))).min())

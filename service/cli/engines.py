@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -20,6 +21,13 @@ VllmArguments = Annotated[
     str, typer.Option(help='More of vLLM\'s engine arguments as JSON, such as {"tensor_parallel_size": 2}.')
 ]
 Rows = Annotated[int, typer.Option(help="Draws decoded at once.", min=1)]
+CacheMb = Annotated[
+    int,
+    typer.Option(
+        help="MB for what the torch engine keeps of pictures that may come again; twice, tokens and keys.",
+        min=0,
+    ),
+]
 
 
 def make_engine(
@@ -29,8 +37,11 @@ def make_engine(
     name: Literal["torch", "vllm"] = "torch",
     device: Literal["cpu", "cuda"] = "cpu",
     vllm_arguments: str = "{}",
+    cache_mb: int = 256,
 ) -> Engine:
     """An engine over a checkpoint, not started yet.
+
+    ``cache_mb`` is for the vision tokens that the torch engine keeps, and as much for keys and values.
 
     Raises:
         CheckpointError: the folder is no usable checkpoint.
@@ -48,4 +59,5 @@ def make_engine(
         return VllmEngine(checkpoint, VllmSettings(rows=rows, arguments=arguments))
     from model.engines.torch.engine import TorchEngine, TorchSettings
 
-    return TorchEngine(checkpoint, TorchSettings.on(device, rows))
+    settings = replace(TorchSettings.on(device, rows), clip_bytes=cache_mb << 20)
+    return TorchEngine(checkpoint, settings)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
+from service.cli.engines import CacheMb, Device, EngineName, Rows, VllmArguments, make_engine
 from service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, told
 
 
@@ -19,6 +19,7 @@ def serve(
     engine: EngineName = "torch",
     device: Device = "cpu",
     vllm_arguments: VllmArguments = "{}",
+    cache_mb: CacheMb = 256,
 ) -> None:
     """Serve a checkpoint over HTTP; the inspector page is at /."""
     from service.app import create_app
@@ -27,6 +28,13 @@ def serve(
 
     with told():
         settings = Settings()
-        load = partial(make_engine, rows=rows, name=engine, device=device, vllm_arguments=vllm_arguments)
+        load = partial(
+            make_engine,
+            rows=rows,
+            name=engine,
+            device=device,
+            vllm_arguments=vllm_arguments,
+            cache_mb=cache_mb,
+        )
         app = create_app(load(checkpoint), settings, teacher=TeacherSettings().teacher(), load=load)
         make_server(app, settings, host, port).run()

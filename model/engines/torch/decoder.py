@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 from typing import Final
@@ -26,7 +26,8 @@ from model.engines.torch.ahead import Ahead
 from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
 from model.engines.torch.runner import ROWS_A_PROMPT, Feed, Prompt, Runner
-from model.engines.torch.schedule import Memory, Schedule, urgency
+from model.engines.torch.schedule import Memory, Schedule
+from model.engines.torch.turns import Work, turn
 from model.formats.pieces import ACTION, BRANCH, THINKING
 
 Logits = npt.NDArray[np.float64]
@@ -204,19 +205,41 @@ class Decoder:
             for row in rows:
                 groups.setdefault(row.draws[0] // self._schedule.draws_a_prompt(request), []).append(row)
             self._beginnings += [_Beginning(request, group) for group in groups.values()]
-        events += self._bring_prompts_on()
-        if self._rows:
-            events += self._feed_rows()
+        going_on = turn(self._works(), self._pace, began_s)
+        events += self._bring_prompts_on(going_on)
+        if any(row.request in going_on for row in self._rows):
+            events += self._feed_rows(going_on)
             self._pace.saw_step(self._clock() - began_s)
         return events + self._settle_for_drafts()
 
-    def _feed_rows(self) -> list[StepEvent]:
-        """Feed all rows once, and write what was chosen."""
+    def _works(self) -> list[Work]:
+        """What is left to do for each running request."""
+        works: dict[str, Work] = {}
+        drafted = {(row.request.id, draw) for row in self._rows if row.draft for draw in row.draws}
+        drafted |= self._drafts.keys()
+        waiting = [row for each in self._beginnings for row in each.rows]
+        for row in [*self._rows, *waiting]:
+            name = row.request.id
+            covered = not row.draft and all((name, draw) in drafted for draw in row.draws)
+            passes = 0.0 if covered else max(1.0, self._pace.direct_passes - row.passes)
+            work = works.get(name) or Work(row.request, 0.0, 0, 0)
+            works[name] = work._replace(passes=max(work.passes, passes), rows=work.rows + 1)
+        for each in self._beginnings:
+            work = works[each.request.id]
+            works[each.request.id] = work._replace(prompts=work.prompts + 1)
+        return list(works.values())
+
+    def _feed_rows(self, going_on: Sequence[Request]) -> list[StepEvent]:
+        """Feed the rows of those that go on once, and write what was chosen."""
         events: list[StepEvent] = []
-        rows = list(self._rows)
-        feeds = [self._feed_of(row) for row in rows]
+        places = [place for place, row in enumerate(self._rows) if row.request in going_on]
+        rows = [self._rows[place] for place in places]
+        feeds = [self._feed_of(row, place, len(rows)) for row, place in zip(rows, places, strict=True)]
         self._count(rows, feeds)
-        for row, feed, logits in zip(rows, feeds, self._runner.feed(feeds), strict=True):
+        began_s = self._clock()
+        found = self._runner.feed(feeds)
+        self._pace.saw_pass(self._clock() - began_s, len(rows))
+        for row, feed, logits in zip(rows, feeds, found, strict=True):
             if row not in self._rows:
                 continue  # its request failed with another of its rows
             if all(np.isfinite(values).all() for values in logits):
@@ -250,12 +273,17 @@ class Decoder:
             assert row.draws
             assert row.pending or row.cursor.done, "a row has nothing to feed"
 
-    def _bring_prompts_on(self) -> list[StepEvent]:
-        """Some tokens of the most urgent prompts; many while no draw waits for the pass."""
-        now_s = self._clock()
-        left = self._chunk if self._rows else _ALONE * self._chunk
+    def _bring_prompts_on(self, going_on: Sequence[Request]) -> list[StepEvent]:
+        """Some tokens of the prompts of those that go on, in order; many while no draw waits for the pass."""
+        beginnings = [each for request in going_on for each in self._beginnings if each.request is request]
+        if not beginnings:
+            return []
+        began_s = self._clock()
+        left = _ALONE * self._chunk
+        if any(row.request in going_on for row in self._rows):
+            left = self._chunk
         taken: list[tuple[_Beginning, int]] = []
-        for beginning in sorted(self._beginnings, key=lambda each: urgency(each.request, now_s)):
+        for beginning in beginnings:
             if left <= 0:
                 break
             count = min(left, self._runner.prompt_tokens)
@@ -269,7 +297,8 @@ class Decoder:
         ]
         if parts:
             self._runner.feed_prompts(parts)
-        for beginning in [each for each in self._beginnings if each.prompt is not None and each.prompt.ready]:
+        read = [each for each in self._beginnings if each.prompt is not None and each.prompt.ready]
+        for beginning in read:
             assert beginning.prompt is not None
             self._beginnings.remove(beginning)
             for row in beginning.rows:
@@ -278,6 +307,7 @@ class Decoder:
                 if not row.tokens:
                     told = row.write((), self._runner.loaded.vocabulary)
                     events += [(beginning.request.id, event) for event in told]
+        self._pace.saw_prompts(self._clock() - began_s, len(read))
         return events
 
     def _open(self, beginnings: list[_Beginning]) -> list[StepEvent]:
@@ -306,13 +336,19 @@ class Decoder:
         size = self._schedule.draws_a_prompt(request) if self._shortcuts.shared_rows else 1
         return [Row(request.start, request, every[first : first + size]) for first in every[::size]]
 
-    def _feed_of(self, row: Row) -> Feed:
-        """A row's pending tokens and what is proposed behind them, with the decisions among both."""
+    def _feed_of(self, row: Row, place: int, rows: int) -> Feed:
+        """A row's pending tokens and what is proposed behind them, with the decisions among both.
+
+        Args:
+            row: to be fed.
+            place: which it is.
+            rows: in the pass.
+        """
         assert row.prompt is not None
         if not self._shortcuts.jump and len(row.pending) > 1:
-            return Feed(row.prompt, row.held, row.pending[:1], ())
-        tokens, wanted = self._ahead.feed(row, len(self._rows) if self._shortcuts.speculate else 0)
-        return Feed(row.prompt, row.held, tokens, wanted)
+            return Feed(place, row.prompt, row.held, row.pending[:1], ())
+        tokens, wanted = self._ahead.feed(row, rows if self._shortcuts.speculate else 0)
+        return Feed(place, row.prompt, row.held, tokens, wanted)
 
     def _apply(self, row: Row, feed: Feed, found: list[Logits]) -> list[StepEvent]:
         """Choose at the decisions of a feed, one after the other, while what was fed is what is chosen."""
@@ -384,13 +420,15 @@ class Decoder:
                 failure = EngineError.because("a response could not be read back", error)
                 events.append(self._fail(row.request, failure))
                 continue
+            if row.passes_before_ending:
+                self._pace.saw_ending(row.passes - row.passes_before_ending)
+            else:
+                self._pace.saw_direct(row.passes)
             if row.draft:
                 events += [(row.request.id, DraftFinished(draw)) for draw in draws]
                 self._drafts.update({(row.request.id, draw.index): draw for draw in draws})
                 self._free_row(row)
                 continue
-            if row.passes_before_ending:
-                self._pace.saw_ending(row.passes - row.passes_before_ending)
             self._ahead.finished(row)
             self._free_row(row)
             events += self._answer(row.request, draws)

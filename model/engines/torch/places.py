@@ -21,11 +21,13 @@ class Fed(NamedTuple):
     """What one draw's row brings into a pass.
 
     Attributes:
+        row: which it is, of the draws'.
         prompt: the row of its prompt.
         held: tokens that the draw's row holds before the pass.
         fed: tokens that the pass brings, at least one.
     """
 
+    row: int
     prompt: int
     held: int
     fed: int
@@ -56,16 +58,16 @@ class Places:
         self._places[target] = self._places[source]
 
     def write(self, fed: Sequence[Fed], prompt_lengths: Sequence[int]) -> Written:
-        """Find places for what the first rows bring.
+        """Find places for what some rows bring.
 
         Args:
-            fed: one a row.
+            fed: one a row; of a prompt's rows all or none, since what others have written would be free.
             prompt_lengths: tokens of the prompt in each of the prompts' rows.
         """
-        prompts, held, counts = (np.array(column, np.int64) for column in zip(*fed, strict=True))
+        own, prompts, held, counts = (np.array(column, np.int64) for column in zip(*fed, strict=True))
         lengths = np.array(prompt_lengths, np.int64)[prompts]
         rows, columns = np.nonzero(np.arange(held.max()) < held[:, None])
-        taken = self._places[rows, columns]
+        taken = self._places[own[rows], columns]
         order = np.argsort(prompts, kind="stable")
         firsts = np.flatnonzero(np.diff(prompts[order], prepend=-1))
         brought = np.add.reduceat(counts[order], firsts)
@@ -79,7 +81,7 @@ class Places:
         within = count_up(counts)
         places = np.empty_like(row_of)
         places[np.argsort(prompts[row_of], kind="stable")] = np.concatenate(free)
-        self._places[row_of, held[row_of] + within] = places
+        self._places[own[row_of], held[row_of] + within] = places
         # Of what the pass brings, a token sees its row's tokens up to itself.
         number = np.arange(len(row_of))
         later, earlier = np.nonzero((row_of[:, None] == row_of) & (number[:, None] >= number))

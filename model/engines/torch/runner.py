@@ -66,12 +66,14 @@ class Feed(NamedTuple):
     """What a draw's row feeds in a pass.
 
     Attributes:
+        row: which it is.
         prompt: of the row.
         held: tokens that the row holds.
         tokens: at least one.
         wanted: places among the tokens, ascending, and the ids whose logits behind them are asked for.
     """
 
+    row: int
     prompt: Prompt
     held: int
     tokens: Sequence[int]
@@ -216,7 +218,10 @@ class Runner:
         prompt.row = row
 
     def feed(self, feeds: Sequence[Feed]) -> list[list[npt.NDArray[np.float64]]]:
-        """Feed the first rows their next tokens in one pass; for each the logits wanted, float64 [k]."""
+        """Feed rows their next tokens in one pass, of a prompt all or none.
+
+        Returns the logits that each wants, float64 [k].
+        """
         device = self.loaded.model.device
         counts = [len(feed.tokens) for feed in feeds]
         ids = np.concatenate([feed.tokens for feed in feeds]).astype(np.int64)
@@ -229,14 +234,17 @@ class Runner:
         )
         prompts = {feed.prompt.row: feed.prompt for feed in feeds}
         lengths = [len(prompts[row].embeddings) if row in prompts else 0 for row in range(self.prompts)]
-        fed = [Fed(feed.prompt.row, feed.held, count) for feed, count in zip(feeds, counts, strict=True)]
+        fed = [
+            Fed(feed.row, feed.prompt.row, feed.held, count)
+            for feed, count in zip(feeds, counts, strict=True)
+        ]
         written = self._places.write(fed, lengths)
         for prompt in prompts.values():
             prompt.end = max(prompt.end, written.seen.shape[1])
         starts = np.cumsum(counts) - counts
         asked = [
-            (row, int(starts[row]) + place, ids)
-            for row, feed in enumerate(feeds)
+            (number, int(starts[number]) + place, ids)
+            for number, feed in enumerate(feeds)
             for place, ids in feed.wanted
         ]
         size = pass_size(len(ids))
@@ -248,8 +256,8 @@ class Runner:
         found: list[list[npt.NDArray[np.float64]]] = [[] for _ in feeds]
         if asked:
             logits = self._head.logits(hidden[: len(asked)], [ids for _, _, ids in asked])
-            for (row, _, _), values in zip(asked, logits, strict=True):
-                found[row].append(values)
+            for (number, _, _), values in zip(asked, logits, strict=True):
+                found[number].append(values)
         return found
 
     def _open(self, scene: Scene) -> _Opened | Exception:

@@ -25,7 +25,7 @@ from hypothesis import strategies as st
 from model.driving.plan import plan_from_bins
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thinking
 from model.engines.torch.decoder import Decoder, Failed, Shortcuts
-from model.engines.torch.pace import TimeFor
+from model.engines.torch.pace import Pace, TimeFor
 from model.engines.torch.rows import Row
 from model.engines.torch.runner import Runner
 from model.engines.torch.sampler import probabilities
@@ -66,6 +66,18 @@ class Mix:
     shortcuts: Shortcuts
     rows: int
     chunk: int
+    row_s: float
+
+
+class Counted(Pace):
+    """Every row makes a pass so much longer, whatever is seen."""
+
+    def __init__(self, row_s: float) -> None:
+        super().__init__()
+        self._row_s = row_s
+
+    def pass_s(self, rows: int) -> float:
+        return self._row_s * rows
 
 
 @st.composite
@@ -107,6 +119,8 @@ mixes = st.builds(
     st.builds(Shortcuts, **{field.name: st.booleans() for field in fields(Shortcuts)}),
     st.integers(*ROWS),
     st.sampled_from([7, 64, 256]),
+    # Some have room for everybody beside the most urgent, and some make the others wait for it.
+    st.sampled_from([0.0, 0.05, 0.1]),
 )
 
 
@@ -198,7 +212,8 @@ def test_nothing_that_makes_it_fast_changes_a_response(
         plain = plainly(exact, requests, made_up)
     for number, mix in enumerate(together):
         runner = Runner(exact, mix.rows, clip_bytes=1 << 20, formats=made_up)
-        decoder = Decoder(runner, mix.shortcuts, prompt_chunk=mix.chunk, clock=lambda: 0.0)
+        pace = Counted(mix.row_s)
+        decoder = Decoder(runner, mix.shortcuts, prompt_chunk=mix.chunk, clock=lambda: 0.0, pace=pace)
         with noted() as shares:
             fast = decode(decoder, mix.arrivals)
         assert {each.request.request_id for each in mix.arrivals if each.cancelled is None} <= {

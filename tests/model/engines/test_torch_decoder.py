@@ -277,13 +277,25 @@ def test_memory_for_drafts_is_kept_where_there_may_be_some(exact: Loaded) -> Non
 class Steady(Pace):
     """Steps of 10 ms, 40 of them behind a text, whatever is seen."""
 
-    step_s, deviation_s, ending_passes = 0.01, 0.0, 40.0
+    step_s, deviation_s, ending_passes, direct_passes, prompt_s = 0.01, 0.0, 40.0, 15.0, 0.0
 
     def __init__(self) -> None:
         pass
 
     def saw_step(self, seconds: float) -> None:
         pass
+
+    def saw_prompts(self, seconds: float, read: int) -> None:
+        pass
+
+    def saw_pass(self, seconds: float, rows: int) -> None:
+        pass
+
+    def saw_direct(self, passes: int) -> None:
+        pass
+
+    def pass_s(self, rows: int) -> float:
+        return 0.01
 
     def saw_ending(self, passes: int) -> None:
         pass
@@ -445,3 +457,29 @@ def test_who_is_late_already_makes_nobody_else_late(exact: Loaded) -> None:
     clock.now_s = 2.0
     draws = decode(decoder)
     assert [name for name, _ in draws] == ["in-time"] * 2 + ["late"] * 2 + ["whenever"] * 2
+
+
+class Crowded(Steady):
+    """As many rows as are fed make a pass so many times as long."""
+
+    def pass_s(self, rows: int) -> float:
+        return 0.01 * rows
+
+
+@pytest.mark.parametrize(("deadline_ms", "together"), [(300, False), (3000, True)])
+def test_others_wait_where_the_most_urgent_would_be_late_beside_them(
+    exact: Loaded, deadline_ms: int, together: bool
+) -> None:
+    decoder = Decoder(Runner(exact, 8), clock=Clock(), pace=Crowded())
+    decoder.add(request("patient", 0, "traj_only", n=2, temperature=0.0))
+    decoder.add(request("urgent", 1, "traj_only", n=2, temperature=0.0, deadline_ms=deadline_ms))
+    order, rows = [], []
+    while not decoder.idle:
+        before = decoder.counts.row_passes
+        order += [name for name, event in decoder.step() if isinstance(event, DrawFinished)]
+        rows.append(decoder.counts.row_passes - before)
+        decoder.check_integrity()
+    assert rows[0] == (2 if together else 1)
+    assert sorted(order) == ["patient"] * 2 + ["urgent"] * 2
+    if not together:
+        assert order == ["urgent"] * 2 + ["patient"] * 2

@@ -6,7 +6,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from model.engines.torch.engine import TorchSettings
+from model.engines.torch.engine import TorchEngine, TorchSettings
 from service.cli.commands import app
 from service.cli.engines import make_engine
 
@@ -45,3 +45,9 @@ def test_the_bench_refuses_what_it_cannot_measure(arguments: list[str], message:
     result = RUNNER.invoke(app, ["bench", "engine", *arguments])
     assert result.exit_code == 2
     assert message in result.stderr
+
+
+def test_the_operator_bounds_what_is_kept_of_pictures(untrained_checkpoint: Path) -> None:
+    engine = make_engine(untrained_checkpoint, 4, cache_mb=1)
+    assert isinstance(engine, TorchEngine)
+    assert engine._settings.clip_bytes == 1 << 20
