@@ -221,9 +221,10 @@ class Decoder:
         for row in [*self._rows, *waiting]:
             name = row.request.id
             covered = not row.draft and all((name, draw) in drafted for draw in row.draws)
-            passes = 0.0 if covered else max(1.0, self._pace.direct_passes - row.passes)
+            passes = 0.0 if covered else self._pace.direct_passes_left(row.passes)
             work = works.get(name) or Work(row.request, 0.0, 0, 0)
-            works[name] = work._replace(passes=max(work.passes, passes), rows=work.rows + 1)
+            rows = work.rows + len(row.draws)
+            works[name] = work._replace(passes=max(work.passes, passes), rows=rows)
         for each in self._beginnings:
             work = works[each.request.id]
             works[each.request.id] = work._replace(prompts=work.prompts + 1)

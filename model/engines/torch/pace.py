@@ -14,6 +14,8 @@ _ALIKE: Final = 1.0
 _FIRST_STEP_S: Final = 0.02
 _FIRST_ENDING: Final = 40.0
 """Passes from the end of thinking to the end of the response, before any was seen."""
+_LONGER: Final = 2.0
+"""So many times their usual deviation the longest of a request's draws are longer than usual."""
 _FIRST_DIRECT: Final = 15.0
 """Passes of a response that does not reflect, before any was seen."""
 _CALM: Final = 1.5
@@ -38,13 +40,13 @@ class Pace:
         step_s: a step, prompts and all.
         deviation_s: how far steps are from it.
         ending_passes: behind a text.
-        direct_passes: of a response that does not reflect.
-        prompt_s: to read one.
+        prompt_s: to read a prompt.
     """
 
     def __init__(self) -> None:
         self.step_s, self.deviation_s = _FIRST_STEP_S, 0.0
-        self.ending_passes, self.direct_passes = _FIRST_ENDING, _FIRST_DIRECT
+        self.ending_passes = _FIRST_ENDING
+        self._direct_passes, self._direct_deviation = _FIRST_DIRECT, 0.0
         self.prompt_s, self._reading_s = 0.0, 0.0
         self._pass_s, self._rows = _FIRST_STEP_S, 1.0
         self._square, self._product = 1.0, _FIRST_STEP_S
@@ -60,7 +62,12 @@ class Pace:
 
     def saw_direct(self, passes: int) -> None:
         """A response that does not reflect took so many passes."""
-        self.direct_passes += _MEMORY * (passes - self.direct_passes)
+        self._direct_deviation += _MEMORY * (abs(passes - self._direct_passes) - self._direct_deviation)
+        self._direct_passes += _MEMORY * (passes - self._direct_passes)
+
+    def direct_passes_left(self, passes: int) -> float:
+        """How many more a response needs that does not reflect, were it one of the longer ones."""
+        return max(1.0, self._direct_passes + _LONGER * self._direct_deviation - passes)
 
     def saw_prompts(self, seconds: float, read: int) -> None:
         """Reading prompts took so long, and so many of them are ready by it."""

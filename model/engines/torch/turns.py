@@ -19,7 +19,7 @@ class Work(NamedTuple):
     Attributes:
         request: whose.
         passes: until all its draws have a trajectory, if only a draft; 0 where they have.
-        rows: that write its draws.
+        rows: that write its draws once these have parted.
         prompts: to be read first.
     """
 

@@ -277,7 +277,7 @@ def test_memory_for_drafts_is_kept_where_there_may_be_some(exact: Loaded) -> Non
 class Steady(Pace):
     """Steps of 10 ms, 40 of them behind a text, whatever is seen."""
 
-    step_s, deviation_s, ending_passes, direct_passes, prompt_s = 0.01, 0.0, 40.0, 15.0, 0.0
+    step_s, deviation_s, ending_passes, prompt_s = 0.01, 0.0, 40.0, 0.0
 
     def __init__(self) -> None:
         pass
@@ -293,6 +293,9 @@ class Steady(Pace):
 
     def saw_direct(self, passes: int) -> None:
         pass
+
+    def direct_passes_left(self, passes: int) -> float:
+        return max(1.0, 15.0 - passes)
 
     def pass_s(self, rows: int) -> float:
         return 0.01
@@ -466,7 +469,7 @@ class Crowded(Steady):
         return 0.01 * rows
 
 
-@pytest.mark.parametrize(("deadline_ms", "together"), [(300, False), (3000, True)])
+@pytest.mark.parametrize(("deadline_ms", "together"), [(600, False), (3000, True)])
 def test_others_wait_where_the_most_urgent_would_be_late_beside_them(
     exact: Loaded, deadline_ms: int, together: bool
 ) -> None:

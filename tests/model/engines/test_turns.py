@@ -89,3 +89,13 @@ def test_a_prompt_takes_as_long_as_its_parts() -> None:
         pace.saw_prompts(0.05, 0)
         pace.saw_prompts(0.15, 2)
     assert pace.prompt_s == pytest.approx(0.1, rel=0.01)
+
+
+def test_the_longer_responses_count() -> None:
+    alike, varying = Pace(), Pace()
+    for number in range(200):
+        alike.saw_direct(14)
+        varying.saw_direct(10 if number % 2 else 18)
+    assert alike.direct_passes_left(4) == pytest.approx(10, abs=0.1)
+    assert varying.direct_passes_left(4) == pytest.approx(18, abs=1)
+    assert alike.direct_passes_left(50) == 1
