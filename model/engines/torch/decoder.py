@@ -27,7 +27,7 @@ from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
 from model.engines.torch.runner import ROWS_A_PROMPT, Feed, Prompt, Runner
 from model.engines.torch.schedule import Memory, Schedule
-from model.engines.torch.turns import Work, turn
+from model.engines.torch.turns import turn, works
 from model.formats.pieces import ACTION, BRANCH, THINKING
 
 Logits = npt.NDArray[np.float64]
@@ -205,30 +205,13 @@ class Decoder:
             for row in rows:
                 groups.setdefault(row.draws[0] // self._schedule.draws_a_prompt(request), []).append(row)
             self._beginnings += [_Beginning(request, group) for group in groups.values()]
-        going_on = turn(self._works(), self._pace, began_s)
+        reading = [each.rows for each in self._beginnings]
+        going_on = turn(works(self._rows, reading, self._drafts.keys(), self._pace), self._pace, began_s)
         events += self._bring_prompts_on(going_on)
         if any(row.request in going_on for row in self._rows):
             events += self._feed_rows(going_on)
             self._pace.saw_step(self._clock() - began_s)
         return events + self._settle_for_drafts()
-
-    def _works(self) -> list[Work]:
-        """What is left to do for each running request."""
-        works: dict[str, Work] = {}
-        drafted = {(row.request.id, draw) for row in self._rows if row.draft for draw in row.draws}
-        drafted |= self._drafts.keys()
-        waiting = [row for each in self._beginnings for row in each.rows]
-        for row in [*self._rows, *waiting]:
-            name = row.request.id
-            covered = not row.draft and all((name, draw) in drafted for draw in row.draws)
-            passes = 0.0 if covered else self._pace.direct_passes_left(row.passes)
-            work = works.get(name) or Work(row.request, 0.0, 0, 0)
-            rows = work.rows + len(row.draws)
-            works[name] = work._replace(passes=max(work.passes, passes), rows=rows)
-        for each in self._beginnings:
-            work = works[each.request.id]
-            works[each.request.id] = work._replace(prompts=work.prompts + 1)
-        return list(works.values())
 
     def _feed_rows(self, going_on: Sequence[Request]) -> list[StepEvent]:
         """Feed the rows of those that go on once, and write what was chosen."""

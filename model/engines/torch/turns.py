@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from itertools import chain
 from typing import Final, NamedTuple
 
 from model.engines.torch.pace import Pace
-from model.engines.torch.rows import Request
+from model.engines.torch.rows import Request, Row
 from model.engines.torch.schedule import urgency
 
 _SLACK: Final = 1.25
@@ -29,6 +30,31 @@ class Work(NamedTuple):
     prompts: int
 
 
+def works(
+    rows: Sequence[Row], reading: Sequence[Sequence[Row]], drafts: Collection[tuple[str, int]], pace: Pace
+) -> list[Work]:
+    """What is left to do for each running request.
+
+    Args:
+        rows: that run.
+        reading: for each prompt that is not read yet, the rows that wait for it.
+        drafts: (request id, draw) of those that are ready; draws whose draft still runs do not wait either.
+        pace: what is known of how long responses are.
+    """
+    found: dict[str, Work] = {}
+    drafted = {(row.request.id, draw) for row in rows if row.draft for draw in row.draws} | set(drafts)
+    for row in chain(rows, *reading):
+        name = row.request.id
+        covered = not row.draft and all((name, draw) in drafted for draw in row.draws)
+        passes = 0.0 if covered else pace.direct_passes_left(row.passes)
+        work = found.get(name) or Work(row.request, 0.0, 0, 0)
+        found[name] = work._replace(passes=max(work.passes, passes), rows=work.rows + len(row.draws))
+    for waiting in reading:
+        name = waiting[0].request.id
+        found[name] = found[name]._replace(prompts=found[name].prompts + 1)
+    return list(found.values())
+
+
 def turn(works: Sequence[Work], pace: Pace, now_s: float) -> list[Request]:
     """The requests that go on in this step, the most urgent first.
 
@@ -43,12 +69,12 @@ def turn(works: Sequence[Work], pace: Pace, now_s: float) -> list[Request]:
         rows = sum(each.rows for each in beside)
         return prompts * pace.prompt_s + work.passes * pace.pass_s(rows)
 
-    if all(work.request.controls.deadline_ms is None for work in works):
-        return [work.request for work in sorted(works, key=lambda work: urgency(work.request, now_s))]
     order = sorted(
         works,
         key=lambda work: (work.passes == 0, urgency(work.request, now_s + needed_s(work, [work]))),
     )
+    if not order:
+        return []
     left_s = order[0].request.deadline_s - now_s
     many = len(order)
     if order[0].passes and needed_s(order[0], order[:1]) <= left_s:

@@ -36,6 +36,10 @@ def test_without_deadlines_all_go_on_in_order_of_arrival() -> None:
     assert names([work("b", None), work("a", None), work("c", None)]) == "abc"
 
 
+def test_without_requests_nobody_goes_on() -> None:
+    assert names([]) == ""
+
+
 def test_all_go_on_where_the_most_urgent_has_time_enough() -> None:
     assert names([work("a", 2000), work("b", 1000), work("c", None)]) == "bac"
 
