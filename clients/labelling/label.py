@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from clients.labelling.checks import FailedCheck
-from clients.labelling.ledger import Entry, Ledger, Record, Run, hash_of
+from clients.labelling.ledger import Entry, Ledger, Record, Run
 from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
-from clients.labelling.rollout import scene_hash
+from clients.labelling.rollout import key_of
 from clients.labelling.teachers.teacher import (
     ATTEMPTS,
     Question,
@@ -23,6 +23,7 @@ from clients.labelling.teachers.teacher import (
     ask,
 )
 from clients.labelling.teachers.view import Surroundings
+from model.driving.hashing import hash_of
 from model.driving.plan import parse_plan
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
@@ -64,7 +65,7 @@ def questions(
     Which plans is left to chance, once and for all for a scene and a seed.
     """
     for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None, group=group):
-        kept = ledger.kept(hash_of(rollout.id, scene_hash(labelled)))
+        kept = ledger.kept(key_of(rollout, labelled))
         if kept is None:
             continue
         entry, draws = kept

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import hashlib
 import json
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -18,13 +17,14 @@ from types import TracebackType
 from typing import Any, Final, Literal, NamedTuple, Self
 
 from clients.labelling.teachers.teacher import Answer
+from model.driving.hashing import hash_of
 
 Stage = Literal["rollout", "label"]
 State = Literal["done", "dead"]
 Record = Mapping[str, Any]
 
 FILE: Final = "ledger.sqlite"
-SCHEMA_VERSION: Final = 1
+SCHEMA_VERSION: Final = 2
 """Of records; part of every key, so that a newer one does not take an older one's work for its own."""
 
 _TABLES: Final = """
@@ -52,15 +52,6 @@ CREATE TABLE IF NOT EXISTS answers (
 
 class LedgerError(RuntimeError):
     """A ledger that cannot be used as asked; the text says what to do."""
-
-
-def hash_of(*parts: object) -> str:
-    """32 hex digits that stand for parts: bytes as they are, all else as JSON."""
-    digest = hashlib.sha256()
-    for part in parts:
-        content = part if isinstance(part, bytes) else json.dumps(part, sort_keys=True).encode()
-        digest.update(len(content).to_bytes(8, "big") + content)
-    return digest.hexdigest()[:32]
 
 
 @dataclass(frozen=True)

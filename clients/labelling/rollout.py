@@ -11,10 +11,11 @@ import numpy as np
 
 from clients import wire
 from clients.answers import PlannerProblem, PlannerUnreachable, PlanResult, RequestRefused, ServiceBusy
-from clients.labelling.ledger import Record, Run, hash_of
+from clients.labelling.ledger import Record, Run
 from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
 from clients.labelling.teachers.patience import TryLater
 from clients.planner import AsyncPlannerClient, Patience
+from model.driving.hashing import hash_of, scene_hash
 from model.driving.labeller import label_plan
 from model.driving.metrics import displacement_errors
 from model.driving.plan import Plan, plan_iou
@@ -52,12 +53,9 @@ def config_of(model: wire.ModelName, sampling: Sampling) -> Record:
     return {"model": model.name, "revision": model.revision, **asdict(sampling)}
 
 
-def scene_hash(labelled: LabelledScene) -> str:
-    """Stands for a scene with its pictures, its way and its expert."""
-    scene = labelled.scene
-    arrays = (scene.history, labelled.future, *(() if scene.route is None else (scene.route,)))
-    pictures = [picture for clip in scene.clips for picture in (clip.camera.encode(), *clip.images)]
-    return hash_of(scene.scene_id, *pictures, *(array.tobytes() for array in arrays))
+def key_of(run: Run, labelled: LabelledScene) -> str:
+    """What the outcome of a run in a scene with its expert is found by."""
+    return hash_of(run.id, scene_hash(labelled.scene), labelled.future.tobytes())
 
 
 def jobs(
@@ -65,7 +63,7 @@ def jobs(
 ) -> Iterator[Job[LabelledScene]]:
     """The scenes of a file or folder as pieces of work; ``unlabelled`` is told of those without a future."""
     for labelled in read_scenes(scenes, dense=False, unlabelled=unlabelled, group=group):
-        yield Job(hash_of(run.id, scene_hash(labelled)), labelled.scene.scene_id, labelled)
+        yield Job(key_of(run, labelled), labelled.scene.scene_id, labelled)
 
 
 def expert_plan(labelled: LabelledScene) -> Plan:

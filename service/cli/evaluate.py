@@ -54,18 +54,24 @@ def evaluate(
         int, typer.Option(help="Scenes for the ladder's temperatures, evenly chosen.", min=1)
     ] = 240,
     plots: Annotated[Path | None, typer.Option(help="Folder for the ladder's pictures.")] = None,
+    keep: Annotated[
+        Path | None,
+        typer.Option(help="SQLite file that keeps all draws: started again, it goes on where it was."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Evaluate open loop: baselines, with and without route, expert plans given, images shuffled."""
     with told():
         from model.driving.scene_store import count_scenes, read_scenes
         from model.engines.engine import Controls
+        from model.evaluation.kept import KeptDraws
 
         controls = Controls(n=n, temperature=temperature, think_threshold=think_threshold)
         labelled = list(_evenly(read_scenes(scenes, dense=False), count_scenes(scenes), limit))
 
         def engine_of(folder: Path) -> Engine:
-            return make_engine(folder, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
+            made = make_engine(folder, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
+            return made if keep is None else KeptDraws(made, keep)
 
         report: Report | LadderReport
         if preset == "ladder":

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 from model.engines.torch.rows import Request
 
-PATIENCE_S: Final = 10.0
+PATIENCE_S: Final = 4.0
 """A request without a deadline waits as if it had this one: those that have some cannot starve it."""
 
 

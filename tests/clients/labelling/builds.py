@@ -11,8 +11,8 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
-from clients.labelling.ledger import Ledger, Run, hash_of
-from clients.labelling.rollout import Sampling, config_of, scene_hash
+from clients.labelling.ledger import Ledger, Run
+from clients.labelling.rollout import Sampling, config_of, key_of
 from clients.wire import ModelName
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import write_scenes
@@ -45,7 +45,7 @@ def rolled_out(folder: Path, count: int) -> Run:
         keys = []
         for number in range(count):
             scene = named(one, f"scene-{number:04d}")
-            keys.append(hash_of(run.id, scene_hash(scene)))
+            keys.append(key_of(run, scene))
             ledger.finish(run, keys[-1], scene.scene.scene_id, rollout_record())
         ledger.keep(run, [(key, (0, 1)) for key in keys])
     return run

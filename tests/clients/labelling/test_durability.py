@@ -16,10 +16,11 @@ from fastapi.responses import JSONResponse, Response
 from starlette.requests import ClientDisconnect
 
 from clients.labelling.label import config_of, jobs, questions
-from clients.labelling.ledger import Ledger, hash_of
-from clients.labelling.rollout import Sampling, scene_hash
+from clients.labelling.ledger import Ledger
+from clients.labelling.rollout import Sampling, key_of
 from clients.labelling.rollout import config_of as rollout_config
 from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from model.driving.hashing import hash_of
 from model.driving.plan import Plan, format_tick, parse_plan
 from tests.clients.labelling.builds import GOOD, LEAKING, MODEL, completion, named, rollout_record, scenes
 from tests.clients.labelling.killed import AT_ONCE, label_all
@@ -87,7 +88,7 @@ def test_nothing_is_lost_and_nothing_is_paid_twice(tmp_path: Path) -> None:
         keys = []
         for number in range(SCENES):
             scene = named(labelled("scene"), f"scene-{number:04d}")
-            keys.append(hash_of(rollout.id, scene_hash(scene)))
+            keys.append(key_of(rollout, scene))
             record = rollout_record()
             for draw in record["free"]:
                 draw["plan"] = str(own_plan(number))

@@ -7,7 +7,7 @@ import pytest
 
 from clients.labelling.dead_letters import FILE as LETTERS
 from clients.labelling.dead_letters import write_dead_letters
-from clients.labelling.ledger import FILE, Ledger, LedgerError, hash_of
+from clients.labelling.ledger import FILE, Ledger, LedgerError
 from clients.labelling.teachers.teacher import Answer
 
 CONFIG = {"model": "nano", "seed": 0}
@@ -122,12 +122,6 @@ def test_dead_letters_are_written_and_can_be_tried_again(tmp_path: Path) -> None
         assert ledger.has("a")
         assert write_dead_letters(ledger, tmp_path) == 0
         assert (tmp_path / LETTERS).read_text() == ""
-
-
-def test_hashes_tell_parts_apart() -> None:
-    assert hash_of("ab", "c") != hash_of("a", "bc") != hash_of("abc")
-    assert hash_of(b"1") != hash_of("1")
-    assert hash_of({"a": 1, "b": 2}) == hash_of({"b": 2, "a": 1})
 
 
 def test_what_a_helper_entered_is_taken_over_once(tmp_path: Path) -> None:

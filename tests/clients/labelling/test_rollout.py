@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 
 from clients.labelling.ledger import Ledger, Run
 from clients.labelling.pipeline import Limits, StageStopped, Tally, work_through
-from clients.labelling.rollout import PATIENCE, Sampling, config_of, expert_plan, jobs, roll_out, scene_hash
+from clients.labelling.rollout import PATIENCE, Sampling, config_of, expert_plan, jobs, key_of, roll_out
 from clients.planner import AsyncPlannerClient
 from clients.wire import ModelName
 from model.driving.scene_store import read_scenes
@@ -83,7 +84,7 @@ def test_a_scene_the_service_refuses_is_a_dead_letter(
 
 
 def test_a_service_that_restarts_in_the_middle_is_waited_for(tmp_path: Path) -> None:
-    file, folder = scenes(tmp_path, 12), tmp_path / "build"
+    file, folder = scenes(tmp_path, 60), tmp_path / "build"
     settings = Settings(bundled_scenes=tmp_path / "none")
     engine = ScriptedEngine()
     with serve(engine, settings) as served:
@@ -105,15 +106,18 @@ def test_a_service_that_restarts_in_the_middle_is_waited_for(tmp_path: Path) -> 
                 )
                 await asyncio.sleep(0.3)  # nobody is there yet
                 assert not work.done()
-                with serve(slow, settings, port=port):
+                with ExitStack() as running:
+                    running.enter_context(serve(slow, settings, port=port))
                     while ledger.count(run) < 3:
                         await asyncio.sleep(0.005)
+                    # Meanwhile the caller goes on sending what it has begun to send.
+                    await asyncio.to_thread(running.pop_all().close)
                 assert not work.done(), "it was to be interrupted in the middle"
                 with serve(ScriptedEngine(), settings, port=port):
                     return await work
 
     tally = asyncio.run(go())
-    assert (tally.done, tally.dead) == (12, 0)
+    assert (tally.done, tally.dead) == (60, 0)
 
 
 def test_another_model_behind_the_service_stops_it(
@@ -132,8 +136,9 @@ def test_keys_change_with_all_that_decides(tmp_path: Path) -> None:
     swapped = replace(clips[0], images=(clips[0].images[1], clips[0].images[0], *clips[0].images[2:]))
     other_pictures = replace(one, scene=replace(one.scene, clips=(swapped, clips[1])))
     variants = [one, labelled("b"), moved, other_future, other_pictures]
-    assert len({scene_hash(variant) for variant in variants}) == len(variants)
     with Ledger(tmp_path) as ledger:
+        run = ledger.run("rollout", config_of(MODEL, Sampling()))
+        assert len({key_of(run, variant) for variant in variants}) == len(variants)
         configs = [
             config_of(MODEL, Sampling()),
             config_of(MODEL, Sampling(temperature=0.5)),

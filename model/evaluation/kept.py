@@ -1,0 +1,138 @@
+"""Draws kept in a file, so that a long evaluation that was killed goes on where it was."""
+
+from __future__ import annotations
+
+import sqlite3
+import zlib
+from collections.abc import AsyncGenerator, Iterable
+from contextlib import aclosing
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import msgpack
+import numpy as np
+
+from model.driving.hashing import hash_of, scene_hash
+from model.driving.plan import Plan, parse_plan
+from model.engines.engine import Draw, DrawFinished, Engine, Event, Load, ModelCard, PlanRequest, Started
+
+_SCHEMA_VERSION: Final = 1
+"""Part of every key, so that a draw that is kept otherwise is none that is known."""
+
+
+class KeptDraws:
+    """An `Engine` in front of another, which is asked only what it has not answered before.
+
+    The draws of a request are kept when the last of them has come; told by the model's revision, the scene
+    with all that is in it, format and controls, not by the request's name. What is answered from the file has
+    no events but `Started` and its draws.
+
+    Args:
+        engine: that is asked.
+        file: SQLite, made where it is not there; several engines may share it.
+
+    Raises:
+        sqlite3.DatabaseError: when it starts, ``file`` is something else.
+    """
+
+    def __init__(self, engine: Engine, file: Path) -> None:
+        self._engine, self._file = engine, file
+        self._kept: sqlite3.Connection | None = None
+
+    @property
+    def card(self) -> ModelCard:
+        """The engine's."""
+        return self._engine.card
+
+    @property
+    def load(self) -> Load:
+        """The engine's."""
+        return self._engine.load
+
+    async def start(self) -> None:
+        """Start the engine and open the file."""
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        self._kept = sqlite3.connect(self._file, isolation_level=None)
+        self._kept.execute("PRAGMA journal_mode = WAL")
+        self._kept.execute("CREATE TABLE IF NOT EXISTS draws (request TEXT PRIMARY KEY, draws BLOB) STRICT")
+        await self._engine.start()
+
+    async def wait(self) -> None:
+        """The engine's."""
+        await self._engine.wait()
+
+    async def stop(self) -> None:
+        """Stop the engine and close the file."""
+        await self._engine.stop()
+        if self._kept is not None:
+            self._kept.close()
+            self._kept = None
+
+    def cancel(self, request_id: str) -> None:
+        """The engine's."""
+        self._engine.cancel(request_id)
+
+    async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
+        """See `Engine.submit`."""
+        assert self._kept is not None, "an engine is started before it is asked"
+        key = _key(self.card, request)
+        found = self._kept.execute("SELECT draws FROM draws WHERE request = ?", (key,)).fetchone()
+        if found is not None:
+            yield Started()
+            for draw in _unpacked(found[0]):
+                yield DrawFinished(draw)
+            return
+        draws = []
+        async with aclosing(self._engine.submit(request)) as events:
+            async for event in events:
+                if isinstance(event, DrawFinished):
+                    draws.append(event.draw)
+                yield event
+        if len(draws) == request.controls.n:
+            self._kept.execute("INSERT OR REPLACE INTO draws VALUES (?, ?)", (key, _packed(draws)))
+
+
+def _key(card: ModelCard, request: PlanRequest) -> str:
+    prefill = request.controls.prefill
+    controls = asdict(request.controls) | {"prefill": None if prefill is None else str(prefill)}
+    scene = scene_hash(request.scene)
+    return hash_of(_SCHEMA_VERSION, card.name, card.revision, card.engine, request.format, controls, scene)
+
+
+def _packed(draws: Iterable[Draw]) -> bytes:
+    records = [
+        vars(draw)
+        | {
+            "plan": _text(draw.plan),
+            "revised_plan": _text(draw.revised_plan),
+            "trajectory": draw.trajectory.astype("<f4").tobytes(),
+            "tokens": dict(draw.tokens),
+        }
+        for draw in draws
+    ]
+    return zlib.compress(msgpack.packb(records))
+
+
+def _unpacked(packed: bytes) -> list[Draw]:
+    records: list[dict[str, Any]] = msgpack.unpackb(zlib.decompress(packed))
+    return [
+        Draw(
+            **record
+            | {
+                "plan": _plan(record["plan"]),
+                "revised_plan": _plan(record["revised_plan"]),
+                "trajectory": np.frombuffer(record["trajectory"], "<f4").reshape(-1, 4),
+                "codes": tuple(record["codes"]),
+            }
+        )
+        for record in records
+    ]
+
+
+def _text(plan: Plan | None) -> str | None:
+    return None if plan is None else str(plan)
+
+
+def _plan(text: str | None) -> Plan | None:
+    return None if text is None else parse_plan(text)

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import asyncio
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.driving.plan import parse_plan
+from model.engines.engine import Controls, Draw, DrawFinished, Engine, EngineError, PlanRequest
+from model.evaluation.kept import KeptDraws
+from tests.model.driving.drives import labelled_scene
+from tests.model.evaluation.fakes import FakeEngine, draw_of
+
+SCENE = labelled_scene().scene
+PLAN = parse_plan("- longitudinal\n  - 0.0s-3.2s: Wait\n  - 3.2s-6.4s: Accelerate\n")
+ASKED = PlanRequest("a", SCENE, "cf_vla", Controls(n=3, prefill=PLAN))
+
+
+def ask(engine: Engine, *requests: PlanRequest) -> list[list[Draw]]:
+    async def go() -> list[list[Draw]]:
+        await engine.start()
+        try:
+            return [
+                [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
+                for request in requests
+            ]
+        finally:
+            await engine.stop()
+
+    return asyncio.run(go())
+
+
+def same(some: Sequence[Draw], others: Sequence[Draw]) -> None:
+    assert len(some) == len(others)
+    for one, other in zip(some, others, strict=True):
+        np.testing.assert_array_equal(one.trajectory, other.trajectory)
+        assert vars(one) | {"trajectory": None} == vars(other) | {"trajectory": None}
+
+
+def test_what_was_asked_before_is_not_asked_again(tmp_path: Path) -> None:
+    file, first, again = tmp_path / "kept" / "draws.sqlite", FakeEngine(), FakeEngine()
+    [made] = ask(KeptDraws(first, file), ASKED)
+    [found] = ask(KeptDraws(again, file), replace(ASKED, request_id="by another name"))
+    assert (len(first.requests), len(again.requests)) == (1, 0)
+    assert len(made) == 3
+    same(found, made)
+
+
+def test_draws_come_back_whole(tmp_path: Path) -> None:
+    whole = replace(
+        draw_of(SCENE.history.repeat(4, 0).astype(np.float32), PLAN, PLAN, 2),
+        text="…", think_probability=0.1, passes=7, chosen=5, cut="shortened",
+    )  # fmt: skip
+
+    class One(FakeEngine):
+        async def submit(self, request):  # type: ignore[no-untyped-def]
+            self.requests.append(request)
+            yield DrawFinished(whole)
+
+    asked, file = replace(ASKED, controls=Controls(n=1)), tmp_path / "draws.sqlite"
+    ask(KeptDraws(One(), file), asked)
+    [found] = ask(KeptDraws(FakeEngine(), file), asked)
+    same(found, [whole])
+
+
+def test_anything_else_is_asked(tmp_path: Path) -> None:
+    engine, other_pictures = FakeEngine(), replace(SCENE.clips[0], images=SCENE.clips[0].images[::-1])
+    others = [
+        replace(ASKED, format="traj_only"),
+        replace(ASKED, controls=replace(ASKED.controls, prefill=None)),
+        replace(ASKED, controls=replace(ASKED.controls, seed=1)),
+        replace(ASKED, scene=replace(SCENE, clips=(other_pictures, *SCENE.clips[1:]))),
+        replace(ASKED, scene=replace(SCENE, route=np.zeros((20, 2), np.float32))),
+    ]
+    ask(KeptDraws(engine, tmp_path / "draws.sqlite"), ASKED, *others)
+    assert len(engine.requests) == 1 + len(others)
+
+
+def test_what_did_not_come_to_its_end_is_asked_again(tmp_path: Path) -> None:
+    file, engine = tmp_path / "draws.sqlite", FakeEngine(missing=1)
+    ask(KeptDraws(engine, file), ASKED)
+    with pytest.raises(EngineError):
+        ask(KeptDraws(FakeEngine(broken=frozenset({SCENE.scene_id})), file), ASKED)
+    whole = FakeEngine()
+    ask(KeptDraws(whole, file), ASKED)
+    assert len(whole.requests) == 1
+
+
+def test_another_file_is_left_alone(tmp_path: Path) -> None:
+    (file := tmp_path / "draws.sqlite").write_text("a letter to somebody")
+    with pytest.raises(sqlite3.DatabaseError):
+        ask(KeptDraws(FakeEngine(), file), ASKED)
+    assert file.read_text() == "a letter to somebody"
