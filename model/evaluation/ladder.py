@@ -68,28 +68,37 @@ def temperature_variants(rung: str, controls: Controls) -> list[Variant]:
     ]
 
 
+def threshold_variants(rung: str, controls: Controls) -> list[Variant]:
+    """Think thresholds from often to seldom; without the route."""
+    return [
+        Variant(f"{rung}, threshold {value:g}", "cf_vla", replace(controls, think_threshold=value))
+        for value in THRESHOLDS
+    ]
+
+
 def threshold_results(
     rung: str,
-    controls: Controls,
+    variants: Sequence[Variant],
     scenes: Sequence[LabelledScene],
     draws: Mapping[tuple[str, str], Sequence[Draw]],
 ) -> dict[Variant, list[SceneResult]]:
-    """Think thresholds from often to seldom; without the route.
+    """Results at think thresholds, without planning anew.
 
     Args:
         rung: one of `RUNGS`.
-        controls: of the adaptive rows.
+        variants: which have a ``think_threshold``.
         scenes: that were planned for.
         draws: of the rung's rows that never and that always think, by the row's name and the scene's.
     """
     results: dict[Variant, list[SceneResult]] = {}
-    for value in THRESHOLDS:
-        given = replace(controls, think_threshold=value)
-        found = results[Variant(f"{rung}, threshold {value:g}", "cf_vla", given)] = []
+    for variant in variants:
+        threshold, route = variant.controls.think_threshold, " + route" if variant.route else ""
+        assert threshold is not None, variant.name
+        found = results[variant] = []
         for labelled in scenes:
             name = labelled.scene.scene_id
-            never, always = draws[f"{rung}, never thinks", name], draws[f"{rung}, always thinks", name]
-            found.append(evaluate_draws(labelled, at_threshold(never, always, value)))
+            never, always = (draws[f"{rung}, {way} thinks{route}", name] for way in ("never", "always"))
+            found.append(evaluate_draws(labelled, at_threshold(never, always, threshold)))
     return results
 
 

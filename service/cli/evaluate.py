@@ -118,25 +118,28 @@ def _ladder(
         rung_variants,
         temperature_variants,
         threshold_results,
+        threshold_variants,
     )
     from model.evaluation.report import evaluate_variants
 
-    found = {} if folder is None else {rung: folder / rung for rung in RUNGS if (folder / rung).is_dir()}
-    found.setdefault(COUNTERFACTUAL, checkpoint)
+    rungs = {} if folder is None else {rung: folder / rung for rung in RUNGS if (folder / rung).is_dir()}
+    rungs.setdefault(COUNTERFACTUAL, checkpoint)
     results: dict[Variant, list[SceneResult]] = {}
-    for rung, path in found.items():
+    for rung, path in rungs.items():
         draws: dict[tuple[str, str], Sequence[Draw]] = {}
 
         def keep(variant: Variant, labelled: LabelledScene, of: Sequence[Draw], draws: Any = draws) -> None:
             draws[variant.name, labelled.scene.scene_id] = of
 
         variants = [each for route in (False, True) for each in rung_variants(rung, controls, route=route)]
+        derived = [each for each in variants if each.controls.think_threshold is not None]
+        planned = [each for each in variants if each not in derived]
         evaluate = partial(evaluate_variants, on_draws=keep)
-        results |= asyncio.run(
-            _run(evaluate, scenes, engine_of(path), variants, controls.n, rows, quiet=quiet)
-        )
+        found = asyncio.run(_run(evaluate, scenes, engine_of(path), planned, controls.n, rows, quiet=quiet))
+        found |= threshold_results(rung, derived, scenes, draws)
+        results |= {variant: found[variant] for variant in variants}
         if rung == COUNTERFACTUAL:
-            results |= threshold_results(rung, controls, scenes, draws)
+            results |= threshold_results(rung, threshold_variants(rung, controls), scenes, draws)
             swept = list(_evenly(scenes, len(scenes), sweep))
             variants = temperature_variants(rung, controls)
             run = _run(evaluate_variants, swept, engine_of(path), variants, controls.n, rows, quiet=quiet)

@@ -42,20 +42,23 @@ class Rung:
 
 @dataclass(frozen=True)
 class Build:
-    """A data set of the ladder: which rung is rolled out, and what is kept."""
+    """A data set of the ladder: which rung is rolled out, what is kept to be labelled, what is added to be
+    acted on."""
 
     name: str
     rung: str
     keep: tuple[str, ...]
+    right: tuple[str, ...] = ()
 
 
-_KEEP: Final = ("--epsilon", "2", "--gain", "0.25")
+_KEEP: Final = ("--epsilon", "1", "--gain", "0.25", "--plan-iou", "0.5")
+_RIGHT: Final = ("--right-iou", "0.7")
 _BUILDS: Final = {
     build.name: build
     for build in (
-        Build("round-1", META_ACT, _KEEP),
+        Build("round-1", META_ACT, _KEEP, _RIGHT),
         Build("whole", META_ACT, ("--everything",)),
-        Build("round-2", COUNTERFACTUAL, _KEEP),
+        Build("round-2", COUNTERFACTUAL, _KEEP, _RIGHT),
     )
 }
 _RUNGS: Final = (
@@ -66,6 +69,8 @@ _RUNGS: Final = (
 )
 _PLANS_PER_SCENE: Final = 6
 _ROWS: Final = 96
+_THINK_THRESHOLD: Final = "0.25"
+"""Chosen on validation scenes (docs/results.md)."""
 
 
 def climb(
@@ -110,6 +115,7 @@ def climb(
         _LOOKTWICE,
         ["evaluate", "--preset", "ladder", "--checkpoint", str(folder / COUNTERFACTUAL)],
         ["--ladder", str(folder), "--scenes", str(test), "--plots", str(folder / "plots")],
+        ["--think-threshold", _THINK_THRESHOLD, "--keep", str(folder / "draws.sqlite")],
     )
 
 
@@ -123,7 +129,7 @@ def _make(build: Build, folder: Path, scenes: Path, every: int, reflections: Pat
         )
     _run(_LOOKTWICE, ["build", "filter", place, *build.keep])
     _run(_LOOKTWICE, ["build", "label", place, str(scenes), "--plans-per-scene", str(_PLANS_PER_SCENE)])
-    _run(_LOOKTWICE, ["build", "export", place, "--to", str(reflections)])
+    _run(_LOOKTWICE, ["build", "export", place, "--to", str(reflections), *build.right])
 
 
 @contextmanager

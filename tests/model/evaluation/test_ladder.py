@@ -21,6 +21,7 @@ from model.evaluation.ladder import (
     rung_variants,
     temperature_variants,
     threshold_results,
+    threshold_variants,
 )
 from model.evaluation.ladder_plots import difficulty_plot, temperature_plot, threshold_plot
 from model.evaluation.open_loop import SceneResult, evaluate_draws, expert_plan
@@ -111,10 +112,15 @@ def test_thresholds_choose_between_the_two_ways() -> None:
     assert at_threshold(never, always, 0.1) == [sure, always[1]]
     name = labelled.scene.scene_id
     draws = {(f"round-2, {way} thinks", name): of for way, of in (("never", never), ("always", always))}
-    found = threshold_results("round-2", Controls(n=2), [labelled], draws)
+    found = threshold_results("round-2", threshold_variants("round-2", Controls(n=2)), [labelled], draws)
     assert [variant.controls.think_threshold for variant in found] == list(THRESHOLDS)
     rates = [result.think_rate for [result] in found.values()]
     assert rates == [0.5 * (value < 0.35) + 0.5 * (value < 0.05) for value in THRESHOLDS]
+    [routed, *_] = rung_variants("round-2", Controls(think_threshold=0.1), route=True)
+    draws = {(f"{row} + route", name): of for (row, name), of in draws.items()}
+    assert [of.think_rate for of in threshold_results("round-2", [routed], [labelled], draws)[routed]] == [
+        0.5
+    ]
 
 
 def test_the_pictures_show_what_is_measured(tmp_path: Path) -> None:
