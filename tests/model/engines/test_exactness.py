@@ -100,7 +100,7 @@ def arrivals(draw: st.DrawFn) -> list[Arrival]:
             top_p=draw(st.sampled_from([1.0, 0.9, 0.5])),
             seed=draw(st.integers(0, 1000)),
             # The clock stands still: deadlines only decide who gives way to whom, and make drafts.
-            deadline_ms=draw(st.sampled_from([None, None, 5_000, 8_000])),
+            deadline_ms=draw(st.sampled_from([None, None, 2_000, 3_000])),
         )
         scene = draw(st.sampled_from(SCENES))
         found.append(

@@ -245,7 +245,7 @@ def test_who_gave_way_is_answered_with_drafts_at_the_deadline(exact: Loaded, wai
 
     while len(drafts) < 2:
         step()
-    decoder.add(request("urgent", 1, "traj_only", n=2, deadline_ms=5_000))
+    decoder.add(request("urgent", 1, "traj_only", n=2, deadline_ms=3_000))
     step()
     if waits_for == "its prompt":
         while ("urgent", 1) not in draws:
