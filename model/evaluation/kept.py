@@ -33,7 +33,7 @@ class KeptDraws:
         file: SQLite, made where it is not there; several engines may share it.
 
     Raises:
-        sqlite3.DatabaseError: when it starts, ``file`` is something else.
+        ValueError: when it starts, ``file`` is something else.
     """
 
     def __init__(self, engine: Engine, file: Path) -> None:
@@ -53,9 +53,14 @@ class KeptDraws:
     async def start(self) -> None:
         """Start the engine and open the file."""
         self._file.parent.mkdir(parents=True, exist_ok=True)
-        self._kept = sqlite3.connect(self._file, isolation_level=None)
-        self._kept.execute("PRAGMA journal_mode = WAL")
-        self._kept.execute("CREATE TABLE IF NOT EXISTS draws (request TEXT PRIMARY KEY, draws BLOB) STRICT")
+        kept = sqlite3.connect(self._file, isolation_level=None)
+        try:
+            kept.execute("PRAGMA journal_mode = WAL")
+            kept.execute("CREATE TABLE IF NOT EXISTS draws (request TEXT PRIMARY KEY, draws BLOB) STRICT")
+        except sqlite3.DatabaseError as error:
+            kept.close()
+            raise ValueError(f"{self._file} keeps no draws ({error}): name another file") from error
+        self._kept = kept
         await self._engine.start()
 
     async def wait(self) -> None:

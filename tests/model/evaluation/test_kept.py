@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import asyncio
-import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -92,6 +91,6 @@ def test_what_did_not_come_to_its_end_is_asked_again(tmp_path: Path) -> None:
 
 def test_another_file_is_left_alone(tmp_path: Path) -> None:
     (file := tmp_path / "draws.sqlite").write_text("a letter to somebody")
-    with pytest.raises(sqlite3.DatabaseError):
+    with pytest.raises(ValueError, match="name another file"):
         ask(KeptDraws(FakeEngine(), file), ASKED)
     assert file.read_text() == "a letter to somebody"
