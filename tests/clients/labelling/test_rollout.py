@@ -111,7 +111,7 @@ def test_a_service_that_restarts_in_the_middle_is_waited_for(tmp_path: Path) -> 
                     while ledger.count(run) < 3:
                         await asyncio.sleep(0.005)
                     # Meanwhile the caller goes on sending what it has begun to send.
-                    await asyncio.to_thread(running.pop_all().close)
+                    await asyncio.to_thread(running.close)
                 assert not work.done(), "it was to be interrupted in the middle"
                 with serve(ScriptedEngine(), settings, port=port):
                     return await work

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import AsyncGenerator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from model.driving.plan import parse_plan
-from model.engines.engine import Controls, Draw, DrawFinished, Engine, EngineError, PlanRequest
+from model.engines.engine import Controls, Draw, DrawFinished, Engine, EngineError, Event, PlanRequest
 from model.evaluation.kept import KeptDraws
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import FakeEngine, draw_of
@@ -56,7 +56,7 @@ def test_draws_come_back_whole(tmp_path: Path) -> None:
     )  # fmt: skip
 
     class One(FakeEngine):
-        async def submit(self, request):  # type: ignore[no-untyped-def]
+        async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
             self.requests.append(request)
             yield DrawFinished(whole)
 
