@@ -17,7 +17,7 @@ from clients.planner import label_request, plan_request, reflect_request
 from loadtests.call import Call
 from loadtests.mix import BATCH_SCENES, Kind, Mix, Payload, Work
 from model.driving.images import media_type
-from model.driving.labeller import label_plan
+from model.driving.labeller import expert_plan
 from model.driving.plan import Plan, parse_plan
 from model.driving.scene import LabelledScene
 from model.driving.variations import fresh
@@ -75,8 +75,8 @@ def _asked(kind: Kind, labelled: LabelledScene, seed: int) -> dict[str, Any]:
     """The request with its pictures in base64."""
     scene = labelled.scene
     if kind.work == "label":
-        expert = label_plan(labelled.future, scene.history, labelled.lane_trace)
-        return label_request(scene, PROPOSED, expert, Surroundings.of(labelled), seed).model_dump(mode="json")
+        asked = label_request(scene, PROPOSED, expert_plan(labelled), Surroundings.of(labelled), seed)
+        return asked.model_dump(mode="json")
     shared: dict[str, Any] = {"n": kind.n, "seed": seed, "deadline_ms": kind.deadline_ms}
     if kind.work == "reflect":
         return reflect_request(scene, PROPOSED, wire.ReflectControls(**shared)).model_dump(mode="json")

@@ -16,7 +16,7 @@ from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
 from clients.labelling.teachers.patience import TryLater
 from clients.planner import AsyncPlannerClient, Patience
 from model.driving.hashing import hash_of, scene_hash
-from model.driving.labeller import label_plan
+from model.driving.labeller import expert_plan
 from model.driving.metrics import displacement_errors
 from model.driving.plan import Plan, plan_iou
 from model.driving.scene import LabelledScene, Scene
@@ -64,11 +64,6 @@ def jobs(
     """The scenes of a file or folder as pieces of work; ``unlabelled`` is told of those without a future."""
     for labelled in read_scenes(scenes, dense=False, unlabelled=unlabelled, group=group):
         yield Job(key_of(run, labelled), labelled.scene.scene_id, labelled)
-
-
-def expert_plan(labelled: LabelledScene) -> Plan:
-    """What the expert did, in words."""
-    return label_plan(labelled.future, labelled.scene.history, labelled.lane_trace)
 
 
 async def roll_out(

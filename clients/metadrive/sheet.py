@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from PIL import Image, ImageDraw
 
-from model.driving.labeller import label_plan
+from model.driving.labeller import expert_plan
 from model.driving.metrics import box_corners
 from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, SEMANTIC_CLASSES, LabelledScene
 
@@ -56,7 +56,7 @@ def _tile(labelled: LabelledScene) -> Image.Image:
     tile.paste(_bird_eye(labelled), (2 * _PICTURE[0], 0))
     draw = ImageDraw.Draw(tile)
     draw.text((4, _MAP + 1), f"{labelled.scene.scene_id}  {' '.join(sorted(labelled.tags))}", (0, 0, 0))
-    plan = label_plan(labelled.future, labelled.scene.history, labelled.lane_trace)
+    plan = expert_plan(labelled)
     draw.text((4, _MAP + 13), " ".join(str(plan).split())[:260], (60, 60, 60))
     return tile
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from clients.metadrive.generate import MANIFEST
-from model.driving.labeller import label_plan
+from model.driving.labeller import expert_plan
 from model.driving.lead import LEAD_WITHIN_M, lead_within
 from model.driving.metrics import collides, leaves_road
 from model.driving.plan import GROUPS, TICKS, WORDS, Plan
@@ -40,7 +40,7 @@ def scene_stats(path: Path, limit: int | None = None) -> dict[str, Any]:
         scenes += 1
         episodes.add(labelled.episode_id)
         tags.update(labelled.tags)
-        plan = label_plan(labelled.future, labelled.scene.history, labelled.lane_trace)
+        plan = expert_plan(labelled)
         ticks = _word_ticks(plan)
         words_in.update(ticks.keys())
         word_ticks.update(ticks)

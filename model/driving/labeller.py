@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from model.driving.plan import TICKS, Plan, Track, track_from_words
-from model.driving.scene import LaneTrace
+from model.driving.scene import LabelledScene, LaneTrace
 from model.driving.trajectory import HISTORY_STEPS, STEP_S, check_history, check_trajectory
 
 Array = npt.NDArray[np.float64]
@@ -101,6 +101,11 @@ def label_plan(future: npt.ArrayLike, history: npt.ArrayLike, lane_trace: LaneTr
         lateral=_track(_lateral(_smoothed(turned / STEP_S, SPEED_WINDOW), speed, changing)),
         lane=None if lane is None else _track(lane),
     )
+
+
+def expert_plan(labelled: LabelledScene) -> Plan:
+    """The plan that the expert of a labelled scene carries out."""
+    return label_plan(labelled.future, labelled.scene.history, labelled.lane_trace)
 
 
 def _longitudinal(speed: Array, acceleration: Array) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.labeller import label_plan
+from model.driving.labeller import expert_plan
 from model.driving.lead import lead_within
 from model.driving.metrics import collides, displacement_errors, leaves_road
 from model.driving.plan import Plan, plan_iou
@@ -80,11 +80,6 @@ class SceneResult:
     think_rate: float | None = None
     thought_iou_first: float | None = None
     thought_iou_revised: float | None = None
-
-
-def expert_plan(labelled: LabelledScene) -> Plan:
-    """The plan that the expert of a labelled scene carries out."""
-    return label_plan(labelled.future, labelled.scene.history, labelled.lane_trace)
 
 
 def evaluate_trajectories(labelled: LabelledScene, trajectories: FloatArray) -> SceneResult:

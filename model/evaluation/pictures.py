@@ -12,13 +12,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from model.driving.images import decode_image
+from model.driving.labeller import expert_plan
 from model.driving.metrics import displacement_errors
 from model.driving.plan import Plan
 from model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, Clip, LabelledScene, Scene
 from model.driving.trajectory import present_speed
 from model.engines.engine import Draw
 from model.evaluation.birds_eye import DIRECT_COLOUR, REFLECTED_COLOUR, draw_birds_eye
-from model.evaluation.open_loop import expert_plan, iou_with_expert
+from model.evaluation.open_loop import iou_with_expert
 from model.evaluation.timeline import draw_timeline, row_count
 
 WIDTH_PX: Final = 1400

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from model.driving.labeller import expert_plan
 from model.driving.scene import Clip, LabelledScene
 from model.engines.engine import (
     Controls,
@@ -19,7 +20,7 @@ from model.engines.engine import (
     EngineError,
     PlanRequest,
 )
-from model.evaluation.open_loop import SceneResult, evaluate_draws, expert_plan
+from model.evaluation.open_loop import SceneResult, evaluate_draws
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.labeller import label_plan
+from model.driving.labeller import expert_plan
 from model.driving.plan import Plan, plan_from_bins
 from model.driving.scene import CLIP_FRAMES, LabelledScene
 from model.driving.scene_store import read_scenes, scene_files
@@ -90,8 +90,7 @@ class Examples:
                 np.full((20, 2), np.nan, np.float32) if scene.route is None else scene.route
             )
             columns["future"].append(labelled.future)
-            plan = label_plan(labelled.future, scene.history, labelled.lane_trace)
-            columns["plan_bins"].append(plan.bins())
+            columns["plan_bins"].append(expert_plan(labelled).bins())
             dense = {target.camera: target for target in labelled.dense}
             columns["dense_classes"].append([dense[camera].classes for camera in cameras])
             columns["dense_range_log"].append(

@@ -14,9 +14,10 @@ import pytest
 
 from clients.labelling.ledger import Ledger, Run
 from clients.labelling.pipeline import Limits, StageStopped, Tally, work_through
-from clients.labelling.rollout import PATIENCE, Sampling, config_of, expert_plan, jobs, key_of, roll_out
+from clients.labelling.rollout import PATIENCE, Sampling, config_of, jobs, key_of, roll_out
 from clients.planner import AsyncPlannerClient
 from clients.wire import ModelName
+from model.driving.labeller import expert_plan
 from model.driving.scene_store import read_scenes
 from model.engines.engine import RequestError
 from service.settings import Settings

@@ -8,7 +8,7 @@ from clients.metadrive.episode import run_episode
 from clients.metadrive.episode_log import EpisodeLog
 from clients.metadrive.rig import Rig
 from clients.metadrive.windows import labelled_scenes
-from model.driving.labeller import label_plan
+from model.driving.labeller import expert_plan
 
 SEED, DURATION_S = 904, 30.0
 
@@ -57,6 +57,6 @@ def test_scenes_show_the_way_back_and_never_the_way_out(straying: EpisodeLog, ri
         assert not straying.strays[step + 1 : step + 65].any()
         offsets = np.abs(straying.lane_offsets[[step, step + 64]])
         returning += bool(offsets[0] > 0.25 > offsets[1])
-        plan = label_plan(labelled.future, labelled.scene.history, labelled.lane_trace)
+        plan = expert_plan(labelled)
         assert plan.word_at("lane", 0) == "Keep Lane", "coming back is no lane change"
     assert returning >= 2

@@ -23,7 +23,7 @@ from clients.metadrive.generate import (
 )
 from clients.metadrive.sheet import contact_sheet
 from clients.metadrive.stats import scene_stats
-from model.driving.labeller import label_plan
+from model.driving.labeller import expert_plan
 from model.driving.scene import TAGS, LabelledScene, SceneError
 from model.driving.scene_store import SceneFileError, read_scenes, write_scenes
 from tests.clients.metadrive.conftest import Filmed
@@ -114,7 +114,7 @@ def test_statistics_count_scenes_tags_and_words(folder: Path) -> None:
 
 
 def labelled_words(labelled: LabelledScene) -> set[str]:
-    plan = label_plan(labelled.future, labelled.scene.history, labelled.lane_trace)
+    plan = expert_plan(labelled)
     return {action.word for _, track in plan.tracks() for action in track}
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from model.driving.images import decode_image
+from model.driving.labeller import expert_plan
 from model.driving.plan import parse_plan
 from model.engines.engine import Controls
 from model.evaluation.ladder import (
@@ -24,7 +25,7 @@ from model.evaluation.ladder import (
     threshold_variants,
 )
 from model.evaluation.ladder_plots import difficulty_plot, temperature_plot, threshold_plot
-from model.evaluation.open_loop import SceneResult, evaluate_draws, expert_plan
+from model.evaluation.open_loop import SceneResult, evaluate_draws
 from model.evaluation.variants import Variant
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import draw_of

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from model.driving.labeller import expert_plan
 from model.driving.plan import MetaAction, Plan, plan_iou
 from model.evaluation.open_loop import (
     BASELINES,
@@ -13,7 +14,6 @@ from model.evaluation.open_loop import (
     evaluate_baselines,
     evaluate_draws,
     evaluate_trajectories,
-    expert_plan,
 )
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
 from tests.model.evaluation.fakes import draw_of, offset

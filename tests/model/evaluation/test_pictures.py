@@ -12,11 +12,11 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from model.driving.images import ImageError
+from model.driving.labeller import expert_plan
 from model.driving.plan import MetaAction, Plan
 from model.driving.scene import CAMERAS, Clip, LabelledScene, Scene
 from model.engines.engine import Draw
 from model.evaluation.birds_eye import DIRECT_COLOUR, REFLECTED_COLOUR
-from model.evaluation.open_loop import expert_plan
 from model.evaluation.pictures import HEIGHT_PX, WIDTH_PX, plan_picture
 from model.evaluation.timeline import WORD_COLOURS
 from tests.model.driving.drives import agent, labelled_scene, picture

@@ -4,8 +4,9 @@ import json
 
 import pytest
 
+from model.driving.labeller import expert_plan
 from model.evaluation.bootstrap import compare
-from model.evaluation.open_loop import evaluate_baselines, evaluate_draws, expert_plan
+from model.evaluation.open_loop import evaluate_baselines, evaluate_draws
 from model.evaluation.table import Row, format_table, to_json
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import draw_of, offset

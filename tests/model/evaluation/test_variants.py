@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from model.driving.labeller import expert_plan
 from model.driving.scene import LabelledScene
 from model.engines.engine import Controls, EngineError
-from model.evaluation.open_loop import SceneResult, expert_plan
+from model.evaluation.open_loop import SceneResult
 from model.evaluation.variants import (
     Variant,
     evaluate_engine,

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from model.driving.images import decode_image
+from model.driving.labeller import expert_plan
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.driving.scene_store import write_scenes
-from model.evaluation.open_loop import expert_plan
 from model.training.examples import Examples, load_examples
 from tests.model.training.scenes import training_scene
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from model.driving.labeller import expert_plan
 from model.driving.plan import parse_plan
 from model.driving.reflection_store import LabelledReflection, write_reflections
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import write_scenes
-from model.evaluation.open_loop import expert_plan
 from model.network.checkpoint import load
 from model.training.recipes import NANO, Recipe
 from model.training.run import RunSettings, last_whole_state, run

@@ -12,13 +12,13 @@ from clients.labelling.teachers.rules import RuleTeacher
 from clients.labelling.teachers.teacher import Question, TeacherError
 from clients.labelling.teachers.view import Surroundings
 from model.bundled import SCENES
-from model.driving.labeller import label_plan
+from model.driving.labeller import expert_plan
 from model.driving.plan import WORDS, Plan, track_from_words
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
 
 BUNDLED = list(read_scenes(SCENES, dense=False))
-PLANS = [label_plan(each.future, each.scene.history, each.lane_trace) for each in BUNDLED]
+PLANS = [expert_plan(each) for each in BUNDLED]
 INDEPENDENT = re.compile(
     r"expert|truth|label|annot|dataset|data set|predict|image|frame|video|camera|picture|trajector|will\b|"
     r"going to|about to|later\b.*(?:stop|turn|brake)|oracle|teacher|simulat|future|ground|hindsight",

@@ -17,14 +17,14 @@ from clients.labelling.teachers.teacher import (
 )
 from clients.labelling.teachers.view import Surroundings
 from model.bundled import SCENES
-from model.driving.labeller import label_plan
+from model.driving.labeller import expert_plan
 from model.driving.scene_store import read_scenes
 
 SCENE, OTHER = list(read_scenes(SCENES, dense=False))[:2]
 QUESTION = Question(
     SCENE.scene,
-    label_plan(OTHER.future, OTHER.scene.history, OTHER.lane_trace),
-    label_plan(SCENE.future, SCENE.scene.history, SCENE.lane_trace),
+    expert_plan(OTHER),
+    expert_plan(SCENE),
     Surroundings.of(SCENE),
 )
 GOOD = asyncio.run(RuleTeacher().reflect(QUESTION))
