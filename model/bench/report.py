@@ -124,17 +124,23 @@ def _load(row: Row) -> tuple[int, int, str, float]:
     return row.scenes, row.n, row.thinking, row.temperature
 
 
+def _rows(row: Row) -> str:
+    """Rows that were fed, of those that a row for every draw would have come to."""
+    fan_out = row.counts.get("fan_out_row_passes")
+    return f"{row.counts['row_passes'] / fan_out:.2f}" if fan_out else "-"
+
+
 def _table(rows: Sequence[Row]) -> str:
     head = (
         f"{'engine':<40}{'load':>8}  {'thinking':<9}{'p50 ms':>8}{'p95 ms':>8}{'plans/s':>9}{'spread':>13}"
-        f"{'tokens/s':>10}{'passes':>8}{'tokens':>8}{'forced':>8}{'valid':>7}{'MiB':>7}"
+        f"{'tokens/s':>10}{'passes':>8}{'tokens':>8}{'forced':>8}{'valid':>7}{'rows':>6}{'MiB':>7}"
     )
     lines = [
         f"{row.engine:<40}{f'{row.scenes} x {row.n}':>8}  {row.thinking:<9}{row.latency_p50_s * 1e3:>8.0f}"
         f"{row.latency_p95_s * 1e3:>8.0f}{row.plans_per_s:>9.2f}"
         f"{f'{row.plans_per_s_spread[0]:.2f}-{row.plans_per_s_spread[1]:.2f}':>13}{row.tokens_per_s:>10.0f}"
         f"{row.passes_per_response:>8.1f}{row.tokens_per_response:>8.1f}{row.forced_share:>8.0%}"
-        f"{row.valid_share:>7.0%}{row.peak_bytes / 2**20:>7.0f}"
+        f"{row.valid_share:>7.0%}{_rows(row):>6}{row.peak_bytes / 2**20:>7.0f}"
         for row in rows
     ]
     return "\n".join([head, *lines])

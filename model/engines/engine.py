@@ -68,12 +68,16 @@ class Controls:
     def __post_init__(self) -> None:
         if self.thinking not in ("adaptive", "always", "never"):
             raise RequestError(f"thinking must be adaptive, always or never, got {self.thinking!r}")
-        if not 1 <= self.n <= MAX_DRAWS:
-            raise RequestError(f"n must lie in 1..{MAX_DRAWS}, got {self.n}")
+        if not isinstance(self.n, int) or not 1 <= self.n <= MAX_DRAWS:
+            raise RequestError(f"n must be a whole number in 1..{MAX_DRAWS}, got {self.n}")
         if not 0.0 <= self.temperature <= 2.0:
             raise RequestError(f"temperature must lie in 0..2, got {self.temperature}")
         if not 0.0 < self.top_p <= 1.0:
             raise RequestError(f"top_p must lie in (0, 1], got {self.top_p}")
+        if not isinstance(self.seed, int):
+            raise RequestError(f"seed must be a whole number, got {self.seed}")
+        if self.deadline_ms is not None and not self.deadline_ms >= 0:
+            raise RequestError(f"deadline_ms must be 0 or more, got {self.deadline_ms}")
         if self.think_threshold is not None:
             if self.thinking != "adaptive":
                 raise RequestError("think_threshold only has a meaning with thinking: adaptive")

@@ -35,7 +35,7 @@ class ClipCache:
 
     def keep(self, key: bytes, tokens: Tensor) -> None:
         """Keep ``tokens``, and forget others until they fit; too large ones are not kept at all."""
-        if key in self._kept:
+        if key in self._kept or tokens.nbytes > self._max_bytes:
             return
         self._kept[key] = tokens
         self._bytes += tokens.nbytes

@@ -58,12 +58,15 @@ class Shortcuts:
         speculate: a revised plan is fed as far as it may repeat the first one, and any response as the last
             one to the same pictures, or others, went on, as far as that is likely; what is fed ahead is
             checked.
+        reuse: what pictures come to, and what all prompts begin with, is kept for those that come again (by
+            the `Runner`).
     """
 
     jump: bool = True
     shared_rows: bool = True
     shared_prompts: bool = True
     speculate: bool = True
+    reuse: bool = True
 
     @classmethod
     def none(cls) -> Shortcuts:
@@ -226,12 +229,14 @@ class Decoder:
         for row, feed, logits in zip(rows, feeds, found, strict=True):
             if row not in self._rows:
                 continue  # its request failed with another of its rows
-            if all(np.isfinite(values).all() for values in logits):
+            if not all(np.isfinite(values).all() for values in logits):
+                events.append(self._fail_without_numbers(row.request))
+                continue
+            try:
                 events += self._apply(row, feed, logits)
-            else:
-                events.append(
-                    self._fail(row.request, EngineError("the network gave logits that are no numbers"))
-                )
+            except Exception as error:  # one draw that cannot go on must not end the others
+                failure = EngineError.because("a draw could not go on", error)
+                events.append(self._fail(row.request, failure))
         return events + self._end_the_done()
 
     def check_integrity(self) -> None:
@@ -466,6 +471,13 @@ class Decoder:
         beginning.rows.remove(row)
         if not beginning.rows:
             self._drop_beginning(beginning)
+
+    def _fail_without_numbers(self, request: Request) -> StepEvent:
+        """End a request whose logits are no numbers, and let nobody read what it has written."""
+        for prompt in {id(row.prompt): row.prompt for row in self._rows if row.request is request}.values():
+            assert prompt is not None
+            self._runner.wipe_prompt(prompt)
+        return self._fail(request, EngineError("the network gave logits that are no numbers"))
 
     def _fail(self, request: Request, error: Exception) -> StepEvent:
         self.cancel(request.id)

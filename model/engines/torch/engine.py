@@ -171,6 +171,9 @@ class TorchEngine:
             decoder.add(request, submitted_s)
         except RequestError as error:
             self._tell(request.request_id, Failed(error))
+        except Exception as error:  # one request that cannot be read must not end the others
+            failure = EngineError.because("the request could not be begun", error)
+            self._tell(request.request_id, Failed(failure))
 
     def _tell(self, request_id: str, event: Event | Failed) -> None:
         if listener := self._listeners.get(request_id):
@@ -189,6 +192,7 @@ class TorchEngine:
                     clip_bytes=settings.clip_bytes,
                     frames=self._frames,
                     products=settings.products,
+                    reuse=settings.shortcuts.reuse,
                 )
                 decoder = Decoder(runner, settings.shortcuts, clock=time.monotonic)
                 self._counts = decoder.counts

@@ -38,13 +38,19 @@ class AllowedHead:
         rows_of: dict[int, list[int]] = {}
         for row, ids in enumerate(wanted):
             rows_of.setdefault(id(ids), []).append(row)
-        found: list[npt.NDArray[np.float64]] = [np.empty(0)] * len(wanted)
+        products = []
         for rows in rows_of.values():
-            ids = wanted[rows[0]]
-            part = self._part(ids)
+            part = self._part(wanted[rows[0]])
             chosen = hidden if len(rows) == len(hidden) else hidden[rows]
-            logits = torch.mm(chosen, self._weight if part is None else part).double().cpu().numpy()
-            if part is None:
+            products.append(torch.mm(chosen, self._weight if part is None else part))
+        # All at once: on a GPU every copy waits for what was asked before.
+        every = torch.cat([product.flatten() for product in products]).double().cpu().numpy()
+        ends = np.cumsum([product.numel() for product in products])
+        found: list[npt.NDArray[np.float64]] = [np.empty(0)] * len(wanted)
+        for rows, flat in zip(rows_of.values(), np.split(every, ends[:-1]), strict=True):
+            ids = wanted[rows[0]]
+            logits = flat.reshape(len(rows), -1)
+            if logits.shape[1] != len(ids):
                 logits = logits[:, ids]
             for row, values in zip(rows, logits, strict=True):
                 found[row] = values

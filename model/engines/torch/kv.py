@@ -36,7 +36,7 @@ class KvRows:
         """The first places of the first rows, [2, layers, rows, heads, length, head_dim].
 
         What was never written is zero and not garbage: masked places are multiplied by weights of zero, and
-        0 x NaN would be NaN.
+        0 x NaN would be NaN. So what was written and is no number is to be wiped.
         """
         for row in range(rows):
             if self._reached[row] < length:
@@ -47,6 +47,10 @@ class KvRows:
     def row(self, row: int, length: int) -> Tensor:
         """The first places of one row, [2, layers, heads, length, head_dim]."""
         return self.reach(row + 1, length)[:, :, row]
+
+    def wipe(self, row: int) -> None:
+        """Make everything of a row zero."""
+        self._both[:, :, row, :, : self._reached[row]] = 0
 
     def copy(self, source: int, target: int, length: int) -> None:
         """Make row ``target`` hold what row ``source`` holds in its first ``length`` places."""

@@ -103,6 +103,7 @@ class Runner:
         clip_bytes: of vision tokens kept for pictures that come again, and as many of keys and values.
         frames: where pictures are decoded; by default a new one.
         products: what matrix products are worked out in; None for the weights' own type.
+        reuse: whether anything is kept from scene to scene at all.
         formats: of them those that the checkpoint writes are served.
 
     Attributes:
@@ -118,6 +119,7 @@ class Runner:
         clip_bytes: int = 0,
         frames: Frames | None = None,
         products: torch.dtype | None = None,
+        reuse: bool = True,
         formats: Mapping[str, Format] = FORMATS,
     ) -> None:
         self.loaded = loaded
@@ -132,6 +134,7 @@ class Runner:
         self._products = products
         self._decoder = PackedDecoder(model.model.language_model, products)
         self._head = AllowedHead(model.lm_head.weight)
+        self._reuse, clip_bytes = reuse, clip_bytes if reuse else 0
         self._clips, self._pictures = ClipCache(clip_bytes), ClipCache(clip_bytes)
         self._frames = frames or Frames(loaded.inputs)
         tower = model.model.visual
@@ -179,7 +182,11 @@ class Runner:
                 continue
             tokens = [each.kept[key] if key in each.kept else made[key] for key in each.keys]
             shown = format.encode() + b"".join(each.keys)
-            begun.append(self._begin_prompt(scene, format, row, torch.cat(tokens), shown))
+            try:
+                begun.append(self._begin_prompt(scene, format, row, torch.cat(tokens), shown))
+            except Exception as error:  # one scene that cannot be embedded must not end the others
+                begun.append(error)
+                continue
             row += 1
         for key, vision_tokens in made.items():
             # A copy: a part of a tensor would keep all of it.
@@ -216,6 +223,10 @@ class Runner:
         """Put a prompt, and all that is written behind it, into another row."""
         self._memory.copy(prompt.row, row, max(prompt.held, prompt.end))
         prompt.row = row
+
+    def wipe_prompt(self, prompt: Prompt) -> None:
+        """Make nothing of a prompt's row, and of all that is written behind it."""
+        self._memory.wipe(prompt.row)
 
     def feed(self, feeds: Sequence[Feed]) -> list[list[npt.NDArray[np.float64]]]:
         """Feed rows their next tokens in one pass, of a prompt all or none.
@@ -305,7 +316,8 @@ class Runner:
             shown,
             int(clips[-1]) + 1,
         )
-        self._begin_with_shared(begun, format, int(clips[0]))
+        if self._reuse:
+            self._begin_with_shared(begun, format, int(clips[0]))
         return begun
 
     def _begin_with_shared(self, prompt: Prompt, format: str, count: int) -> None:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 
+from model.bench.contenders import SHORTCUTS
 from model.bench.memory import peak_bytes
 from model.bench.report import BenchReport, Roofline
 from model.bench.roofline import Machine, Work
 from model.bench.run import Job, Row, can_do, run
 from model.bench.workload import Workload
 from model.bundled import SCENES
+from model.engines.torch.decoder import Shortcuts
 
 
 def job(checkpoint: Path, *contenders: str, loads: tuple[Workload, ...]) -> Job:
@@ -44,6 +47,7 @@ def test_engines_run_side_by_side(untrained_checkpoint: Path) -> None:
 
 
 def test_shortcuts_are_switched_by_name(untrained_checkpoint: Path) -> None:
+    assert set(SHORTCUTS) == {field.name for field in fields(Shortcuts)}
     names = ("torch+none", "torch+jump")
     none, jump = run(job(untrained_checkpoint, *names, loads=(Workload(1, 2, "never"),)), lambda _: None)
     assert none.passes_per_response > 0.95 * none.tokens_per_response
@@ -94,7 +98,8 @@ def test_reports_say_how_much_slower_the_others_are() -> None:
     machine = Machine(1e10, 1e12, "bfloat16", "cpu")
     work = Work(2e9, 1e8)
     roofline = Roofline(machine, 1, 6, work, work.seconds(machine), 0.1)
-    report = BenchReport((row("torch", 0.1, 10.0), row("vllm", 0.4, 5.0)), (), (roofline,))
+    shared = replace(row("torch", 0.1, 10.0), counts={"row_passes": 63, "fan_out_row_passes": 90})
+    report = BenchReport((row("torch", 0.1, 10.0), row("vllm", 0.4, 5.0)), (shared,), (roofline,))
     [ratio] = report.ratios()
     assert ratio["latency_p50"] == pytest.approx(4.0)
     assert ratio["plans_per_s"] == pytest.approx(2.0)
@@ -106,3 +111,4 @@ def test_reports_say_how_much_slower_the_others_are() -> None:
     )
     assert "vllm" in str(report)
     assert "10%" in str(report)
+    assert "0.70" in str(report), "the share of rows that draws that agree leave to be fed"

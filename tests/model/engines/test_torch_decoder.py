@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields, replace
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from model.bundled import CHECKPOINT, SCENES
 from model.driving.plan import parse_plan
+from model.driving.scene_store import read_scenes
 from model.engines.engine import (
     Controls,
     DraftFinished,
@@ -90,8 +93,8 @@ def test_draws_are_those_of_the_plain_decoder(
     exact: Loaded, plainly: dict[tuple[str, int], Draw], off: str | None
 ) -> None:
     shortcuts = Shortcuts.none() if off == "all" else replace(Shortcuts(), **({off: False} if off else {}))
-    decoder = Decoder(Runner(exact, 13, clip_bytes=1 << 20), shortcuts, prompt_chunk=50)
-    draws = decode(decoder, *MIX)
+    runner = Runner(exact, 13, clip_bytes=1 << 20, reuse=shortcuts.reuse)
+    draws = decode(Decoder(runner, shortcuts, prompt_chunk=50), *MIX)
     assert draws.keys() == plainly.keys()
     for key, draw in draws.items():
         assert draw.text == plainly[key].text, key
@@ -337,6 +340,31 @@ def test_thinking_is_cut_when_the_rest_would_not_fit(exact: Loaded) -> None:
     assert draw.revised_plan is not None
     assert draw.tokens["thinking"] < unhurried.tokens["thinking"]
     assert draw.plan == unhurried.plan
+
+
+def test_thinking_ends_at_a_sentence_when_time_gets_short() -> None:
+    trained = exactly(load(CHECKPOINT, dtype=torch.float64))
+    [labelled, *_] = read_scenes(SCENES)
+    controls = Controls(n=1, seed=1, thinking="always", deadline_ms=100_000)
+    asked = PlanRequest("a", labelled.scene, "cf_vla", controls)
+    unhurried = decode(Decoder(Runner(trained, 2), clock=Clock()), asked)["a", 0]
+    clock = Clock()
+    decoder = Decoder(Runner(trained, 2), clock=clock, pace=Steady())
+    decoder.add(asked)
+    draws = []
+    while not decoder.idle:
+        for _, event in decoder.step():
+            if isinstance(event, SectionFinished) and event.section == "branch":
+                clock.now_s = 99.5  # 50 steps are left and 40 are needed
+            draws += [event.draw] if isinstance(event, DrawFinished) else []
+    (draw,) = draws
+    assert draw.cut == "shortened"
+    assert draw.thinking is not None
+    assert unhurried.thinking is not None
+    first, *rest = re.split(r"(?<=[.!?]) ", unhurried.thinking)
+    assert rest, "there is a sentence to leave out"
+    assert draw.thinking == first
+    assert draw.revised_plan is not None
 
 
 def test_steps_that_vary_are_left_more_room() -> None:

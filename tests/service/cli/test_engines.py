@@ -35,7 +35,7 @@ def test_vllm_arguments_must_be_an_object(untrained_checkpoint: Path, arguments:
     [
         (["--engines", "torch,hf"], "unknown engine hf"),
         (["--at-once", "1,0"], "'0' is no positive number"),
-        (["--draws", "65"], "n must lie in 1..64"),
+        (["--draws", "65"], "n must be a whole number in 1..64"),
         (["--thinking", "sometimes"], "thinking must be"),
         (["--preset", "cf-vla-3b"], "say --random-weights"),
         (["--preset", "gpt"], "unknown preset 'gpt'"),

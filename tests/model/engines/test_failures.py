@@ -1,0 +1,147 @@
+"""What goes wrong with one request is that request's alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+
+from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, RequestError
+from model.engines.torch.decoder import Decoder, Failed
+from model.engines.torch.pace import TimeFor
+from model.engines.torch.rows import Row
+from model.engines.torch.runner import Runner
+from model.network.checkpoint import Loaded, load
+from tests.checkpoints import noisy_scene
+from tests.model.engines.reference import exactly, reference_draws
+
+BAD = "bad"
+
+
+@pytest.fixture(scope="module")
+def exact(untrained_checkpoint: Path) -> Loaded:
+    return exactly(load(untrained_checkpoint, dtype=torch.float64))
+
+
+@pytest.fixture(autouse=True)
+def _inference() -> Iterator[None]:
+    with torch.inference_mode():
+        yield
+
+
+def request(name: str, scene: int, n: int = 2) -> PlanRequest:
+    return PlanRequest(name, noisy_scene(scene, route=scene % 2 == 1), "cf_vla", Controls(n=n, seed=scene))
+
+
+def decode(
+    decoder: Decoder, *requests: PlanRequest
+) -> tuple[dict[tuple[str, int], Draw], dict[str, Exception]]:
+    """What ended, and what failed."""
+    for each in requests:
+        decoder.add(each)
+    draws, failed = {}, {}
+    while not decoder.idle:
+        for name, event in decoder.step():
+            if isinstance(event, DrawFinished):
+                draws[name, event.draw.index] = event.draw
+            elif isinstance(event, Failed):
+                failed[name] = event.error
+        decoder.check_integrity()
+    return draws, failed
+
+
+def assert_as_alone(exact: Loaded, draws: dict[tuple[str, int], Draw], *requests: PlanRequest) -> None:
+    for asked in requests:
+        for draw in reference_draws(exact, asked):
+            assert draws[asked.request_id, draw.index].text == draw.text
+
+
+def test_a_scene_without_numbers_fails_alone_and_nobody_reads_what_it_wrote(
+    exact: Loaded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bad, good, later = request(BAD, 7), request("good", 2), request("later", 4)
+    embed = exact.model.embed_prompt
+
+    def embedding(prompt: Any, vision_tokens: Any, history: Any, route: Any) -> Any:
+        embedded = embed(prompt, vision_tokens, history, route)
+        if history is bad.scene.history:
+            embedded.embeddings[-3:] = float("nan")
+        return embedded
+
+    monkeypatch.setattr(exact.model, "embed_prompt", embedding)
+    decoder = Decoder(Runner(exact, 8))
+    decoder.add(good)
+    decoder.add(bad)
+    failed: list[Failed] = []
+    while not failed:
+        failed = [event for _, event in decoder.step() if isinstance(event, Failed)]
+    assert "no numbers" in str(failed[0].error)
+    # Its prompt is one shorter, it is where the failed one was, and it is read as far as the other has come.
+    draws, others = decode(decoder, later)
+    assert not others
+    assert_as_alone(exact, draws, good, later)
+
+
+def test_a_scene_that_cannot_be_embedded_fails_alone(exact: Loaded, monkeypatch: pytest.MonkeyPatch) -> None:
+    bad, good = request(BAD, 7), request("good", 2)
+    embed = exact.model.embed_prompt
+
+    def embedding(prompt: Any, vision_tokens: Any, history: Any, route: Any) -> Any:
+        if history is bad.scene.history:
+            raise ArithmeticError("no")
+        return embed(prompt, vision_tokens, history, route)
+
+    monkeypatch.setattr(exact.model, "embed_prompt", embedding)
+    draws, failed = decode(Decoder(Runner(exact, 8)), bad, good)
+    assert list(failed) == [BAD]
+    assert_as_alone(exact, draws, good)
+
+
+@pytest.mark.parametrize("decision", [0, 3])
+def test_a_draw_that_cannot_go_on_ends_its_request_alone(
+    exact: Loaded, monkeypatch: pytest.MonkeyPatch, decision: int
+) -> None:
+    choices, seen = Row.choices, []
+
+    def choosing(row: Row, logits: npt.NDArray[np.float64], time_for: TimeFor) -> Any:
+        if row.request.id == BAD:
+            seen.append(row)
+            if len(seen) > decision:
+                raise ArithmeticError("no")
+        return choices(row, logits, time_for)
+
+    monkeypatch.setattr(Row, "choices", choosing)
+    good = request("good", 2)
+    draws, failed = decode(Decoder(Runner(exact, 8)), request(BAD, 7, n=4), good)
+    assert list(failed) == [BAD]
+    assert "a draw could not go on: no" in str(failed[BAD])
+    assert_as_alone(exact, draws, good)
+
+
+@pytest.mark.parametrize(
+    ("controls", "message"),
+    [
+        ({"n": 0}, "n must be"),
+        ({"n": 1_000_000}, "n must be"),
+        ({"n": 2.5}, "n must be"),
+        ({"think_threshold": -0.01}, "think_threshold must lie"),
+        ({"think_threshold": 1.01}, "think_threshold must lie"),
+        ({"think_threshold": float("nan")}, "think_threshold must lie"),
+        ({"think_threshold": 0.5, "thinking": "always"}, "only has a meaning"),
+        ({"thinking": "sometimes"}, "thinking must be"),
+        ({"temperature": -0.1}, "temperature must lie"),
+        ({"temperature": float("nan")}, "temperature must lie"),
+        ({"top_p": 0.0}, "top_p must lie"),
+        ({"seed": 0.5}, "seed must be"),
+        ({"deadline_ms": -1}, "deadline_ms must be"),
+        ({"deadline_ms": float("nan")}, "deadline_ms must be"),
+    ],
+)
+def test_controls_that_mean_nothing_are_refused(controls: dict[str, Any], message: str) -> None:
+    with pytest.raises(RequestError, match=message):
+        Controls(**controls)
