@@ -68,7 +68,7 @@ $(BIN)/promtool: | $(VENV)/.created
 vllm: $(VLLM_VENV)/.made
 
 test-vllm: $(VLLM_VENV)/.made
-	$(VLLM_BIN)/python -m pytest tests/model/engines/vllm tests/clients/labelling/teachers/vllm
+	$(VLLM_BIN)/python -m pytest tests/model/engines/vllm tests/clients/labelling/teachers/vllm tests/service/vllm
 
 $(VLLM_VENV)/.made: deploy/vllm/constraints.txt deploy/vllm/cpu_torchvision.py pyproject.toml
 	$(PYTHON) -m venv $(VLLM_VENV)

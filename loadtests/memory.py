@@ -71,21 +71,30 @@ class Growth:
     """How memory went.
 
     Attributes:
-        first_bytes, last_bytes: medians of the first and the last tenth of the readings.
+        first_bytes, middle_bytes, last_bytes: medians of the first tenth of the readings, the tenth in the
+            middle, and the last.
         bytes_per_hour: slope of the line through all of them, by least squares.
     """
 
     first_bytes: int
+    middle_bytes: int
     last_bytes: int
     bytes_per_hour: float
+
+    @property
+    def late(self) -> float:
+        """Growth over the second half, as a share: caches and pools have filled up in the first."""
+        return self.last_bytes / self.middle_bytes - 1
 
     def to_json(self) -> dict[str, Any]:
         """For scripts."""
         return {
             "first_bytes": self.first_bytes,
+            "middle_bytes": self.middle_bytes,
             "last_bytes": self.last_bytes,
             "growth_bytes": self.last_bytes - self.first_bytes,
             "growth_bytes_per_hour": self.bytes_per_hour,
+            "late_growth": self.late,
         }
 
 
@@ -99,4 +108,8 @@ def growth(readings: Sequence[Reading]) -> Growth | None:
     )
     edge = max(1, int(len(rss) * _EDGE))
     slope = np.polyfit(at_s - at_s[0], rss, 1)[0]
-    return Growth(int(np.median(rss[:edge])), int(np.median(rss[-edge:])), float(slope * 3600))
+    middle = (len(rss) - edge) // 2
+    first, half, last = (
+        int(np.median(part)) for part in (rss[:edge], rss[middle : middle + edge], rss[-edge:])
+    )
+    return Growth(first, half, last, float(slope * 3600))

@@ -18,6 +18,14 @@ _KEPT: Final = 1024
 _KEPT_BYTES: Final = 64_000_000
 
 
+class NotKept(Exception):
+    """An answer that is given and not kept: another try may get a better one."""
+
+    def __init__(self, answer: Response) -> None:
+        super().__init__()
+        self.answer = answer
+
+
 @dataclass(frozen=True)
 class _Made:
     fingerprint: bytes

@@ -10,6 +10,7 @@ import numpy as np
 import clients.wire as wire
 from clients.labelling.teachers.patience import patiently
 from clients.labelling.teachers.teacher import (
+    AnnotationsMissing,
     Answer,
     Question,
     ReflectionRefused,
@@ -23,7 +24,15 @@ from clients.labelling.teachers.view import Surroundings
 from model.driving.scene import AGENT_KINDS, Agent
 from service.intake import plan_of, scene_of
 from service.metrics import Metrics
-from service.problems import INVALID_REQUEST, LABEL_REFUSED, NEEDS_ANNOTATIONS, TEACHER_AWAY, ProblemError, at
+from service.problems import (
+    INVALID_REQUEST,
+    LABEL_REFUSED,
+    NEEDS_ANNOTATIONS,
+    TEACHER_AWAY,
+    TEACHER_REFUSED,
+    ProblemError,
+    at,
+)
 
 PATIENCE_S: Final = 30.0
 """That a teacher may be busy or away before its caller is told."""
@@ -46,8 +55,10 @@ async def label(
         reflection = await patiently(lambda: ask(teacher, question, answers), PATIENCE_S)
     except (TeacherBusy, TeacherClosed) as error:
         raise ProblemError(TEACHER_AWAY, f"{teacher.name}: {error}") from None
-    except TeacherError as error:
+    except AnnotationsMissing as error:
         raise ProblemError(NEEDS_ANNOTATIONS, f"{teacher.name}: {error}") from None
+    except TeacherError as error:
+        raise ProblemError(TEACHER_REFUSED, f"{teacher.name}: {error}") from None
     except ReflectionRefused as error:
         metrics.label_asked(teacher.name, [each.check for each in error.failed], written=False)
         raise ProblemError(LABEL_REFUSED, f"{teacher.name}, asked {error.attempts} times: {error}") from None

@@ -59,6 +59,12 @@ class Metrics:
             ["reason"],
             registry=registry,
         )
+        self._failures = Counter(
+            "looktwice_failures_told",
+            "Failures told in an answer of status 200: in a stream, or of a scene of a batch.",
+            ["reason"],
+            registry=registry,
+        )
         self._queue = Histogram(
             "looktwice_queue_seconds",
             "Of a scene, for its turn in a batch and for its place in the engine.",
@@ -180,6 +186,12 @@ class Metrics:
         """Count a request, or a scene of a batch, that may have been right and was not served."""
         if kind in REJECTIONS:
             self._rejections.labels(kind.slug).inc()
+
+    def problem_told_within(self, kind: Kind) -> None:
+        """Count a problem that no status shows, since it is told in a stream or in a batch's answer."""
+        self.problem_told(kind)
+        if kind.status >= 500 and kind.status != 503:
+            self._failures.labels(kind.slug).inc()
 
     def answered(self, endpoint: str, queue_s: float, engine_s: float) -> None:
         """Count one scene that was planned for."""

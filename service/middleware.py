@@ -95,5 +95,7 @@ class Around:
                 method=method,
                 path=scope["path"],
                 status=status,
+                owner=scope.get("state", {}).get("owner"),
+                client=scope["client"][0] if scope["client"] else None,
                 milliseconds=round(1000 * seconds, 1),
             )

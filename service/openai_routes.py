@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import AsyncGenerator
 from contextlib import aclosing
-from typing import Any
+from typing import Any, Final
 
 from fastapi import APIRouter, Request
 from fastapi.exceptions import RequestValidationError
@@ -16,7 +16,7 @@ import clients.wire as wire
 from service.callers import while_connected
 from service.errors import from_validation, problem_document
 from service.openai_chat import THINKING, ChatRequest, Completion, plan_request, trajectory_text
-from service.openapi import problems
+from service.openapi import Responses, problems
 from service.parts import Parts
 from service.payloads import payload_route
 from service.planning import Planned, last
@@ -24,12 +24,33 @@ from service.planning_routes import REFUSALS, arrival_of
 from service.problems import ProblemError
 from service.streaming import Told, Written, streamed
 
+_ANSWERS: Final[Responses] = {
+    200: {
+        "content": {
+            "application/json": {
+                "schema": {
+                    "type": "object",
+                    "description": "A chat completion; each message has a `looktwice` with its draw.",
+                    "required": ["id", "object", "created", "model", "choices", "usage"],
+                    "properties": {
+                        "object": {"const": "chat.completion"},
+                        "choices": {"type": "array", "minItems": 1, "items": {"type": "object"}},
+                    },
+                }
+            },
+            wire.SSE_MEDIA_TYPE: {
+                "schema": {"type": "string", "description": "With stream: true. Chat completion chunks."}
+            },
+        }
+    }
+}
+
 
 def openai_router(parts: Parts) -> APIRouter:
     """The endpoint for clients of OpenAI's API."""
     router = APIRouter(route_class=payload_route(lambda _: parts.planning.check_open()), tags=["planning"])
 
-    @router.post("/v1/chat/completions", responses=problems(*REFUSALS))
+    @router.post("/v1/chat/completions", responses=problems(*REFUSALS) | _ANSWERS)
     async def chat_completions(request: Request, chat: ChatRequest) -> Any:
         """Planning in OpenAI's dialect: pictures as image parts, a message per draw; see docs/http.md."""
         arrival = arrival_of(request)

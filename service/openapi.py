@@ -20,6 +20,12 @@ from service.problems import INTERNAL, Kind
 Responses = dict[int | str, dict[str, Any]]
 
 
+PACKED: Responses = {
+    200: {"content": {MSGPACK_MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}}}
+}
+"""Of a route that answers in msgpack where that is accepted."""
+
+
 def problems(*kinds: Kind) -> Responses:
     """What a route declares about its errors; 500 can occur anywhere."""
     by_status: dict[int, list[Kind]] = {}

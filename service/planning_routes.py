@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
+import structlog
 from fastapi import APIRouter, Body, Header, Request
 from fastapi.openapi.models import Example
 from pydantic import BaseModel
@@ -18,7 +19,8 @@ from service.answers import plan_answer, reflect_answer
 from service.callers import while_connected
 from service.errors import problem_document
 from service.examples import example_reflection, example_request
-from service.openapi import Responses, payloads, problems
+from service.idempotency import NotKept
+from service.openapi import PACKED, Responses, payloads, problems
 from service.parts import Parts
 from service.payloads import packed, payload_route
 from service.planning import Arrival, Asked, Planned, last
@@ -51,9 +53,14 @@ from service.problems import (
     UNSUPPORTED_MEDIA_TYPE,
     ProblemError,
     at,
+    unforeseen,
 )
 from service.streaming import server_sent, streamed
 
+log = structlog.stdlib.get_logger()
+
+_TRY_AGAIN: Final = frozenset((429, 500, 503, 504))
+"""What a scene of a batch may get that another try may better."""
 PLAN_EXAMPLES: dict[str, Example] = {"straight on": {"value": example_request((FRONT_WIDE, FRONT_TELE))}}
 REFLECT_EXAMPLES: dict[str, Example] = {
     "is it right to go on?": {"value": example_reflection((FRONT_WIDE, FRONT_TELE))}
@@ -61,7 +68,7 @@ REFLECT_EXAMPLES: dict[str, Example] = {
 STREAM: Responses = {
     200: {
         "content": {
-            wire.MSGPACK_MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}},
+            **PACKED[200]["content"],
             wire.SSE_MEDIA_TYPE: {
                 "schema": {
                     "type": "string",
@@ -132,7 +139,7 @@ def planning_router(parts: Parts) -> APIRouter:
     @batches.post(
         "/v1/plan/batch",
         response_model=wire.BatchResponse,
-        responses=refusals,
+        responses=refusals | PACKED,
         openapi_extra=payloads(wire.BatchRequest),
     )
     async def batch(
@@ -149,7 +156,11 @@ def planning_router(parts: Parts) -> APIRouter:
                 await parts.planning.spend(arrival.owner, sum(each.controls.n for each in asked.requests))
                 async with asyncio.TaskGroup() as group:
                     tasks = [group.create_task(_result(parts, each, arrival)) for each in asked.requests]
-            return respond(request, wire.BatchResponse(results=[task.result() for task in tasks]))
+            results = [task.result() for task in tasks]
+            answer = respond(request, wire.BatchResponse(results=results))
+            if any(result.status in _TRY_AGAIN for result in results):
+                raise NotKept(answer)
+            return answer
 
         return await _once(request, parts, arrival, idempotency_key, asked, work)
 
@@ -210,17 +221,24 @@ async def _once(
     asked: BaseModel,
     work: Callable[[], Awaitable[Response]],
 ) -> Response:
-    if idempotency_key is not None:
-        same = request.url.path.encode() + packed(asked.model_dump())
-        return await parts.idempotency.once(arrival.owner, idempotency_key, same, work)
-    return await while_connected(request, work())
+    try:
+        if idempotency_key is not None:
+            same = request.url.path.encode() + packed(asked.model_dump())
+            return await parts.idempotency.once(arrival.owner, idempotency_key, same, work)
+        return await while_connected(request, work())
+    except NotKept as given:
+        return given.answer
 
 
 async def _result(parts: Parts, asked: wire.PlanRequest, arrival: Arrival) -> wire.BatchResult:
     try:
         planned = await parts.planning.in_turn(asked, arrival)
+        return wire.BatchResult(status=200, response=plan_answer(planned, arrival.request_id))
     except ProblemError as error:
-        parts.metrics.problem_told(error.kind)
-        document = problem_document(error, arrival.request_id)
-        return wire.BatchResult(status=error.kind.status, problem=document)
-    return wire.BatchResult(status=200, response=plan_answer(planned, arrival.request_id))
+        failure = error
+    except Exception:  # one scene must not end the others
+        log.exception("scene of a batch failed")
+        failure = unforeseen()
+    parts.metrics.problem_told_within(failure.kind)
+    document = problem_document(failure, arrival.request_id)
+    return wire.BatchResult(status=failure.kind.status, problem=document)

@@ -17,7 +17,7 @@ from service.auth import NOBODY
 from service.callers import while_connected
 from service.labelling import label, teacher_name
 from service.openai_routes import openai_router
-from service.openapi import Responses, payloads, problems
+from service.openapi import PACKED, Responses, payloads, problems
 from service.parts import Parts
 from service.payloads import payload_route
 from service.planning import full_as_problem, let_in
@@ -46,6 +46,7 @@ from service.problems import (
     SCENES_UNREADABLE,
     SWAP_UNDER_WAY,
     TEACHER_AWAY,
+    TEACHER_REFUSED,
     UNAUTHORIZED,
     UNKNOWN_CAMERA,
     UNKNOWN_CHECKPOINT,
@@ -93,8 +94,10 @@ def _add_labelling(router: APIRouter, parts: Parts) -> None:
             *(INVALID_JSON, INVALID_BODY, UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE),
             *(UNSUPPORTED_MEDIA_TYPE, INVALID_REQUEST, UNKNOWN_FIELD),
             *(INVALID_CLIP, UNKNOWN_CAMERA, INVALID_IMAGE, INVALID_HISTORY, INVALID_ROUTE, INVALID_PLAN),
-            *(NEEDS_ANNOTATIONS, LABEL_REFUSED, QUEUE_FULL, RATE_LIMITED, TEACHER_AWAY, DRAINING),
-        ),
+            *(NEEDS_ANNOTATIONS, LABEL_REFUSED, TEACHER_REFUSED, QUEUE_FULL, RATE_LIMITED, TEACHER_AWAY),
+            DRAINING,
+        )
+        | PACKED,
         openapi_extra=payloads(wire.LabelRequest),
     )
     async def write_label(request: Request, asked: wire.LabelRequest) -> Any:

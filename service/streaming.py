@@ -65,11 +65,13 @@ async def told_events(
                     yield each
                 event = await anext(events, None)
         except ProblemError as error:
-            metrics.problem_told(error.kind)
+            metrics.problem_told_within(error.kind)
             raise
         except Exception as error:
             log.exception("stream failed")
-            raise unforeseen() from error
+            failure = unforeseen()
+            metrics.problem_told_within(failure.kind)
+            raise failure from error
 
 
 async def server_sent(

@@ -19,13 +19,20 @@ _MARKUP: Final = re.compile(
     r"\b(?:Meta Actions|Thinking|Action|Reasoning|Reflection|Note):"
 )
 _SENTENCE_END: Final = re.compile(r"[.!?]$")
-_CUE: Final = re.compile(
-    r"\b(?:vehicles?|cars?|vans?|trucks?|bus(?:es)?|motorcycl\w+|cyclists?|bicycles?|leaders?|traffic|queues?|"
-    r"brake lights?|tail lights?|pedestrians?|persons?|people|walkers?|cones?|barriers?|obstacles?|"
-    r"lane (?:lines?|markings?)|markings?|lanes?|curves?|bends?|junctions?|intersections?|crossings?|"
-    r"crosswalks?|kerbs?|shoulder|roads?|gaps?|lights?|signs?|signals?|construction|closure|horizon)\b",
-    re.IGNORECASE,
+_SENTENCES: Final = re.compile(r"(?<=[.!?;])\s+")
+_CORRECTION: Final = re.compile(
+    r"\b(?:should|must|ought to|have to|need to|had better|better to)\b", re.IGNORECASE
 )
+_THINGS: Final = (
+    r"vehicles?|cars?|vans?|trucks?|bus(?:es)?|motorcycl\w+|cyclists?|bicycles?|leaders?|traffic|queues?|"
+    r"brake lights?|tail lights?|pedestrians?|persons?|people|walkers?|cones?|barriers?|obstacles?|"
+    r"lane (?:lines?|markings?)|markings?|crosswalks?|kerbs?|lights?|signs?|signals?|construction|closure"
+)
+_ROADS: Final = (
+    r"lanes?|curves?|bends?|bending|junctions?|intersections?|crossings?|shoulder|roads?|gaps?|horizon"
+)
+_THING: Final = re.compile(rf"\b(?:{_THINGS})\b", re.IGNORECASE)
+_CUE: Final = re.compile(rf"\b(?:{_THINGS}|{_ROADS})\b", re.IGNORECASE)
 
 
 class FailedCheck(NamedTuple):
@@ -56,8 +63,27 @@ def check_reflection(text: str, predicted: Plan, expert: Plan) -> list[FailedChe
         failed.append(FailedCheck("length", f"write at most {MOST_WORDS} words; these are {words}"))
     for leak in find_leaks(text):
         failed.append(FailedCheck("leak", f"do not say {leak.phrase!r}: it hints at {leak.kind}"))
-    if not _CUE.search(text):
-        failed.append(FailedCheck("anchor", "name what is to be seen on the road that asks for the change"))
+    if not _is_anchored(text):
+        failed.append(FailedCheck("anchor", "name what is to be seen on the road that asks for each change"))
     if not agrees(text, predicted, expert):
         failed.append(FailedCheck("direction", "the text asks for another change than the plan needs"))
     return failed
+
+
+def _is_anchored(text: str) -> bool:
+    """Whether every correction has something to be seen before it, or in it, that none before it used.
+
+    "I should stay in my lane" names the lane as what to do and not as what is seen: behind the word that asks
+    for a change only things count.
+    """
+    cues, corrections = set[str](), 0
+    for sentence in _SENTENCES.split(text):
+        asks = _CORRECTION.search(sentence)
+        seen = sentence if asks is None else sentence[: asks.start()]
+        cues |= {found.group().casefold() for found in _CUE.finditer(seen)}
+        if asks is not None:
+            cues |= {found.group().casefold() for found in _THING.finditer(sentence[asks.start() :])}
+            corrections += 1
+            if len(cues) < corrections:
+                return False
+    return bool(cues)

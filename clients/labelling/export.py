@@ -18,6 +18,8 @@ from model.driving.scene_store import read_scenes
 from model.driving.trajectory import present_speed
 
 MESSAGES_FILE: Final = "messages.jsonl"
+PARTS_FILE: Final = "trl.jsonl"
+_IMAGE: Final = "<image>"
 DATASET: Final = "looktwice"
 
 
@@ -73,8 +75,9 @@ def _rollout_of(ledger: Ledger, label: Run) -> Run:
 
 
 def write_messages(ledger: Ledger, label: Run, scenes: Path, folder: Path) -> int:
-    """Write a data set of messages and images that LLaMA-Factory and TRL read; returns its length.
+    """Write a data set of messages and images, in the form of LLaMA-Factory and in TRL's; returns its length.
 
+    One wants a tag in the text for each image, the other parts: it would take a tag for text.
     The scene and the plan to be corrected are the user's, the reflection and the better plan the
     assistant's: so a trainer that learns what assistants say leaves the wrong plan out by itself.
     """
@@ -83,18 +86,21 @@ def write_messages(ledger: Ledger, label: Run, scenes: Path, folder: Path) -> in
         by_scene.setdefault(each.scene_id, []).append(each)
     pictures = folder / "images"
     pictures.mkdir(parents=True, exist_ok=True)
-    temporary = folder / f".{MESSAGES_FILE}.{os.getpid()}"
+    tagged, parted = (folder / f".{name}.{os.getpid()}" for name in (MESSAGES_FILE, PARTS_FILE))
     count = 0
-    with temporary.open("w") as lines:
+    with tagged.open("w") as tagged_lines, parted.open("w") as parted_lines:
         for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None):
             for each in by_scene.pop(labelled.scene.scene_id, []):
                 row = _row(labelled.scene, each, _write_images(labelled.scene, pictures))
-                lines.write(json.dumps(row) + "\n")
+                tagged_lines.write(json.dumps(row) + "\n")
+                parted_lines.write(json.dumps(_in_parts(row)) + "\n")
                 count += 1
     if by_scene:
-        temporary.unlink()
+        tagged.unlink()
+        parted.unlink()
         raise LedgerError(f"{len(by_scene)} labelled scenes are not at {scenes}, such as {min(by_scene)}")
-    os.replace(temporary, folder / MESSAGES_FILE)
+    os.replace(parted, folder / PARTS_FILE)
+    os.replace(tagged, folder / MESSAGES_FILE)
     (folder / "dataset_info.json").write_text(json.dumps(_DATASET_INFO, indent=2) + "\n")
     return count
 
@@ -126,7 +132,7 @@ def _write_images(scene: Scene, folder: Path) -> list[str]:
 
 
 def _row(scene: Scene, labelled: LabelledReflection, images: list[str]) -> dict[str, Any]:
-    cameras = "\n".join(f"{camera_line(clip)}\n{'<image>' * len(clip.images)}" for clip in scene.clips)
+    cameras = "\n".join(f"{camera_line(clip)}\n{_IMAGE * len(clip.images)}" for clip in scene.clips)
     asked = (
         f"{cameras}\nYou drive at {present_speed(scene.history):.1f} m/s.\n"
         f"Your plan for the next 6.4 seconds:\n{labelled.predicted_plan}"
@@ -142,6 +148,19 @@ def _row(scene: Scene, labelled: LabelledReflection, images: list[str]) -> dict[
         "scene_id": labelled.scene_id,
         "key": labelled.key,
     }
+
+
+def _in_parts(row: dict[str, Any]) -> dict[str, Any]:
+    """A row whose messages are parts: texts, and places for the images in their order."""
+
+    def parts(content: str) -> list[dict[str, str]]:
+        found: list[dict[str, str]] = []
+        for number, text in enumerate(content.split(_IMAGE)):
+            found += [{"type": "image"}] * (number > 0)
+            found += [{"type": "text", "text": text}] if text else []
+        return found
+
+    return row | {"messages": [each | {"content": parts(each["content"])} for each in row["messages"]]}
 
 
 def _file_name(scene_id: str) -> str:

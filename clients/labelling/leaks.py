@@ -22,6 +22,8 @@ _KINDS: Final[dict[str, tuple[str, ...]]] = {
         r"(?:the )?(?:reference|target|gold|golden|desired|optimal|ideal|true|actual|real|recorded|logged) "
         r"(?:plan|driver|action|actions|trajectory|path|behaviou?r|answer|solution|response|meta actions?)",
         r"(?:correct|right|expected) (?:answer|label|meta actions?)|(?:correct|expected) plan",
+        r"(?:better|alternative|given|provided|suggested|proposed|second|other) (?:plan|trajectory|actions)",
+        r"hint(?:s|ed)?",
         r"what (?:actually|really) happen\w*",
         r"(?:was|were|am|been) (?:told|given|informed|provided|instructed)",
     ),
@@ -46,8 +48,9 @@ _KINDS: Final[dict[str, tuple[str, ...]]] = {
         r"annotated|bounding box(?:es)?|coordinates?|way ?points?|detections?",
     ),
     "the future": (
-        r"(?:vehicles?|cars?|vans?|trucks?|pedestrians?|persons?|people|leaders?|drivers?|it|they|he|she|that|"
-        r"traffic|queue|gap) (?:will|is going to|are going to|shall)",
+        # Of oneself one may say what one will do.
+        r"(?!(?:i|we) )\w+ (?:(?:\w+ly|soon|then|surely) )?(?:will|shall|is going to|are going to)",
+        r"(?!(?:i|we)')\w+'ll",
         r"(?:turns|turned) out",
         r"(?:ends?|ended) up",
         r"(?:later|soon|then|eventually|subsequently|afterwards) "

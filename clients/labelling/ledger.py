@@ -305,6 +305,15 @@ class Ledger:
         rows = self._db.execute("SELECT answer FROM answers WHERE key = ? ORDER BY attempt", (key,))
         return [Answer(**json.loads(answer)) for (answer,) in rows]
 
+    def begun(self, run: Run) -> Entered:
+        """Answers to questions of a run that have no outcome yet, for a helper that goes on with them."""
+        rows = self._db.execute(
+            "SELECT key, attempt, answer FROM answers WHERE run = ? "
+            "AND key NOT IN (SELECT key FROM outcomes WHERE run = ?)",
+            (run.id, run.id),
+        )
+        return Entered([], rows.fetchall())
+
     def entered(self, run: Run) -> Entered:
         """All that was entered for a run, for another ledger to take over."""
         return Entered(

@@ -33,12 +33,14 @@ class Chunk:
     Attributes:
         file, group: where the scenes are; every worker must be able to read the file.
         done: keys that are not to be done again.
+        begun: answers to questions that were broken off; for labelling.
         kept: rollouts of scenes that were kept, with their draws; for labelling.
     """
 
     file: Path
     group: int
     done: frozenset[str]
+    begun: Entered
     kept: tuple[tuple[Entry, list[int]], ...] = ()
 
 
@@ -50,8 +52,8 @@ class Work(Protocol):
         """What its outcomes belong to."""
         ...
 
-    def __call__(self, book: Ledger, chunk: Chunk) -> Awaitable[Tally]:
-        """Enter into ``book`` what came of the chunk."""
+    def __call__(self, book: Ledger, chunk: Chunk, unlabelled: Callable[[str], None]) -> Awaitable[Tally]:
+        """Enter into ``book`` what came of the chunk; ``unlabelled`` is told of scenes without a future."""
         ...
 
 
@@ -66,10 +68,10 @@ class RolloutWork:
     sampling: Sampling
     limits: Limits
 
-    async def __call__(self, book: Ledger, chunk: Chunk) -> Tally:
+    async def __call__(self, book: Ledger, chunk: Chunk, unlabelled: Callable[[str], None]) -> Tally:
         """Roll the chunk's scenes out."""
         book.run(self.run.stage, self.run.config)
-        found = rollout.jobs(self.run, chunk.file, lambda _: None, chunk.group)
+        found = rollout.jobs(self.run, chunk.file, unlabelled, chunk.group)
         async with AsyncPlannerClient(self.service, PATIENCE, access=self.access) as planner:
             return await work_through(
                 book,
@@ -91,13 +93,14 @@ class LabelWork:
     seed: int
     limits: Limits
 
-    async def __call__(self, book: Ledger, chunk: Chunk) -> Tally:
+    async def __call__(self, book: Ledger, chunk: Chunk, unlabelled: Callable[[str], None]) -> Tally:
         """Have the chunk's plans looked at."""
         for run in (self.run, self.rollout):
             book.run(run.stage, run.config)
         for entry, _ in chunk.kept:
             book.finish(self.rollout, entry.key, entry.scene_id, entry.record)
         book.keep(self.rollout, [(entry.key, draws) for entry, draws in chunk.kept])
+        book.take_over(self.run, chunk.begun)
         asked = label.questions(
             book,
             self.rollout,
@@ -125,6 +128,7 @@ class LabelWork:
 def chunks(ledger: Ledger, run: Run, scenes: Path, rollout: Run | None = None) -> Iterator[Chunk]:
     """The row groups of scene files; with a ``rollout`` those with kept scenes, and what is kept."""
     kept: dict[str, list[tuple[Entry, list[int]]]] = {}
+    begun = ledger.begun(run)
     if rollout is not None:
         for entry in ledger.entries(rollout):
             found = ledger.kept(entry.key)
@@ -134,7 +138,7 @@ def chunks(ledger: Ledger, run: Run, scenes: Path, rollout: Run | None = None) -
         for group, names in enumerate(row_groups(file)):
             mine = tuple(each for name in names for each in kept.get(name, ()))
             if rollout is None or mine:
-                yield Chunk(file.resolve(), group, frozenset(ledger.keys_of(run, names)), mine)
+                yield Chunk(file.resolve(), group, frozenset(ledger.keys_of(run, names)), begun, mine)
 
 
 def work_on_ray(
@@ -144,6 +148,7 @@ def work_on_ray(
     work: Work,
     address: str,
     on_progress: Callable[[Tally], None] = lambda _: None,
+    unlabelled: Callable[[str], None] = lambda _: None,
 ) -> Tally:
     """Have chunks done on a cluster and enter what comes back.
 
@@ -154,6 +159,7 @@ def work_on_ray(
         work: `RolloutWork` or `LabelWork`.
         address: of the cluster; ``local`` starts one in this machine.
         on_progress: told after every chunk.
+        unlabelled: told of scenes that have no expert's future.
 
     Raises:
         StageStopped: a worker stopped; what others have done is entered.
@@ -172,6 +178,8 @@ def work_on_ray(
         tally.dead += row["dead"]
         tally.earlier += row["earlier"]
         stopped = stopped or row["stopped"]
+        for name in json.loads(row["unlabelled"]):
+            unlabelled(name)
         on_progress(replace(tally))
     if stopped:
         raise StageStopped(stopped)
@@ -185,10 +193,11 @@ def _work_in_worker(item: dict[str, Any], work: Work) -> dict[str, Any]:
     What comes back is made of numbers and texts, as Ray Data keeps rows in Arrow's types.
     """
     chunk: Chunk = item["chunk"]
+    unlabelled: list[str] = []
     with Ledger(None) as book:
         stopped, tally = "", Tally()
         try:
-            tally = asyncio.run(_awaited(work, book, chunk))
+            tally = asyncio.run(_awaited(work, book, chunk, unlabelled.append))
         except StageStopped as error:
             stopped = str(error)
         entered = json.dumps(book.entered(work.run)._asdict())
@@ -197,12 +206,13 @@ def _work_in_worker(item: dict[str, Any], work: Work) -> dict[str, Any]:
         "done": tally.done,
         "dead": tally.dead,
         "earlier": len(chunk.done),
+        "unlabelled": json.dumps(unlabelled),
         "stopped": stopped,
     }
 
 
-async def _awaited(work: Work, book: Ledger, chunk: Chunk) -> Tally:
-    return await work(book, chunk)
+async def _awaited(work: Work, book: Ledger, chunk: Chunk, unlabelled: Callable[[str], None]) -> Tally:
+    return await work(book, chunk, unlabelled)
 
 
 def _open(found: Iterator[Job[Any]], chunk: Chunk) -> Iterator[Job[Any]]:

@@ -10,7 +10,14 @@ from typing import Any
 import numpy as np
 
 from clients import wire
-from clients.answers import PlannerProblem, PlannerUnreachable, PlanResult, RequestRefused, ServiceBusy
+from clients.answers import (
+    BadAnswer,
+    PlannerProblem,
+    PlannerUnreachable,
+    PlanResult,
+    RequestRefused,
+    ServiceBusy,
+)
 from clients.labelling.ledger import Record, Run
 from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
 from clients.labelling.teachers.patience import TryLater
@@ -30,6 +37,8 @@ PATIENCE = Patience(timeout_s=120.0, attempts=1)
 class Sampling:
     """How responses are drawn; a part of every key.
 
+    Nobody thinks: what is judged are first plans, and the trajectories that they lead to.
+
     Attributes:
         n: draws, both freely and with the expert's plan.
         temperature, top_p, seed: as in `wire.Controls`.
@@ -45,12 +54,15 @@ class Sampling:
     @property
     def controls(self) -> wire.Controls:
         """As the service takes them."""
-        return wire.Controls(n=self.n, temperature=self.temperature, top_p=self.top_p, seed=self.seed)
+        return wire.Controls(
+            n=self.n, thinking="never", temperature=self.temperature, top_p=self.top_p, seed=self.seed
+        )
 
 
 def config_of(model: wire.ModelName, sampling: Sampling) -> Record:
     """What decides a rollout besides the scene."""
-    return {"model": model.name, "revision": model.revision, **asdict(sampling)}
+    thinking = sampling.controls.thinking
+    return {"model": model.name, "revision": model.revision, "thinking": thinking, **asdict(sampling)}
 
 
 def key_of(run: Run, labelled: LabelledScene) -> str:
@@ -89,6 +101,8 @@ async def roll_out(
         raise CannotBeDone(error.detail, type=error.type) from error
     except PlannerProblem as error:
         raise CannotBeDone(str(error), type=error.type) from error
+    except BadAnswer as error:
+        raise CannotBeDone(str(error)) from error
     for answer in (free, given):
         if answer.model != model:
             raise StageStopped(
@@ -112,11 +126,8 @@ def _draws(result: PlanResult, labelled: LabelledScene, expert: Plan | None) -> 
             row |= {
                 "plan": str(draw.plan),
                 "plan_iou": round(plan_iou(draw.plan, expert), 4),
-                "branch": draw.branch,
                 "think_probability": draw.think_probability,
             }
-            if draw.revised_plan is not None:
-                row |= {"thinking": draw.thinking, "revised_plan": str(draw.revised_plan)}
         told.append(row)
     return told
 

@@ -124,6 +124,7 @@ def drive(
     plans, shots = _Plans(), dict[int, list[Picture]]()
     way: Array | None = None
     planned_at, outside, left_road = 0, 0, False
+    every = round(config.replan_s / STEP_S)
     try:
         near = world.remember()
         began_m = world.ego.progress
@@ -135,14 +136,17 @@ def drive(
                 began_m = world.ego.progress
                 if pilot is not None:
                     world.ego = FreeVehicle.from_rails(world.ego)
-            if pilot is not None and step >= TAKE_OVER:
-                if (step - TAKE_OVER) % round(config.replan_s / STEP_S) == 0:
-                    scene = _scene(world, step, shots, rig)
-                    plans.made.append(pilot.plan(scene))
-                    way = world_trajectory(world.live.ego[step], plans.made[-1].trajectory)
-                    planned_at = step
-                outside = outside + 1 if _is_outside(world) else 0
-                left_road = left_road or outside > 0
+            if pilot is not None and step >= TAKE_OVER and (step - TAKE_OVER) % every == 0:
+                scene = _scene(world, step, shots, rig)
+                plans.made.append(pilot.plan(scene))
+                way = world_trajectory(world.live.ego[step], plans.made[-1].trajectory)
+                planned_at = step
+            if step >= TAKE_OVER and _is_outside(world):
+                left_road = True
+                # The expert is on rails: it finds back.
+                outside += pilot is not None
+            else:
+                outside = 0
             if on_shot is not None and step in shots:
                 name = EXPERT if pilot is None else pilot.name
                 on_shot(Shot(name, world.live, step, shots[step], plans.made[-1] if plans.made else None))

@@ -7,7 +7,7 @@ from typing import Final
 
 from loadtests.accounting import Summary, summarise
 from loadtests.arrivals import Window
-from loadtests.memory import MemoryWatch, growth
+from loadtests.memory import Growth, MemoryWatch, growth
 from loadtests.run import Result, Setup, check
 from loadtests.scenarios.poisson import MEASURED, run_steady
 
@@ -17,8 +17,10 @@ _EDGE: Final = 0.1
 """Share of the run that stands for its beginning, and for its end."""
 
 
-def soak(setup: Setup, knee_rps: float, share: float, pid: int) -> Result:
+def soak(setup: Setup, knee_rps: float, share: float, pid: int, growth_limit: float = 0.05) -> Result:
     """Offer ``share`` of ``knee_rps`` for the setup's time, and watch the memory of process ``pid``.
+
+    Not valid where memory could not be read, or grew by more than ``growth_limit`` over the second half.
 
     Raises:
         ValueError: there is no such process here.
@@ -37,7 +39,7 @@ def soak(setup: Setup, knee_rps: float, share: float, pid: int) -> Result:
         "soak",
         overall,
         {first.window.name: first, last.window.name: last},
-        tuple(check(overall, setup)),
+        (*check(overall, setup), *_memory_faults(grown, growth_limit)),
         {
             "soak": {"knee_rps": knee_rps, "share": share},
             "memory": {"pid": pid, "readings": [(each.at_s, each.rss_bytes) for each in readings]}
@@ -49,10 +51,18 @@ def soak(setup: Setup, knee_rps: float, share: float, pid: int) -> Result:
             if grown is None
             else f"the server's memory went from {grown.first_bytes / 2**20:.1f} to "
             f"{grown.last_bytes / 2**20:.1f} MiB "
-            f"over {setup.seconds / 60:.1f} minutes",
+            f"over {setup.seconds / 60:.1f} minutes, {grown.late:+.1%} of it in the second half",
         ),
         ran.exchanges,
     )
+
+
+def _memory_faults(grown: Growth | None, limit: float) -> list[str]:
+    if grown is None:
+        return ["the server's memory could not be read"]
+    if grown.late > limit:
+        return [f"the server's memory grew by {grown.late:.1%} in the second half; {limit:.0%} is allowed"]
+    return []
 
 
 def _edges(overall: Summary) -> tuple[Summary, Summary]:

@@ -42,7 +42,9 @@ def contenders(names: list[str], checkpoint: Path, device: str) -> dict[str, Con
             if "vllm-grammar" not in made:
                 engine = VllmEngine(
                     checkpoint,
-                    VllmSettings(_ROWS, str(dtype).removeprefix("torch."), {"enforce_eager": True}),
+                    VllmSettings(
+                        _ROWS, str(dtype).removeprefix("torch."), {"enforce_eager": device == "cpu"}
+                    ),
                 )
                 made["vllm-grammar"] = EngineContender(engine)
                 made["vllm"] = PlainVllm(checkpoint, engine, _MAX_TOKENS)

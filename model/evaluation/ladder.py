@@ -24,9 +24,12 @@ RUNGS: Final = (META_ACT, MULTI_ROUND, WHOLE_DATASET, COUNTERFACTUAL, ROUND_2)
 """Checkpoints of a ladder, by the folder that each lies in."""
 
 TEMPERATURES: Final = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)
-THRESHOLDS: Final = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+THRESHOLDS: Final = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""From always to never."""
 GROUPS: Final = 10
 """Scenes are told apart by difficulty in so many groups."""
+FIFTH: Final = GROUPS // 5
+"""Groups that make a fifth of the scenes."""
 
 Results = Mapping[Variant, Sequence[SceneResult]]
 
@@ -154,6 +157,17 @@ def by_difficulty(
     return found
 
 
+def hard_to_easy(groups: Sequence[Difficulty]) -> float | None:
+    """How many times as often the hardest fifth of the scenes is thought about as the easiest one.
+
+    None where the easiest is never thought about.
+    """
+    easiest, hardest = (
+        sum(group.scenes * group.think_rate for group in part) for part in (groups[:FIFTH], groups[-FIFTH:])
+    )
+    return hardest / easiest if easiest else None
+
+
 @dataclass(frozen=True)
 class LadderReport:
     """Rows, comparisons and difficulties of a ladder.
@@ -167,15 +181,18 @@ class LadderReport:
     difficulty: Mapping[str, Sequence[Difficulty]]
 
     def to_json(self) -> dict[str, Any]:
-        """The table's JSON with ``difficulty`` added."""
+        """The table's JSON with ``difficulty`` and ``hard_to_easy`` added."""
         groups = {name: [asdict(group) for group in of] for name, of in self.difficulty.items()}
-        return self.report.to_json() | {"difficulty": groups}
+        ratios = {name: hard_to_easy(of) for name, of in self.difficulty.items()}
+        return self.report.to_json() | {"difficulty": groups, "hard_to_easy": ratios}
 
     def __str__(self) -> str:
         lines = [str(self.report)]
         for name, groups in self.difficulty.items():
             rates = " ".join(f"{group.think_rate:.0%}" for group in groups)
-            lines.append(f"{name} thinks, from easy to hard scenes: {rates}")
+            ratio = hard_to_easy(groups)
+            times = "" if ratio is None else f" (hardest : easiest fifth {ratio:.1f})"
+            lines.append(f"{name} thinks, from easy to hard scenes: {rates}{times}")
         return "\n".join(lines)
 
 

@@ -6,6 +6,7 @@ import asyncio
 import json
 import tempfile
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from contextlib import contextmanager
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
@@ -87,12 +88,13 @@ def rollout(
                 from clients.labelling.on_ray import RolloutWork, chunks, work_on_ray
 
                 work = RolloutWork(run, service, access, model, sampling, limits)
-                return run, work_on_ray(ledger, run, chunks(ledger, run, scenes), work, on_ray)
-            found = islice(jobs(run, scenes, unlabelled.append), 0, None, every)
+                found = chunks(ledger, run, scenes)
+                with _progress(run, _count(scenes), quiet=as_json) as show:
+                    return run, work_on_ray(ledger, run, found, work, on_ray, show, unlabelled.append)
             return run, await _work(
                 ledger,
                 run,
-                found,
+                islice(jobs(run, scenes, unlabelled.append), 0, None, every),
                 lambda job: roll_out(planner, job.subject, model, sampling),
                 limits,
                 limit=dry_run or limit,
@@ -197,7 +199,9 @@ def label(
                 from clients.labelling.on_ray import LabelWork, chunks, work_on_ray
 
                 work = LabelWork(begun, rollout, connect, plans_per_scene, seed, limits)
-                tally = work_on_ray(ledger, begun, chunks(ledger, begun, scenes, rollout), work, on_ray)
+                kept = chunks(ledger, begun, scenes, rollout)
+                with _progress(begun, ledger.count_kept(rollout, plans_per_scene), quiet=as_json) as show:
+                    tally = work_on_ray(ledger, begun, kept, work, on_ray, show)
             else:
                 found = questions(ledger, rollout, scenes, plans_per_scene=plans_per_scene, seed=seed)
                 tally = await _work(
@@ -354,22 +358,29 @@ async def _work(
     total: int,
     quiet: bool,
 ) -> Tally:
+    from clients.labelling.pipeline import work_through
+
+    with _progress(run, min(total, limit or total), quiet=quiet) as show:
+        return await work_through(ledger, run, islice(jobs, limit), do, limits, show)
+
+
+@contextmanager
+def _progress(run: Run, total: int, *, quiet: bool) -> Iterator[Callable[[Tally], None]]:
+    """A bar on stderr, moved by what it is told."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from clients.labelling.pipeline import work_through
 
     columns = (TextColumn(run.stage), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bar = TextColumn("{task.description}")
     with Progress(*columns, bar, console=Console(stderr=True, quiet=quiet)) as progress:
-        task = progress.add_task("", total=min(total, limit or total))
+        task = progress.add_task("", total=total)
 
         def show(tally: Tally) -> None:
             ended = tally.done + tally.dead + tally.earlier
             told = f"{tally.dead} dead letters" if tally.dead else ""
             progress.update(task, completed=ended, description=told)
 
-        return await work_through(ledger, run, islice(jobs, limit), do, limits, show)
+        yield show
 
 
 def _count(scenes: Path) -> int:

@@ -23,8 +23,15 @@ def drive(
     ] = None,
     n: Annotated[int, typer.Option(help="Draws; the car follows the one nearest to the others.", min=1)] = 6,
     temperature: Annotated[float, typer.Option(help="Of sampling.", min=0, max=2)] = 1.0,
+    think_threshold: Annotated[
+        float | None,
+        typer.Option(help="adaptive thinks where the probability exceeds it, not by chance.", min=0, max=1),
+    ] = None,
     deadline_ms: Annotated[int | None, typer.Option(help="That each plan has.", min=1)] = None,
     route: Annotated[bool, typer.Option(help="Tell the model the route.")] = True,
+    keep: Annotated[
+        Path | None, typer.Option(help="File that keeps every drive: started again, it goes on behind them.")
+    ] = None,
     gif: Annotated[Path | None, typer.Option(help="Film of the first episode of the last driver.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -38,10 +45,12 @@ def drive(
     from clients.metadrive.drive import drive as drive_episode
     from clients.metadrive.drive_table import driver_rows, format_table, to_json
     from clients.metadrive.film import Film
+    from clients.metadrive.kept_drives import KeptDrives
     from clients.metadrive.maps import MapError
     from clients.metadrive.pilots import ConstantVelocity, Pilot, ServicePilot
     from clients.metadrive.rig import Rig
     from clients.planner import Access, Patience, PlannerClient
+    from model.driving.hashing import hash_of
     from model.driving.scene import split_of_seed
 
     def pilot_of(driver: str, planner: PlannerClient) -> Pilot | None:
@@ -49,10 +58,21 @@ def drive(
             return None
         if driver == "constant-velocity":
             return ConstantVelocity()
-        controls = wire.Controls(
-            n=n, temperature=temperature, thinking=cast(wire.Thinking, driver), deadline_ms=deadline_ms
+        return ServicePilot(planner, driver, controls_of(driver), route=route)
+
+    def controls_of(driver: str) -> wire.Controls:
+        return wire.Controls(
+            n=n,
+            temperature=temperature,
+            thinking=cast(wire.Thinking, driver),
+            think_threshold=think_threshold if driver == "adaptive" else None,
+            deadline_ms=deadline_ms,
         )
-        return ServicePilot(planner, driver, controls, route=route)
+
+    def key_of(driver: str, seed: int, models: list[str]) -> str:
+        if driver in ("expert", "constant-velocity"):
+            return hash_of(driver, seed, seconds)
+        return hash_of(driver, seed, seconds, controls_of(driver).model_dump_json(), route, models)
 
     wanted = drivers or list(DRIVERS[:-1])
     if unknown := set(wanted) - set(DRIVERS):
@@ -64,7 +84,9 @@ def drive(
         seeds = range(first_seed, first_seed + episodes)
         for seed in (seeds[0], seeds[-1]):
             split_of_seed(seed)
-        rig, film = Rig(), Film()
+        rig, film, config = Rig(), Film(), DriveConfig(seconds)
+        kept = KeptDrives(keep) if keep is not None else None
+        models = [card.revision for card in planner.models()]
         found: dict[str, list[Drive]] = {}
         # Progress goes to stderr, so that stdout holds nothing but the table.
         with Progress(console=Console(stderr=True, quiet=as_json)) as progress:
@@ -74,10 +96,13 @@ def drive(
                     pilot = pilot_of(driver, planner)
                     name = EXPERT if pilot is None else pilot.name
                     filmed = gif is not None and seed == seeds[0] and driver == wanted[-1]
+                    key = key_of(driver, seed, models)
+                    drove = kept.find(key) if kept is not None and not filmed else None
                     try:
-                        drove = drive_episode(
-                            seed, pilot, rig, DriveConfig(seconds), film.add if filmed else None
-                        )
+                        if drove is None:
+                            drove = drive_episode(seed, pilot, rig, config, film.add if filmed else None)
+                            if kept is not None:
+                                kept.keep(key, drove)
                     except MapError:
                         typer.echo(f"no map fits seed {seed}: left out", err=True)
                         break

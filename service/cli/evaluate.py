@@ -107,10 +107,11 @@ def _ladder(
     *,
     quiet: bool,
 ) -> LadderReport:
-    """Climb the ladder: every checkpoint in turn, the best one with all temperatures and thresholds."""
+    """Climb the ladder: every checkpoint in turn, the last round's with all temperatures and thresholds."""
     from model.evaluation import ladder_plots
     from model.evaluation.ladder import (
         COUNTERFACTUAL,
+        ROUND_2,
         RUNGS,
         TEMPERATURES,
         THRESHOLDS,
@@ -124,6 +125,7 @@ def _ladder(
 
     rungs = {} if folder is None else {rung: folder / rung for rung in RUNGS if (folder / rung).is_dir()}
     rungs.setdefault(COUNTERFACTUAL, checkpoint)
+    shown = ROUND_2 if ROUND_2 in rungs else COUNTERFACTUAL
     results: dict[Variant, list[SceneResult]] = {}
     for rung, path in rungs.items():
         draws: dict[tuple[str, str], Sequence[Draw]] = {}
@@ -138,7 +140,7 @@ def _ladder(
         found = asyncio.run(_run(evaluate, scenes, engine_of(path), planned, controls.n, rows, quiet=quiet))
         found |= threshold_results(rung, derived, scenes, draws)
         results |= {variant: found[variant] for variant in variants}
-        if rung == COUNTERFACTUAL:
+        if rung == shown:
             results |= threshold_results(rung, threshold_variants(rung, controls), scenes, draws)
             swept = list(_evenly(scenes, len(scenes), sweep))
             variants = temperature_variants(rung, controls)
@@ -149,14 +151,14 @@ def _ladder(
         plots.mkdir(parents=True, exist_ok=True)
         row_of = {row.name: row for row in report.report.rows if row.subgroup is None}
         ladder_plots.difficulty_plot(
-            report.difficulty[f"{COUNTERFACTUAL}, adaptive"], plots / "thinking-by-difficulty.png"
+            report.difficulty[f"{shown}, adaptive"], plots / "thinking-by-difficulty.png"
         )
         ladder_plots.temperature_plot(
-            [(value, row_of[f"{COUNTERFACTUAL}, temperature {value:g}"]) for value in TEMPERATURES],
+            [(value, row_of[f"{shown}, temperature {value:g}"]) for value in TEMPERATURES],
             plots / "thinking-by-temperature.png",
         )
         ladder_plots.threshold_plot(
-            [(value, row_of[f"{COUNTERFACTUAL}, threshold {value:g}"]) for value in THRESHOLDS],
+            [(value, row_of[f"{shown}, threshold {value:g}"]) for value in THRESHOLDS],
             plots / "risk-and-compute.png",
         )
     return report

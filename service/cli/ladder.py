@@ -31,13 +31,15 @@ class Rung:
         name: its folder.
         recipe: that makes it.
         source: the rung that it is trained from.
-        build: the build whose reflections it learns from.
+        build: the build whose reflections it learns from; empty below them.
+        vision: the rung whose vision tower it takes; empty for that of its source.
     """
 
     name: str
     recipe: str
     source: str
-    build: str
+    build: str = ""
+    vision: str = ""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,14 @@ _BUILDS: Final = {
         Build("round-2", COUNTERFACTUAL, _KEEP, _RIGHT),
     )
 }
+_UNTRAINED: Final = "untrained"
+_GROUNDWORK: Final = (
+    Rung("language", "language", _UNTRAINED),
+    Rung("ground", "ground", _UNTRAINED),
+    Rung(META_ACT, "meta-act", "language", vision="ground"),
+)
+_OF_RECIPES: Final = frozenset(("--learning-rate", "--vision-rate"))
+"""Options that are meant for the rungs above `META_ACT`: below it every recipe has its own."""
 _RUNGS: Final = (
     Rung(COUNTERFACTUAL, "counterfactual", META_ACT, "round-1"),
     Rung(MULTI_ROUND, "multi-round", META_ACT, "round-1"),
@@ -77,19 +87,21 @@ def climb(
     folder: Path,
     scenes: Path,
     test: Path,
-    meta_act: Path,
+    meta_act: Path | None,
     training: Sequence[str],
     *,
     every: int,
     processes: int,
 ) -> None:
-    """Roll out, label and train round by round, then print the table; started again, it goes on.
+    """Train up to meta-actions, then roll out, label and train round by round, then print the table.
+
+    Started again, it goes on.
 
     Args:
         folder: where builds, checkpoints and plots go.
         scenes, test: to train on and to test on.
-        meta_act: the checkpoint to begin with.
-        training: options of `looktwice train` for every rung.
+        meta_act: a checkpoint that writes meta-actions, to begin with; None to train that as well.
+        training: options of `looktwice train` for every rung, in pairs or alone.
         every: so many-th scene is rolled out.
         processes: that train together.
 
@@ -97,26 +109,51 @@ def climb(
         RuntimeError: a step failed; what is done is kept.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / META_ACT).exists():
+    if meta_act is not None and not (folder / META_ACT).exists():
         (folder / META_ACT).symlink_to(meta_act.resolve(), target_is_directory=True)
+    if not (folder / META_ACT / _CHECKPOINT_FILE).exists():
+        if not (folder / _UNTRAINED / _CHECKPOINT_FILE).exists():
+            _run(
+                _LOOKTWICE,
+                ["train", "create", "--to", str(folder / _UNTRAINED), "--scenes", str(scenes), *training],
+            )
+        own = _without(training, _OF_RECIPES)
+        for rung in _GROUNDWORK:
+            vision = ["--vision-from", str(folder / rung.vision)] if rung.vision else []
+            _train(rung, folder, scenes, [*vision, *own], processes)
     for rung in _RUNGS:
-        if (folder / rung.name / _CHECKPOINT_FILE).exists():
-            continue
         reflections = folder / f"{rung.build}.parquet"
-        if not reflections.exists():
+        if not reflections.exists() and not _is_there(rung, folder):
             _make(_BUILDS[rung.build], folder, scenes, every, reflections)
-        _run(
-            [sys.executable, "-m", "torch.distributed.run", "--standalone"],
-            ["--nproc-per-node", str(processes), "-m", "service.cli", "train", rung.recipe],
-            ["--from", str(folder / rung.source), "--to", str(folder / rung.name)],
-            ["--scenes", str(scenes), "--reflections", str(reflections), *training],
-        )
+        _train(rung, folder, scenes, ["--reflections", str(reflections), *training], processes)
     _run(
         _LOOKTWICE,
         ["evaluate", "--preset", "ladder", "--checkpoint", str(folder / COUNTERFACTUAL)],
         ["--ladder", str(folder), "--scenes", str(test), "--plots", str(folder / "plots")],
         ["--think-threshold", _THINK_THRESHOLD, "--keep", str(folder / "draws.sqlite")],
     )
+
+
+def _is_there(rung: Rung, folder: Path) -> bool:
+    return (folder / rung.name / _CHECKPOINT_FILE).exists()
+
+
+def _train(rung: Rung, folder: Path, scenes: Path, options: Sequence[str], processes: int) -> None:
+    """Train one rung, unless it is there."""
+    if _is_there(rung, folder):
+        return
+    _run(
+        [sys.executable, "-m", "torch.distributed.run", "--standalone"],
+        ["--nproc-per-node", str(processes), "-m", "service.cli", "train", rung.recipe],
+        ["--from", str(folder / rung.source), "--to", str(folder / rung.name)],
+        ["--scenes", str(scenes), *options],
+    )
+
+
+def _without(options: Sequence[str], names: frozenset[str]) -> list[str]:
+    """Options without some that have values."""
+    places = [place for place, option in enumerate(options) if option in names]
+    return [option for at, option in enumerate(options) if not {at, at - 1} & set(places)]
 
 
 def _make(build: Build, folder: Path, scenes: Path, every: int, reflections: Path) -> None:

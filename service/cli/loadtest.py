@@ -57,7 +57,10 @@ def loadtest(
     planners: Annotated[int, typer.Option(help="fleet: how many.", min=1)] = 4,
     hz: Annotated[float, typer.Option(help="fleet: plans a second of each; 10, 5, 2 or 1.")] = 10.0,
     knee: Annotated[float | None, typer.Option(help="soak: what a sweep found.", min=0.05)] = None,
-    share: Annotated[float, typer.Option(help="soak: of the knee.", min=0.01, max=1)] = 0.7,
+    share: Annotated[float, typer.Option(help="soak: of the knee.", min=0.01, max=1)] = 0.8,
+    growth_limit: Annotated[
+        float, typer.Option(help="soak: of memory over the second half; with more it is not valid.", min=0)
+    ] = 0.05,
     server_pid: Annotated[int | None, typer.Option(help="soak: whose memory is watched.")] = None,
     factor: Annotated[float, typer.Option(help="burst: times the rate.", min=1)] = 10.0,
     burst_seconds: Annotated[float, typer.Option(help="burst: how long.", min=0.5)] = 5.0,
@@ -86,7 +89,7 @@ def loadtest(
                 raise ValueError(
                     "a soak needs --knee (see the sweep) and --server-pid (whose memory is watched)"
                 )
-            return soak(setup, knee, share, server_pid)
+            return soak(setup, knee, share, server_pid, growth_limit)
 
         run: dict[Scenario, Callable[[], Result]] = {
             "poisson": lambda: poisson(setup),

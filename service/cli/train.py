@@ -18,12 +18,17 @@ def train(
         str,
         typer.Argument(
             help="create, language, ground, traj-only, meta-act, counterfactual, multi-round; "
-            "ladder: rollouts, labels and training round by round, then the table."
+            "ladder: all of it, then rollouts, labels and training round by round, and the table."
         ),
     ],
     scenes: Annotated[Path, typer.Option(help="Training scenes: a file or a folder.")],
     target: Annotated[Path, typer.Option("--to", help="Checkpoint folder to write.")],
-    source: Annotated[Path | None, typer.Option("--from", help="Checkpoint folder to start from.")] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from", help="Checkpoint folder to start from; of a ladder one that writes meta-actions."
+        ),
+    ] = None,
     vision_from: Annotated[Path | None, typer.Option(help="Checkpoint whose vision tower is taken.")] = None,
     reflections: Annotated[
         Path | None, typer.Option(help="A build's reflections, for counterfactual and multi-round.")
@@ -58,8 +63,8 @@ def train(
 
     from model.driving.scene_store import count_scenes, read_scenes
     from model.evaluation.curves import training_curves
+    from model.network.allocator import keep_freed_memory
     from model.network.precision import bfloat16_is_fast
-    from model.training.memory import keep_freed_memory
     from model.training.recipes import NANO, PAPER
     from model.training.run import RunSettings, create, run
     from model.training.trainer import LOG_FILE
@@ -72,11 +77,6 @@ def train(
             for name, value in create(scenes, cache, target, seed=seed).items():
                 typer.echo(f"codec {name} {value:.3f}")
             return
-        recipes = PAPER if paper else NANO
-        if recipe not in recipes:
-            raise ValueError(f"unknown recipe {recipe!r}; known are create, ladder, {', '.join(recipes)}")
-        if source is None:
-            raise ValueError("give the checkpoint to start from: --from FOLDER")
         if recipe == "ladder":
             if test is None:
                 raise ValueError("give the scenes for the table: --test FOLDER")
@@ -85,6 +85,11 @@ def train(
             )
             climb(target, scenes, test, source, options, every=every, processes=processes)
             return
+        recipes = PAPER if paper else NANO
+        if recipe not in recipes:
+            raise ValueError(f"unknown recipe {recipe!r}; known are create, ladder, {', '.join(recipes)}")
+        if source is None:
+            raise ValueError("give the checkpoint to start from: --from FOLDER")
         chosen = recipes[recipe]
         chosen = replace(
             chosen,

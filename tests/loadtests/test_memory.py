@@ -11,6 +11,14 @@ def test_growth_is_the_slope_of_what_was_read() -> None:
     assert grown is not None
     assert grown.bytes_per_hour == pytest.approx(500 / 10 * 3600)
     assert grown.last_bytes - grown.first_bytes == pytest.approx(90 * 500, rel=0.02)
+    assert grown.late == pytest.approx(45 * 500 / 1_022_500, rel=0.05)
+
+
+def test_what_fills_up_in_the_first_half_is_no_growth_of_the_second() -> None:
+    grown = growth([Reading(float(step), 1_000_000 + 20_000 * min(step, 40)) for step in range(100)])
+    assert grown is not None
+    assert grown.last_bytes > 1.5 * grown.first_bytes
+    assert grown.late == 0
 
 
 def test_one_peak_is_no_growth() -> None:

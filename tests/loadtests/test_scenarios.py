@@ -142,6 +142,8 @@ def test_a_soak_sees_memory_grow() -> None:
     memory = result.extra["memory"]
     assert memory["growth_bytes"] > 20_000_000
     assert memory["growth_bytes_per_hour"] > 20_000_000 * 1200
+    assert memory["late_growth"] > 0.05
+    assert any("memory grew" in fault for fault in result.faults)
     assert result.overall.offered_rps == pytest.approx(20, rel=0.5)
     assert written(result, used).tags.count("svg") == 3
 

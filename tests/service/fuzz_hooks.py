@@ -1,16 +1,27 @@
-"""For schemathesis: every other scene gets real pictures and a history, so that requests get past them."""
+"""For schemathesis: every other scene gets real pictures and a history, so that requests get past them.
+
+Chats too, and bodies go out in msgpack as well.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
+import msgpack
 import schemathesis
 from pydantic import ValidationError
 
 import clients.wire as wire
+from service.openai_chat import ChatRequest
 from tests.service.serving import body
 
 REAL = body()["scene"]
+PICTURES = [
+    {"type": "image_url", "image_url": {"url": f"data:image/jpeg;base64,{image}"}}
+    for clip in REAL["clips"]
+    for image in clip["images"]
+]
+_LARGEST = 2**63
 
 
 @schemathesis.hook
@@ -18,18 +29,39 @@ def map_body(context: Any, body: Any) -> Any:
     """A body with scenes that can be planned for."""
     if not isinstance(body, dict):
         return body
+    if "messages" in body:
+        if len(str(body)) % 2 and _is_of_the_schema(ChatRequest, body):
+            body["messages"] = [{"role": "user", "content": PICTURES}]
+        return body
     requests = body["requests"] if isinstance(body.get("requests"), list) else [body]
     for request in requests:
         scene = request.get("scene") if isinstance(request, dict) else None
-        if isinstance(scene, dict) and len(str(request)) % 2 and _is_of_the_schema(scene):
+        if isinstance(scene, dict) and len(str(request)) % 2 and _is_of_the_schema(wire.Scene, scene):
             scene.update({part: REAL[part] for part in ("clips", "history", "route")})
     return body
 
 
-def _is_of_the_schema(scene: dict[str, Any]) -> bool:
+@schemathesis.serializer("application/msgpack")
+def packed(context: Any, value: Any) -> bytes:
+    """What is to be sent, packed."""
+    return bytes(msgpack.packb(_within_bounds(value)))
+
+
+def _within_bounds(value: Any) -> Any:
+    """Numbers that msgpack has no form for as floats."""
+    if isinstance(value, dict):
+        return {name: _within_bounds(of) for name, of in value.items()}
+    if isinstance(value, list):
+        return [_within_bounds(of) for of in value]
+    if isinstance(value, int) and not -_LARGEST <= value < 2 * _LARGEST:
+        return float(value) if abs(value) < 2**1000 else float("inf")
+    return value
+
+
+def _is_of_the_schema(model: type[Any], value: dict[str, Any]) -> bool:
     """What was broken on purpose stays broken."""
     try:
-        wire.Scene.model_validate(scene)
+        model.model_validate(value)
     except ValidationError:
         return False
     return True

@@ -8,6 +8,7 @@ import pytest
 
 import clients.wire as wire
 from model.engines.engine import EngineError
+from service.planning import Arrival, Planning
 from service.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
@@ -98,3 +99,40 @@ def test_scenes_that_fail_are_counted(served: Served, engine: ScriptedEngine) ->
     results = ask(served, body(n=1), body(n=1))
     assert [result.status for result in results] == [503, 503]
     assert served.metric("looktwice_rejections_total", reason="engine-failed") == 2
+    assert served.metric("looktwice_failures_told_total") == 0, "a 503 is a refusal"
+
+
+def test_a_defect_in_one_scene_leaves_the_others_and_is_counted(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_turn = Planning.in_turn
+
+    async def unlucky(planning: Planning, asked: wire.PlanRequest, arrival: Arrival) -> Any:
+        if asked.scene.scene_id == "unlucky":
+            raise ArithmeticError("no")
+        return await in_turn(planning, asked, arrival)
+
+    monkeypatch.setattr(Planning, "in_turn", unlucky)
+    results = ask(served, body(scene("lucky")), body(scene("unlucky")))
+    assert [result.status for result in results] == [200, 500]
+    assert results[1].problem is not None
+    assert results[1].problem.type.endswith("internal")
+    assert served.metric("looktwice_failures_told_total", reason="internal") == 1
+
+
+def test_with_a_key_only_what_is_final_is_kept(served: Served, engine: ScriptedEngine) -> None:
+    headers, document = {"Idempotency-Key": "batch"}, {"requests": [body(n=1), body(n=9)]}
+
+    def again() -> list[int]:
+        answer = served.http.post("/v1/plan/batch", json=document, headers=headers)
+        return [result["status"] for result in answer.json()["results"]]
+
+    engine.failure = EngineError("broke")
+    assert again() == [503, 422]
+    engine.failure = None
+    asked = len(engine.submitted)
+    assert again() == [200, 422]
+    assert len(engine.submitted) > asked
+    asked = len(engine.submitted)
+    assert again() == [200, 422]
+    assert len(engine.submitted) == asked, "the same answer again"

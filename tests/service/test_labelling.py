@@ -1,17 +1,37 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
 
-from clients.labelling.checks import check_reflection
+from clients.labelling.checks import FailedCheck, check_reflection
+from clients.labelling.teachers.teacher import Answer, Question, TeacherClosed, TeacherError
 from clients.wire import LabelResponse
 from model.driving.plan import parse_plan
-from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN
-from tests.service.serving import Served, body
+from service.settings import Settings
+from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN, ScriptedEngine
+from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem
 
 PATH = "/v1/label"
+
+
+class Upstream:
+    """A teacher somewhere else, with one thing to say or to raise."""
+
+    name, revision = "upstream", "1"
+
+    def __init__(self, says: str | Exception) -> None:
+        self._says = says
+
+    async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
+        if isinstance(self._says, Exception):
+            raise self._says
+        return Answer(self._says, 100, 20, 0.01)
+
+    async def close(self) -> None:
+        pass
 
 
 def asking(served: Served, **changes: Any) -> dict[str, Any]:
@@ -75,3 +95,29 @@ def test_the_scene_is_checked_like_any_other(served: Served) -> None:
     document = asking(served)
     document["scene"]["clips"][0]["images"][0] = body()["scene"]["clips"][0]["images"][0][:-40] + "!"
     assert problem(served.http.post(PATH, json=document), "invalid-image")
+
+
+@pytest.mark.parametrize(
+    ("error", "type", "status"),
+    [
+        (TeacherError("400: too many pictures"), "teacher-refused", 502),
+        (TeacherClosed("401: no such key"), "teacher-away", 503),
+    ],
+)
+def test_an_upstream_teacher_that_fails_is_told_from_a_question_that_lacks_something(
+    error: Exception, type: str, status: int
+) -> None:
+    with serve(ScriptedEngine(), Settings(), teacher=Upstream(error)) as served:
+        answer = served.http.post(PATH, json=asking(served))
+        assert answer.status_code == status
+        assert str(error) in problem(answer, type).detail
+
+
+def test_checks_that_a_teacher_never_passes_are_counted_by_reason() -> None:
+    with serve(ScriptedEngine(), Settings(), teacher=Upstream("The expert brakes for the van.")) as served:
+        answer = served.http.post(PATH, json=asking(served))
+        assert "'expert'" in problem(answer, "label-refused").detail
+        for check, failed in (("leak", 3), ("length", 0)):
+            labels = {"teacher": "upstream", "check": check}
+            assert served.metric("looktwice_label_checks_failed_total", **labels) == failed
+        assert served.metric("looktwice_labels_total", teacher="upstream") == 0

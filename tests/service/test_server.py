@@ -21,10 +21,13 @@ import pytest
 
 from clients.labelling.checks import FailedCheck
 from clients.labelling.teachers.teacher import Answer, Question
+from model.bundled import CHECKPOINT
+from model.engines.torch.engine import TorchEngine, TorchSettings
 from service.app import create_app
 from service.keys import new_line
 from service.server import check_who_may_ask, make_server
 from service.settings import Settings
+from tests.checkpoints import noisy_scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem
@@ -264,6 +267,42 @@ def test_another_checkpoint_takes_over_without_dropping_a_request(
         assert served.metric("looktwice_checkpoint_swaps_total", outcome="done") == 1
         assert served.metric("looktwice_model_info", revision="r2") == 1
         assert served.metric("looktwice_model_info", revision="r1") == 0
+
+
+def test_real_engines_change_places_under_load_and_lose_nothing(
+    untrained_checkpoint: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "trained").symlink_to(CHECKPOINT, target_is_directory=True)
+
+    def load(path: Path) -> TorchEngine:
+        return TorchEngine(path, TorchSettings(rows=12))
+
+    answers: list[httpx.Response] = []
+    enough = threading.Event()
+
+    def ask() -> None:
+        while not enough.is_set():
+            document = body(noisy_scene(), n=2, thinking="never")
+            answers.append(httpx.post(served.url + "/v1/plan", json=document, timeout=60))
+
+    with serve(load(untrained_checkpoint), Settings(checkpoints=tmp_path), load=load) as served:
+        before = served.http.get("/v1/models").json()["models"][0]["revision"]
+        threads = [threading.Thread(target=ask) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        served.until(lambda: len(answers) > 3)
+        after = served.http.post("/v1/models:load", json={"checkpoint": "trained"}, timeout=60).json()[
+            "revision"
+        ]
+        count = len(answers)
+        served.until(lambda: len(answers) > count + 3)
+        enough.set()
+        for thread in threads:
+            thread.join()
+    assert [answer.status_code for answer in answers] == [200] * len(answers)
+    revisions = [answer.json()["model"]["revision"] for answer in answers]
+    assert (revisions[0], revisions[-1]) == (before, after)
+    assert before != after
 
 
 def test_a_checkpoint_that_cannot_be_served_changes_nothing(engine: ScriptedEngine, tmp_path: Path) -> None:

@@ -84,6 +84,7 @@ def test_what_fails_on_the_way_is_an_event(served: Served, engine: ScriptedEngin
     events = events_of(served.http.post("/v1/plan", json=streaming()))
     assert events[-1][1]["type"].endswith("/internal")
     assert "inside knowledge" not in str(events)
+    assert served.metric("looktwice_failures_told_total", reason="internal") == 1
 
 
 def test_leaving_a_stream_cancels_it(served: Served, engine: ScriptedEngine) -> None:

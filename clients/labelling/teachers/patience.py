@@ -27,13 +27,15 @@ async def patiently(call: Callable[[], Awaitable[_Result]], give_up_after_s: flo
     """What a call gives in the end; it is made again, ever later, while it ends in `TryLater`.
 
     Raises:
-        TryLater: it still did after so many seconds.
+        TryLater: it still did after so many seconds, or asked to wait for longer than that.
     """
 
     def wait(error: Exception) -> bool | float:
         if not isinstance(error, TryLater):
             return False
-        return True if error.wait_s is None else min(error.wait_s, _LONGEST_WAIT_S)
+        if error.wait_s is None:
+            return True
+        return error.wait_s if error.wait_s <= give_up_after_s else False
 
     async for attempt in stamina.retry_context(
         on=wait, attempts=None, timeout=give_up_after_s, wait_initial=0.2, wait_max=_LONGEST_WAIT_S

@@ -12,7 +12,7 @@ from typing import Final
 
 from clients.labelling.checks import FailedCheck
 from clients.labelling.direction import Change, wanted_changes
-from clients.labelling.teachers.teacher import Answer, Question, TeacherError
+from clients.labelling.teachers.teacher import AnnotationsMissing, Answer, Question
 from clients.labelling.teachers.view import Sight, View, view_of
 from model.driving.plan import Group, Plan, format_tick
 from model.driving.scene import AgentKind
@@ -32,37 +32,42 @@ class RuleTeacher:
     """`clients.labelling.teachers.teacher.Teacher` by rule; nothing is asked of anybody."""
 
     name: Final = "rules"
-    revision: Final = "1"
+    revision: Final = "2"
 
     async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
         """One paragraph; the same for the same question, another one after complaints.
 
         Raises:
-            TeacherError: the scene has no annotations.
+            AnnotationsMissing: the scene has no annotations.
         """
         if question.surroundings is None:
-            raise TeacherError("the built-in teacher needs the scene's annotations: agents and lane lines")
+            raise AnnotationsMissing(
+                "the built-in teacher needs the scene's annotations: agents and lane lines"
+            )
         scene, predicted, expert = question.scene, question.predicted, question.expert
         chance = random.Random(f"{scene.scene_id}/{question.seed}/{len(complaints)}/{predicted}")
         view = view_of(scene, question.surroundings)
         changes = wanted_changes(predicted, expert)
         if not changes:
             return Answer(_nothing_to_change(view, chance))
-        said = [_on(min(each), view, predicted, expert, chance) for each in changes[:2]]
+        routed = scene.route is not None
+        said = [_on(min(each), view, predicted, expert, routed, chance) for each in changes[:2]]
         return Answer(" ".join(said))
 
     async def close(self) -> None:
         """There is nothing to close."""
 
 
-def _on(change: Change, view: View, predicted: Plan, expert: Plan, chance: random.Random) -> str:
+def _on(
+    change: Change, view: View, predicted: Plan, expert: Plan, routed: bool, chance: random.Random
+) -> str:
     """What is to be seen, what is wrong with the plan, and what is better: one change of one track."""
     if change == "slower":
         return _slower(view, predicted, expert, chance)
     if change == "faster":
         return _faster(view, predicted, chance)
     if change in ("left", "right", "straight"):
-        return _turning(change, view, predicted, chance)
+        return _turning(change, view, predicted, routed, chance)
     return _lanes(change, view, predicted, chance)
 
 
@@ -135,7 +140,7 @@ def _faster(view: View, predicted: Plan, chance: random.Random) -> str:
     return f"{cue} {_capital(slow)} for so long {result}, so {better}."
 
 
-def _turning(change: Change, view: View, predicted: Plan, chance: random.Random) -> str:
+def _turning(change: Change, view: View, predicted: Plan, routed: bool, chance: random.Random) -> str:
     planned = _first(predicted, "lateral", "Left Turn") or _first(predicted, "lateral", "Right Turn")
     if change == "straight":
         cue = chance.choice(("The lane runs straight on here.", "The lane markings run straight ahead."))
@@ -145,10 +150,14 @@ def _turning(change: Change, view: View, predicted: Plan, chance: random.Random)
         return f"{cue} Turning{when} would take me off my line, so I should steer straight for longer."
     if view.bend == change:
         cue = f"The road bends {change} {_ahead(view.bend_m)}."
-    else:
+    elif change in view.turns:
         cue = chance.choice(
-            (f"My way leads {change} off this road.", f"The junction lets me go {change} here.")
+            (f"The junction lets me go {change} here.", f"A lane leads {change} off this road.")
         )
+    elif routed:
+        cue = f"My way leads {change} off this road."
+    else:
+        cue = "The road ahead is not one to go straight through."
     result = chance.choice(("would carry me out of the lane", "would miss the way"))
     better = chance.choice((f"I should turn {change}", f"I should steer to the {change} in time"))
     return f"{cue} Going on as planned {result}, so {better}."
@@ -170,14 +179,16 @@ def _lanes(change: Change, view: View, predicted: Plan, chance: random.Random) -
     ahead = view.first("vehicle", "cone", "barrier", places=("my lane",))
     if ahead is not None:
         cue = f"{_a(ahead, chance)} {_motion(ahead, view, chance)} in my lane, {_ahead(ahead.ahead_m)}."
+    elif side not in view.beside:
+        cue = "My lane is not the one to stay in here."
+    elif view.first(
+        "vehicle", "cone", "barrier", places=("the left lane" if side == "left" else "the right lane",)
+    ):
+        cue = "The lane markings allow to move over here."
     else:
         cue = chance.choice(
             (f"There is room in the {side} lane.", f"The lane to the {side} of mine is open.")
         )
-        if view.first(
-            "vehicle", "cone", "barrier", places=("the left lane" if side == "left" else "the right lane",)
-        ):
-            cue = "The lane markings allow to move over here."
     better = chance.choice(
         (f"I should move to the {side} lane", f"I should change to the {side} lane in time")
     )

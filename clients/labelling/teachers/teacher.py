@@ -23,6 +23,10 @@ class TeacherBusy(TeacherError, TryLater):
     """A teacher that has no time, or is not there now: the same question may be answered later."""
 
 
+class AnnotationsMissing(TeacherError):
+    """A teacher that needs to be told who is around in the scene."""
+
+
 class TeacherClosed(TeacherError):
     """A teacher that answers nobody as things are set up: a wrong key, model or address."""
 

@@ -31,6 +31,8 @@ _SEEN_WITHIN_M: Final = {
 _LANE_M: Final = 2 * LANE_HALF_WIDTH_M
 _LOOK_AHEAD_M: Final = 45.0
 _BEND_RAD: Final = float(np.deg2rad(15))
+_TOUCH_M: Final = 1.0
+_TURN_RAD: Final = float(np.deg2rad(30))
 _PAST_STEPS: Final = 10
 """Motion is judged over the last second; clips show two."""
 
@@ -61,12 +63,16 @@ class View:
         sights: the nearest first.
         bend: which way the ego's lane bends within reach, or None.
         bend_m: where it begins to.
+        turns: which ways a lane leaves the ego's, at a junction for one, within reach.
+        beside: on which sides there is another lane of the same way.
     """
 
     speed_ms: float
     sights: tuple[Sight, ...]
     bend: Bend | None
     bend_m: float
+    turns: frozenset[Bend] = frozenset()
+    beside: frozenset[Bend] = frozenset()
 
     def first(self, *kinds: AgentKind, places: tuple[Place, ...]) -> Sight | None:
         """The nearest sight of some kinds in some places."""
@@ -93,7 +99,8 @@ def view_of(scene: Scene, surroundings: Surroundings) -> View:
     seen = [agent for agent in surroundings.agents if _visible(agent, surroundings.agents)]
     sights = sorted((_sight(agent, lane) for agent in seen), key=lambda each: each.ahead_m)
     bend, bend_m = _bend(lane)
-    return View(speed_ms, tuple(sights), bend, bend_m)
+    lines = [line.astype(np.float64) for line in surroundings.lane_lines if len(line) > 1]
+    return View(speed_ms, tuple(sights), bend, bend_m, _turns(lines, lane), _beside(lines))
 
 
 def _visible(agent: Agent, others: tuple[Agent, ...]) -> bool:
@@ -176,3 +183,33 @@ def _bend(lane: Array) -> tuple[Bend | None, float]:
         return None, 0.0
     begins = int(np.flatnonzero(np.abs(turned) > _BEND_RAD / 3)[0])
     return ("left" if turned[strongest] > 0 else "right"), float(behind[begins])
+
+
+def _turns(lines: list[Array], lane: Array) -> frozenset[Bend]:
+    """Ways that lines which touch the ego's lane ahead turn off to."""
+    found: set[Bend] = set()
+    reach = lane[np.linalg.norm(lane, axis=1) < _LOOK_AHEAD_M]
+    for line in lines:
+        apart = np.linalg.norm(line[:, None] - reach, axis=2)
+        if not len(reach) or apart.min() > _TOUCH_M:
+            continue
+        onwards = line[int(np.unravel_index(int(apart.argmin()), apart.shape)[0]) :]
+        heading = np.unwrap(np.arctan2(*np.diff(onwards, axis=0).T[::-1]))
+        if len(heading) and abs(heading[0]) < np.pi / 2:
+            turned = heading[int(np.abs(heading).argmax())]
+            if abs(turned) > _TURN_RAD:
+                found.add("left" if turned > 0 else "right")
+    return frozenset(found)
+
+
+def _beside(lines: list[Array]) -> frozenset[Bend]:
+    """Sides on which a line runs beside the ego, the same way, a lane away."""
+    found: set[Bend] = set()
+    for line in lines:
+        nearest = int(np.abs(line[:-1, 0]).argmin())
+        x, y = line[nearest]
+        step = line[nearest + 1] - line[nearest]
+        same_way = abs(np.arctan2(step[1], step[0])) < _TURN_RAD
+        if same_way and abs(x) < _LANE_M and LANE_HALF_WIDTH_M < abs(y) < LANE_HALF_WIDTH_M + _LANE_M:
+            found.add("left" if y > 0 else "right")
+    return frozenset(found)

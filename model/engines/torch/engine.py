@@ -28,6 +28,7 @@ from model.engines.torch.runner import Runner
 from model.engines.torch.threads import FreeCores, fit_threads
 from model.engines.torch.worker import Worker
 from model.engines.warm_up import warm_up
+from model.network.allocator import FreedMemory
 from model.network.checkpoint import load
 from model.network.precision import bfloat16_is_fast
 
@@ -197,10 +198,11 @@ class TorchEngine:
                 decoder = Decoder(runner, settings.shortcuts, clock=time.monotonic)
                 self._counts = decoder.counts
                 runner.warm_up(_WARM_TOKENS)
-                cores = FreeCores(torch.get_num_threads())
+                cores, freed = FreeCores(torch.get_num_threads()), FreedMemory()
                 while self._obey(decoder):
                     if cores.threads != cores.look():
                         torch.set_num_threads(cores.threads)
+                    freed.give_back()
                     events = decoder.step()
                     # Before anybody hears of an end: who asks then must not find its rows in use.
                     self._rows_used = decoder.rows_used

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
@@ -107,3 +109,14 @@ def completion(text: str | None, finish_reason: str = "stop") -> dict[str, Any]:
         ],
         "usage": {"prompt_tokens": 1000, "completion_tokens": 50, "total_tokens": 1050},
     }
+
+
+def without_future(file: Path, scene_id: str) -> None:
+    """Take the expert's future from one scene of a file."""
+    table = pq.read_table(file)
+    rows = table.select(["scene_id", "future"]).to_pylist()
+    place = table.schema.get_field_index("future")
+    futures = [None if row["scene_id"] == scene_id else row["future"] for row in rows]
+    column = pa.array(futures, table.schema.field(place).type)
+    table = table.set_column(place, table.schema.field(place), column)
+    pq.write_table(table, file, write_page_checksum=True)

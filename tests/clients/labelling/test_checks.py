@@ -42,6 +42,8 @@ def test_a_grounded_reflection_passes() -> None:
         (GOOD + " It is so." * 20, "length"),
         (GOOD.replace("The van", "As the expert knows, the van"), "leak"),
         ("Accelerating is too risky here, so I should ease off now.", "anchor"),
+        ("I should ease off now and stay in my lane.", "anchor"),
+        ("A van is close, so I should ease off now. Going on is unsafe, so I should also wait.", "anchor"),
         ("The lane ahead is clear, so I should speed up.", "direction"),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 
 from clients.labelling.batch import BatchError, batch_requests, read_results, take_results
 from clients.labelling.checks import FailedCheck
-from clients.labelling.export import DATASET, reflections, right_plans, write_messages
+from clients.labelling.export import DATASET, PARTS_FILE, reflections, right_plans, write_messages
 from clients.labelling.label import Asked, config_of, jobs, labeller, predicted_plans, questions
 from clients.labelling.ledger import Entry, Ledger, LedgerError, Run
 from clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
@@ -178,6 +178,14 @@ def test_messages_are_what_trainers_read(ledger: Ledger, file: Path, tmp_path: P
         assert GOOD in assistant["content"]
         assert "expert" not in user["content"] + assistant["content"]
         assert str(SLOW_DOWN).strip() in assistant["content"]
+    parted = [json.loads(line) for line in (folder / PARTS_FILE).read_text().splitlines()]
+    for row, other in zip(rows, parted, strict=True):
+        assert other["images"] == row["images"]
+        for message, (role, parts) in zip(row["messages"], map(dict.values, other["messages"]), strict=True):
+            assert role == message["role"]
+            texts = [part.get("text", "<image>") for part in parts]
+            assert "".join(texts) == message["content"]
+            assert [part["type"] for part in parts].count("image") == message["content"].count("<image>")
     with pytest.raises(LedgerError, match="not at"):
         write_messages(ledger, run, scenes(tmp_path / "fewer", 2), folder)
 

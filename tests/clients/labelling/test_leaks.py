@@ -45,6 +45,15 @@ LEAKS = [
     "The \uff27\uff34 brakes.",
     "The bounding boxes overlap.",
     "My instructions say to brake.",
+    "The vehicle ahead will brake.",
+    "The cyclist on the right will cross.",
+    "The light will turn red.",
+    "The bus at the stop is going to pull out.",
+    "The gap soon will close.",
+    "It'll stop behind the crossing.",
+    "The better plan brakes first.",
+    "The hint says to brake.",
+    "Compared with the given trajectory this is fast.",
 ]
 CLEAN = [
     "The van ahead in my lane is close and its brake lights are on. Accelerating from 2.1s would close the "
@@ -55,6 +64,7 @@ CLEAN = [
     "Cones close the right lane ahead, so moving to the left lane soon is the better way.",
     "A pedestrian stands at the kerb on the right. I should brake gently and be ready to stop.",
     "Both lanes look free, a steady speed fits the traffic around me.",
+    "A van stands in my lane. I will brake, and then I'll move to the left lane.",
 ]
 
 

@@ -136,3 +136,19 @@ def test_what_a_helper_entered_is_taken_over_once(tmp_path: Path) -> None:
         assert (ledger.count(run), ledger.count(run, "dead")) == (1, 1)
         assert ledger.answers("a") == [Answer("yes", 10, 5)]
         assert set(ledger.keys_of(run, ["scene a", "scene b", "scene c"])) == {"a", "b"}
+
+
+def test_a_helper_goes_on_with_answers_that_were_paid_for(tmp_path: Path) -> None:
+    with Ledger(None) as helper, Ledger(tmp_path) as ledger:
+        run = ledger.run("label", {})
+        for key in ("ended", "broken off"):
+            ledger.answered(run, key, 1, Answer(f"{key}?", 10, 5))
+        ledger.finish(run, "ended", "scene", {})
+        helper.run("label", {})
+        helper.take_over(run, ledger.begun(run))
+        assert helper.answers("ended") == []
+        assert helper.answers("broken off") == [Answer("broken off?", 10, 5)]
+        helper.answered(run, "broken off", 2, Answer("yes", 20, 5))
+        ledger.take_over(run, helper.entered(run))
+        assert [answer.text for answer in ledger.answers("broken off")] == ["broken off?", "yes"]
+        assert ledger.spent(run).input_tokens == 40

@@ -8,9 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
+from fastapi import FastAPI
 
 from clients.labelling.ledger import Ledger, Run
 from clients.labelling.pipeline import Limits, StageStopped, Tally, work_through
@@ -21,10 +20,11 @@ from model.driving.labeller import expert_plan
 from model.driving.scene_store import read_scenes
 from model.engines.engine import RequestError
 from service.settings import Settings
-from tests.clients.labelling.builds import MODEL, scenes
+from tests.clients.labelling.builds import MODEL, scenes, without_future
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import Served, serve
+from tests.sockets import listening
 
 LIMITS = Limits(at_once=4, give_up_after_s=20.0, max_error_rate=1.0)
 
@@ -64,6 +64,7 @@ def test_a_scene_is_planned_freely_and_with_the_expert_s_plan(
     expert = expert_plan(labelled())
     prefills = [request.controls.prefill for request in engine.submitted]
     assert len(prefills) == 6
+    assert {request.controls.thinking for request in engine.submitted} == {"never"}
     assert [plan for plan in prefills if plan is not None] == [expert] * 3
     with Ledger(tmp_path / "build") as ledger:
         record = next(iter(ledger.entries(run))).record
@@ -82,6 +83,14 @@ def test_a_scene_the_service_refuses_is_a_dead_letter(
     assert (tally.done, tally.dead) == (0, 2)
     with Ledger(tmp_path / "build") as ledger:
         assert "not this one" in next(iter(ledger.entries(run, "dead"))).record["reason"]
+
+
+def test_a_service_that_answers_rubbish_is_a_dead_letter(tmp_path: Path) -> None:
+    app = FastAPI()
+    app.post("/v1/plan")(lambda: {"draws": "none"})
+    with listening(app) as (url, _):
+        _, tally = rolled(url, scenes(tmp_path, 1), tmp_path / "build")
+    assert (tally.done, tally.dead) == (0, 1)
 
 
 def test_a_service_that_restarts_in_the_middle_is_waited_for(tmp_path: Path) -> None:
@@ -150,13 +159,7 @@ def test_keys_change_with_all_that_decides(tmp_path: Path) -> None:
 
 def test_scenes_without_an_expert_s_future_are_named(tmp_path: Path) -> None:
     file = scenes(tmp_path, 3)
-    table = pq.read_table(file)
-    futures = table.column("future").to_pylist()
-    futures[1] = None
-    column = table.schema.get_field_index("future")
-    emptied = pa.array(futures, table.schema.field(column).type)
-    table = table.set_column(column, table.schema.field(column), emptied)
-    pq.write_table(table, file, write_page_checksum=True)
+    without_future(file, "scene-0001")
     named: list[str] = []
     with Ledger(tmp_path / "build") as ledger:
         run = ledger.run("rollout", {})

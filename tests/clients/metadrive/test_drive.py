@@ -15,6 +15,7 @@ from clients.metadrive.drive_table import driver_rows, format_table, to_json
 from clients.metadrive.episode import make_world, run_episode
 from clients.metadrive.episode_log import EpisodeLog
 from clients.metadrive.film import Film
+from clients.metadrive.kept_drives import KeptDrives
 from clients.metadrive.pilots import ConstantVelocity, Planned, ServicePilot
 from clients.metadrive.rig import Rig
 from clients.metadrive.tracking import FreeVehicle, world_trajectory
@@ -168,3 +169,20 @@ def test_drivers_are_compared_over_the_same_episodes() -> None:
     assert {"name", "episodes", "route_completion", "collisions", "off_road", "think_rate"} <= set(told[1])
     assert told[1]["drives"][0]["ended"] == "collision"
     assert driver_rows({"adaptive": [half]})[0].route_completion is None
+
+
+def test_a_run_that_was_cut_goes_on_behind_what_is_kept(tmp_path: Path) -> None:
+    file = tmp_path / "drives.jsonl"
+    whole = Drive(1, "time", 200.0, False, 3.0, 1.0)
+    half = Drive(2, "collision", 100.0, True, 5.0, 2.0, 10, 0.2, 1, 250.0)
+    kept = KeptDrives(file)
+    kept.keep("a", whole)
+    kept.keep("b", half)
+    text = file.read_text()
+    file.write_text(text[:-20])  # killed while it wrote
+    again = KeptDrives(file)
+    assert again.find("a") == whole
+    assert again.find("b") is None
+    again.keep("b", half)
+    assert file.read_text() == text
+    assert KeptDrives(file).find("b") == half

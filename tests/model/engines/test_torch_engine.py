@@ -82,8 +82,23 @@ def test_leaving_early_frees_the_rows(untrained_checkpoint: Path) -> None:
             waiting = PlanRequest("slow", noisy_scene(), controls=Controls(n=2, thinking="always"))
             async for _ in (events := engine.submit(waiting)):
                 break
+            passes = engine.counts.passes
             await events.aclose()
+            await asyncio.sleep(0.5)
+            # The step that was under way, and the one in which it was told.
+            assert engine.counts.passes - passes <= 2
+            assert engine.load.rows_used == 0
             assert len(await plan(engine, direct("next", n=2))) == 2
+
+    run(test)
+
+
+def test_an_engine_that_has_started_has_planned_in_every_format(untrained_checkpoint: Path) -> None:
+    async def test() -> None:
+        async with running(untrained_checkpoint) as engine:
+            assert engine.counts.scene_passes > 0
+            assert engine.counts.passes > len(engine.card.formats)
+            assert engine.load.rows_used == 0
 
     run(test)
 

@@ -18,6 +18,7 @@ from model.evaluation.ladder import (
     THRESHOLDS,
     at_threshold,
     by_difficulty,
+    hard_to_easy,
     ladder_report,
     rung_variants,
     temperature_variants,
@@ -61,6 +62,8 @@ def test_a_rung_has_its_rows_with_and_without_the_route() -> None:
 def test_difficulty_is_told_by_the_error_without_thinking() -> None:
     never = [result(scene, float(scene)) for scene in range(40)]
     adaptive = [result(scene, 40.0 - scene, scene / 40) for scene in reversed(range(40))]
+    ten = by_difficulty(adaptive, never)
+    assert hard_to_easy(ten) == pytest.approx(35.5 / 3.5)
     groups = by_difficulty(adaptive, never, 5)
     assert [group.scenes for group in groups] == [8] * 5
     assert [group.never_m for group in groups] == sorted(group.never_m for group in groups)

@@ -1,0 +1,50 @@
+"""What thinking brings, as the command tells it: real engines, an untrained checkpoint, bundled scenes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from model.engines.torch.engine import TorchEngine
+from service.cli.commands import app
+
+
+def ladder(checkpoint: Path, folder: Path, *more: str) -> dict[str, Any]:
+    """Over two scenes with two draws each."""
+    asked = ["evaluate", "--preset", "ladder", "--checkpoint", str(checkpoint), "--limit", "2", "--n", "2"]
+    kept = ["--think-threshold", "0.25", "--sweep", "1", "--keep", str(folder / "draws.sqlite")]
+    result = CliRunner().invoke(app, [*asked, *kept, *more, "--json"])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout.splitlines()[-1])
+    assert isinstance(found, dict)
+    return found
+
+
+def test_a_ladder_is_climbed_once_and_told_again(
+    untrained_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rungs = tmp_path / "rungs"
+    rungs.mkdir()
+    for name in ("meta-act", "multi-round"):
+        (rungs / name).symlink_to(untrained_checkpoint, target_is_directory=True)
+    plots = tmp_path / "plots"
+    told = ladder(untrained_checkpoint, tmp_path, "--ladder", str(rungs), "--plots", str(plots))
+    names = {row["name"] for row in told["rows"]}
+    assert {"traj-only", "meta-act", "meta-act, expert plan", "meta-act, multi-round"} <= names
+    for way in ("adaptive", "never thinks", "always thinks", "threshold 0", "threshold 1", "temperature 0.2"):
+        assert f"counterfactual, {way}" in names
+    assert {path.name for path in plots.iterdir()} == {
+        "thinking-by-difficulty.png",
+        "thinking-by-temperature.png",
+        "risk-and-compute.png",
+    }
+
+    def plan(*_: object) -> None:
+        raise AssertionError("all draws are kept")
+
+    monkeypatch.setattr(TorchEngine, "submit", plan)
+    assert ladder(untrained_checkpoint, tmp_path, "--ladder", str(rungs)) == told
