@@ -71,19 +71,19 @@ def check_reflection(text: str, predicted: Plan, expert: Plan) -> list[FailedChe
 
 
 def _is_anchored(text: str) -> bool:
-    """Whether every correction has something to be seen before it, or in it, that none before it used.
+    """Whether at least as much is seen as is asked for, up to every correction.
 
     "I should stay in my lane" names the lane as what to do and not as what is seen: behind the word that asks
     for a change only things count.
     """
-    cues, corrections = set[str](), 0
+    seen = corrections = 0
     for sentence in _SENTENCES.split(text):
         asks = _CORRECTION.search(sentence)
-        seen = sentence if asks is None else sentence[: asks.start()]
-        cues |= {found.group().casefold() for found in _CUE.finditer(seen)}
-        if asks is not None:
-            cues |= {found.group().casefold() for found in _THING.finditer(sentence[asks.start() :])}
-            corrections += 1
-            if len(cues) < corrections:
-                return False
-    return bool(cues)
+        if asks is None:
+            seen += len(_CUE.findall(sentence))
+            continue
+        seen += len(_CUE.findall(sentence[: asks.start()])) + len(_THING.findall(sentence[asks.start() :]))
+        corrections += 1
+        if seen < corrections:
+            return False
+    return seen > 0

@@ -28,8 +28,6 @@ THRESHOLDS: Final = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0
 """From always to never."""
 GROUPS: Final = 10
 """Scenes are told apart by difficulty in so many groups."""
-FIFTH: Final = GROUPS // 5
-"""Groups that make a fifth of the scenes."""
 
 Results = Mapping[Variant, Sequence[SceneResult]]
 
@@ -136,7 +134,7 @@ class Difficulty:
 def by_difficulty(
     adaptive: Sequence[SceneResult], never: Sequence[SceneResult], groups: int = GROUPS
 ) -> list[Difficulty]:
-    """Scenes from easy to hard, in groups of equal size.
+    """Scenes from easy to hard, in groups of equal size; fewer groups where there are fewer scenes.
 
     How hard a scene is, is told by the same model's minADE when it may not think, so that thinking has no
     part in what it is measured by.
@@ -144,7 +142,7 @@ def by_difficulty(
     without = {result.scene_id: result.min_ade_m for result in never}
     order = sorted(adaptive, key=lambda result: without[result.scene_id])
     found = []
-    for part in np.array_split(np.arange(len(order)), groups):
+    for part in np.array_split(np.arange(len(order)), min(groups, len(order))):
         group = [order[place] for place in part]
         found.append(
             Difficulty(
@@ -160,10 +158,13 @@ def by_difficulty(
 def hard_to_easy(groups: Sequence[Difficulty]) -> float | None:
     """How many times as often the hardest fifth of the scenes is thought about as the easiest one.
 
-    None where the easiest is never thought about.
+    None where the easiest is never thought about, or where a fifth is less than a group.
     """
+    fifth = len(groups) // 5
+    if not fifth:
+        return None
     easiest, hardest = (
-        sum(group.scenes * group.think_rate for group in part) for part in (groups[:FIFTH], groups[-FIFTH:])
+        sum(group.scenes * group.think_rate for group in part) for part in (groups[:fifth], groups[-fifth:])
     )
     return hardest / easiest if easiest else None
 

@@ -121,7 +121,7 @@ def test_a_defect_in_one_scene_leaves_the_others_and_is_counted(
 
 
 def test_with_a_key_only_what_is_final_is_kept(served: Served, engine: ScriptedEngine) -> None:
-    headers, document = {"Idempotency-Key": "batch"}, {"requests": [body(n=1), body(n=9)]}
+    headers, document = {"Idempotency-Key": "batch"}, {"requests": [body(n=1), body() | {"format": "haiku"}]}
 
     def again() -> list[int]:
         answer = served.http.post("/v1/plan/batch", json=document, headers=headers)

@@ -268,6 +268,7 @@ def test_types_are_stable() -> None:
         "idempotency-key-reused": 422,
         "checkpoint-failed": 422,
         "queue-full": 429,
+        "teacher-refused": 502,
         "rate-limited": 429,
         "draining": 503,
         "queue-timeout": 503,

@@ -105,16 +105,16 @@ def test_the_scene_is_checked_like_any_other(served: Served) -> None:
     ],
 )
 def test_an_upstream_teacher_that_fails_is_told_from_a_question_that_lacks_something(
-    error: Exception, type: str, status: int
+    settings: Settings, error: Exception, type: str, status: int
 ) -> None:
-    with serve(ScriptedEngine(), Settings(), teacher=Upstream(error)) as served:
+    with serve(ScriptedEngine(), settings, teacher=Upstream(error)) as served:
         answer = served.http.post(PATH, json=asking(served))
         assert answer.status_code == status
         assert str(error) in problem(answer, type).detail
 
 
-def test_checks_that_a_teacher_never_passes_are_counted_by_reason() -> None:
-    with serve(ScriptedEngine(), Settings(), teacher=Upstream("The expert brakes for the van.")) as served:
+def test_checks_that_a_teacher_never_passes_are_counted_by_reason(settings: Settings) -> None:
+    with serve(ScriptedEngine(), settings, teacher=Upstream("The expert brakes for the van.")) as served:
         answer = served.http.post(PATH, json=asking(served))
         assert "'expert'" in problem(answer, "label-refused").detail
         for check, failed in (("leak", 3), ("length", 0)):

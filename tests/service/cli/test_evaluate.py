@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
+from model.bundled import SCENES
+from model.driving.scene_store import read_scenes
+from model.engines.engine import Event, PlanRequest
 from model.engines.torch.engine import TorchEngine
 from service.cli.commands import app
 
@@ -43,8 +47,12 @@ def test_a_ladder_is_climbed_once_and_told_again(
         "risk-and-compute.png",
     }
 
-    def plan(*_: object) -> None:
-        raise AssertionError("all draws are kept")
+    planned, submit = set[str](), TorchEngine.submit
 
-    monkeypatch.setattr(TorchEngine, "submit", plan)
+    def planning(engine: TorchEngine, request: PlanRequest) -> AsyncGenerator[Event]:
+        planned.add(request.scene.scene_id)
+        return submit(engine, request)
+
+    monkeypatch.setattr(TorchEngine, "submit", planning)
     assert ladder(untrained_checkpoint, tmp_path, "--ladder", str(rungs)) == told
+    assert not planned & {each.scene.scene_id for each in read_scenes(SCENES)}, "all draws are kept"
