@@ -49,7 +49,7 @@ _KINDS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "the future": (
         # Of oneself one may say what one will do.
-        r"(?!(?:i|we) )\w+ (?:(?:\w+ly|soon|then|surely) )?(?:will|shall|is going to|are going to)",
+        r"(?!(?:i|we) )\w+ (?:will|shall|is going to|are going to)",
         r"(?!(?:i|we)')\w+'ll",
         r"(?:turns|turned) out",
         r"(?:ends?|ended) up",

@@ -111,8 +111,8 @@ def climb(
     folder.mkdir(parents=True, exist_ok=True)
     if meta_act is not None and not (folder / META_ACT).exists():
         (folder / META_ACT).symlink_to(meta_act.resolve(), target_is_directory=True)
-    if not (folder / META_ACT / _CHECKPOINT_FILE).exists():
-        if not (folder / _UNTRAINED / _CHECKPOINT_FILE).exists():
+    if not _is_there(folder / META_ACT):
+        if not _is_there(folder / _UNTRAINED):
             _run(
                 _LOOKTWICE,
                 ["train", "create", "--to", str(folder / _UNTRAINED), "--scenes", str(scenes), *training],
@@ -123,7 +123,7 @@ def climb(
             _train(rung, folder, scenes, [*vision, *own], processes)
     for rung in _RUNGS:
         reflections = folder / f"{rung.build}.parquet"
-        if not reflections.exists() and not _is_there(rung, folder):
+        if not reflections.exists() and not _is_there(folder / rung.name):
             _make(_BUILDS[rung.build], folder, scenes, every, reflections)
         _train(rung, folder, scenes, ["--reflections", str(reflections), *training], processes)
     _run(
@@ -134,13 +134,13 @@ def climb(
     )
 
 
-def _is_there(rung: Rung, folder: Path) -> bool:
-    return (folder / rung.name / _CHECKPOINT_FILE).exists()
+def _is_there(checkpoint: Path) -> bool:
+    return (checkpoint / _CHECKPOINT_FILE).exists()
 
 
 def _train(rung: Rung, folder: Path, scenes: Path, options: Sequence[str], processes: int) -> None:
     """Train one rung, unless it is there."""
-    if _is_there(rung, folder):
+    if _is_there(folder / rung.name):
         return
     _run(
         [sys.executable, "-m", "torch.distributed.run", "--standalone"],

@@ -50,7 +50,7 @@ class AllowedHead:
         for rows, flat in zip(rows_of.values(), np.split(every, ends[:-1]), strict=True):
             ids = wanted[rows[0]]
             logits = flat.reshape(len(rows), -1)
-            if logits.shape[1] != len(ids):
+            if self._part(ids) is None:
                 logits = logits[:, ids]
             for row, values in zip(rows, logits, strict=True):
                 found[row] = values

@@ -2,57 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-import torch
 
-from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, RequestError
+from model.engines.engine import Controls, Draw, PlanRequest, RequestError
 from model.engines.torch.decoder import Decoder, Failed
 from model.engines.torch.pace import TimeFor
 from model.engines.torch.rows import Row
 from model.engines.torch.runner import Runner
-from model.network.checkpoint import Loaded, load
-from tests.checkpoints import noisy_scene
-from tests.model.engines.reference import exactly, reference_draws
+from model.network.checkpoint import Loaded
+from tests.model.engines.decoding import decode_some, request
+from tests.model.engines.reference import reference_draws
 
 BAD = "bad"
 
 
-@pytest.fixture(scope="module")
-def exact(untrained_checkpoint: Path) -> Loaded:
-    return exactly(load(untrained_checkpoint, dtype=torch.float64))
-
-
-@pytest.fixture(autouse=True)
-def _inference() -> Iterator[None]:
-    with torch.inference_mode():
-        yield
-
-
-def request(name: str, scene: int, n: int = 2) -> PlanRequest:
-    return PlanRequest(name, noisy_scene(scene, route=scene % 2 == 1), "cf_vla", Controls(n=n, seed=scene))
-
-
-def decode(
-    decoder: Decoder, *requests: PlanRequest
-) -> tuple[dict[tuple[str, int], Draw], dict[str, Exception]]:
-    """What ended, and what failed."""
-    for each in requests:
-        decoder.add(each)
-    draws, failed = {}, {}
-    while not decoder.idle:
-        for name, event in decoder.step():
-            if isinstance(event, DrawFinished):
-                draws[name, event.draw.index] = event.draw
-            elif isinstance(event, Failed):
-                failed[name] = event.error
-        decoder.check_integrity()
-    return draws, failed
+pytestmark = pytest.mark.usefixtures("inference")
 
 
 def assert_as_alone(exact: Loaded, draws: dict[tuple[str, int], Draw], *requests: PlanRequest) -> None:
@@ -64,7 +32,11 @@ def assert_as_alone(exact: Loaded, draws: dict[tuple[str, int], Draw], *requests
 def test_a_scene_without_numbers_fails_alone_and_nobody_reads_what_it_wrote(
     exact: Loaded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bad, good, later = request(BAD, 7), request("good", 2), request("later", 4)
+    bad, good, later = (
+        request(BAD, 7, n=2, seed=7),
+        request("good", 2, n=2, seed=2),
+        request("later", 4, n=2, seed=4),
+    )
     embed = exact.model.embed_prompt
 
     def embedding(prompt: Any, vision_tokens: Any, history: Any, route: Any) -> Any:
@@ -82,13 +54,13 @@ def test_a_scene_without_numbers_fails_alone_and_nobody_reads_what_it_wrote(
         failed = [event for _, event in decoder.step() if isinstance(event, Failed)]
     assert "no numbers" in str(failed[0].error)
     # Its prompt is one shorter, it is where the failed one was, and it is read as far as the other has come.
-    draws, others = decode(decoder, later)
+    draws, others = decode_some(decoder, later)
     assert not others
     assert_as_alone(exact, draws, good, later)
 
 
 def test_a_scene_that_cannot_be_embedded_fails_alone(exact: Loaded, monkeypatch: pytest.MonkeyPatch) -> None:
-    bad, good = request(BAD, 7), request("good", 2)
+    bad, good = request(BAD, 7, n=2, seed=7), request("good", 2, n=2, seed=2)
     embed = exact.model.embed_prompt
 
     def embedding(prompt: Any, vision_tokens: Any, history: Any, route: Any) -> Any:
@@ -97,7 +69,7 @@ def test_a_scene_that_cannot_be_embedded_fails_alone(exact: Loaded, monkeypatch:
         return embed(prompt, vision_tokens, history, route)
 
     monkeypatch.setattr(exact.model, "embed_prompt", embedding)
-    draws, failed = decode(Decoder(Runner(exact, 8)), bad, good)
+    draws, failed = decode_some(Decoder(Runner(exact, 8)), bad, good)
     assert list(failed) == [BAD]
     assert_as_alone(exact, draws, good)
 
@@ -116,8 +88,8 @@ def test_a_draw_that_cannot_go_on_ends_its_request_alone(
         return choices(row, logits, time_for)
 
     monkeypatch.setattr(Row, "choices", choosing)
-    good = request("good", 2)
-    draws, failed = decode(Decoder(Runner(exact, 8)), request(BAD, 7, n=4), good)
+    good = request("good", 2, n=2, seed=2)
+    draws, failed = decode_some(Decoder(Runner(exact, 8)), request(BAD, 7, n=4, seed=7), good)
     assert list(failed) == [BAD]
     assert "a draw could not go on: no" in str(failed[BAD])
     assert_as_alone(exact, draws, good)
