@@ -16,7 +16,7 @@ from model.formats.pieces import FormatError
 from model.formats.text import parse
 from model.network.vocabulary import END_OF_TEXT, IM_END, Vocabulary
 
-SHORTCUTS = ("jump", "shared_prompts", "shared_rows", "speculate", "reuse")
+SHORTCUTS = ("jump", "shared_prompts", "shared_rows", "speculate", "reuse", "capture")
 """The torch engine's, in the order in which the bench switches them on."""
 
 

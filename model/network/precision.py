@@ -19,6 +19,11 @@ def bfloat16_is_fast(device: str = "cpu") -> bool:
     return bool(capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
 
 
+def has_bfloat16_layout() -> bool:
+    """Whether oneDNN can lay weights in bfloat16 out for this CPU (AVX-512 or AVX-NE-CONVERT; not AVX2)."""
+    return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
 def fast_dtype(device: str = "cpu") -> torch.dtype:
     """The type whose matrices a device multiplies fastest: bfloat16 or float32."""
     return torch.bfloat16 if bfloat16_is_fast(device) else torch.float32

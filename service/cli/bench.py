@@ -79,7 +79,7 @@ def engine(
         rows = run(job, tell)
         steps: list[Row] = []
         if shortcuts and "torch" in names:
-            for chosen in _ladder():
+            for chosen in _ladder(device):
                 ladder = tuple(load for load in loads if load.n > 1 and load.thinking == "adaptive")
                 steps += run(Job((chosen,), ladder, checkpoint, scenes, repeats, device), tell)
         planners = [run_planner(job, _whole(n)) for n in draws.split(",") if "torch" in names]
@@ -212,11 +212,12 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-def _ladder() -> list[str]:
-    """The torch engine without shortcuts, then with one more at a time."""
+def _ladder(device: str) -> list[str]:
+    """The torch engine without shortcuts, then with one more at a time of those that the device knows."""
     from model.bench.contenders import SHORTCUTS
 
-    return ["torch+none"] + [f"torch+{','.join(SHORTCUTS[:count])}" for count in range(1, len(SHORTCUTS) + 1)]
+    known = [each for each in SHORTCUTS if device != "cpu" or each != "capture"]
+    return ["torch+none"] + [f"torch+{','.join(known[:count])}" for count in range(1, len(known) + 1)]
 
 
 def _random_checkpoint(preset: str, words_of: Path, folder: Path, device: str, agreed: bool) -> Path:

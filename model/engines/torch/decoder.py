@@ -60,6 +60,7 @@ class Shortcuts:
             checked.
         reuse: what pictures come to, and what all prompts begin with, is kept for those that come again (by
             the `Runner`).
+        capture: on a GPU a pass is replayed as a whole where one of its sizes came before (by the `Runner`).
     """
 
     jump: bool = True
@@ -67,6 +68,7 @@ class Shortcuts:
     shared_prompts: bool = True
     speculate: bool = True
     reuse: bool = True
+    capture: bool = True
 
     @classmethod
     def none(cls) -> Shortcuts:

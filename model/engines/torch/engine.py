@@ -24,6 +24,7 @@ from model.engines.engine import (
 )
 from model.engines.torch.decoder import Counts, Decoder, Failed, Shortcuts
 from model.engines.torch.frames import Frames
+from model.engines.torch.graphs import CudaGraph
 from model.engines.torch.runner import Runner
 from model.engines.torch.threads import FreeCores, fit_threads
 from model.engines.torch.worker import Worker
@@ -194,6 +195,7 @@ class TorchEngine:
                     frames=self._frames,
                     products=settings.products,
                     reuse=settings.shortcuts.reuse,
+                    capture=CudaGraph if settings.shortcuts.capture and settings.device == "cuda" else None,
                 )
                 decoder = Decoder(runner, settings.shortcuts, clock=time.monotonic)
                 self._counts = decoder.counts

@@ -30,7 +30,7 @@ class KvRows:
         self._both = torch.empty((2, layers, rows, heads, length, head_dim), dtype=dtype, device=device)
         self.flat = self._both.view(2, layers, -1, head_dim)
         self._reached = [0] * rows
-        self.heads, self.length, self.head_dim = heads, length, head_dim
+        self.rows, self.heads, self.length = rows, heads, length
 
     def reach(self, rows: int, length: int) -> Tensor:
         """The first places of the first rows, [2, layers, rows, heads, length, head_dim].

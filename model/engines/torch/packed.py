@@ -13,15 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-
-def pass_size(count: int) -> int:
-    """Tokens that a pass with ``count`` of them is padded to: one of few sizes, at most a quarter too large.
-
-    For every new size of a product in bfloat16 a CPU's library makes a kernel first, which takes as long
-    as using it forty times.
-    """
-    step = 1 << max(0, (count - 1).bit_length() - 3) if count else 1
-    return -(-count // step) * step
+from model.network.precision import has_bfloat16_layout
 
 
 class Attention(Protocol):
@@ -51,14 +43,16 @@ class Rotation(NamedTuple):
 class _Product:
     """``x @ weight.T + bias``, the weight laid out once as products read it, and not in every call.
 
-    On a CPU in bfloat16 that is as its matrix units do (oneDNN's own layout, as `torch.compile` does when it
-    freezes weights); else turned over, which takes half of the time where tokens are few.
+    In bfloat16 on most CPUs that is as their matrix units do (oneDNN's own layout, as `torch.compile` does
+    when it freezes weights); else turned over, which takes half of the time where tokens are few.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor | None = None) -> None:
         self.width = weight.shape[1]
         self._bias = bias
-        self._by_onednn = weight.device.type == "cpu" and weight.dtype == torch.bfloat16
+        self._by_onednn = (
+            weight.device.type == "cpu" and weight.dtype == torch.bfloat16 and has_bfloat16_layout()
+        )
         self._weight = (
             torch.ops.mkldnn._reorder_linear_weight(weight) if self._by_onednn else weight.t().contiguous()
         )

@@ -17,9 +17,11 @@ from model.driving.scene import Scene
 from model.engines.torch.attention import DrawPass, PromptPart, PromptPass
 from model.engines.torch.clips import ClipCache, digest
 from model.engines.torch.frames import Frames
+from model.engines.torch.graphs import Capture, Graphs, Numbers, Sizes
 from model.engines.torch.head import AllowedHead, Ids
 from model.engines.torch.kv import KvRows
-from model.engines.torch.packed import PackedDecoder, Rotation, pass_size
+from model.engines.torch.layout import Shape, alike, lean, pass_size, reached
+from model.engines.torch.packed import PackedDecoder, Rotation
 from model.engines.torch.places import Fed, Places
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat
@@ -88,8 +90,9 @@ class _Opened(NamedTuple):
     patches: dict[bytes, npt.NDArray[np.uint8]]
 
 
-def _padded(values: npt.NDArray[np.int64], size: int, device: torch.device) -> Tensor:
-    return torch.from_numpy(np.pad(values, (0, size - len(values)))).to(device)
+def _padded(values: npt.NDArray[np.int64], size: int) -> npt.NDArray[np.int64]:
+    """The last one again and again behind them."""
+    return np.pad(values, (0, size - len(values)), mode="edge" if len(values) else "constant")
 
 
 class Runner:
@@ -104,6 +107,8 @@ class Runner:
         frames: where pictures are decoded; by default a new one.
         products: what matrix products are worked out in; None for the weights' own type.
         reuse: whether anything is kept from scene to scene at all.
+        capture: how passes of draws are captured, to be replayed for passes of the same sizes; None for not
+            at all, which is best where an operation costs no more than what it does.
         formats: of them those that the checkpoint writes are served.
 
     Attributes:
@@ -120,6 +125,7 @@ class Runner:
         frames: Frames | None = None,
         products: torch.dtype | None = None,
         reuse: bool = True,
+        capture: Capture | None = None,
         formats: Mapping[str, Format] = FORMATS,
     ) -> None:
         self.loaded = loaded
@@ -153,6 +159,9 @@ class Runner:
         }
         self.prompt_tokens = max(kept)
         self._memory = KvRows(rows=self.prompts, length=self.prompt_tokens + ROWS_A_PROMPT * length, **sizes)
+        self._shape = Shape(self._decoder.heads, self._memory.heads, self._memory.rows, self._memory.length)
+        self._arrange = lean if capture is None else alike
+        self._pass = self._run_pass if capture is None else Graphs(self._run_pass, capture)
         self._places = Places(rows, length)
         every_place = torch.arange(max(kept) + 1 + length, device=loaded.model.device)
         self._rotation = self._decoder.rotation(every_place.expand(3, -1))
@@ -258,18 +267,45 @@ class Runner:
             for number, feed in enumerate(feeds)
             for place, ids in feed.wanted
         ]
-        size = pass_size(len(ids))
-        attention = DrawPass(self._decoder.heads, self._memory, written, size)
-        embeddings = self.loaded.model.get_input_embeddings()(_padded(ids, size, device))
-        rotation = self._rotation.at(_padded(places, size, device))
-        at = _padded(np.array([place for _, place, _ in asked], np.int64), pass_size(len(asked)), device)
-        hidden = self._decoder(embeddings, rotation, attention, at if asked else None)
+        size, wanted = pass_size(len(ids)), np.array([place for _, place, _ in asked], np.int64)
+        layout = self._arrange(self._shape, written, size)
+        numbers = [
+            _padded(ids, size),
+            _padded(places, size),
+            _padded(wanted, pass_size(len(asked)) if asked else 0),
+            *(layout.slots, layout.into, layout.back),
+        ]
+        self._memory.reach(*reached(layout.parts))
+        hidden = self._pass(
+            Sizes(layout.parts, tuple(map(len, numbers))),
+            Numbers(
+                # Few copies: on a GPU each costs as much as an operation.
+                torch.from_numpy(np.concatenate(numbers)).to(device),
+                torch.from_numpy(layout.hidden).to(device),
+            ),
+        )
         found: list[list[npt.NDArray[np.float64]]] = [[] for _ in feeds]
         if asked:
             logits = self._head.logits(hidden[: len(asked)], [ids for _, _, ids in asked])
             for (number, _, _), values in zip(asked, logits, strict=True):
                 found[number].append(values)
         return found
+
+    def _run_pass(self, sizes: Sizes, numbers: Numbers) -> Tensor:
+        """Final hidden states of the tokens that are asked for, [k, hidden]."""
+        ids, places, wanted, slots, into, back = torch.split(numbers.whole, list(sizes.numbers))
+        attention = DrawPass(
+            self._decoder.heads,
+            self._memory,
+            sizes.parts,
+            slots=slots,
+            into=into,
+            back=back,
+            hidden=numbers.hidden,
+        )
+        embeddings = self.loaded.model.get_input_embeddings()(ids)
+        rotation = self._rotation.at(places)
+        return self._decoder(embeddings, rotation, attention, wanted if len(wanted) else None)
 
     def _open(self, scene: Scene) -> _Opened | Exception:
         """A scene's pictures: what is kept of them, and the patches of the others."""

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 
 from model.engines.torch.attention import DrawPass
 from model.engines.torch.kv import KvRows
-from model.engines.torch.packed import pass_size
-from model.engines.torch.places import Fed, Places
+from model.engines.torch.layout import Layout, Part, Shape, alike, lean, pass_size
+from model.engines.torch.places import Fed, Places, Written
 
 PROMPTS = (5, 3, 9)
 HEADS, GROUPS, WIDTH = 4, 2, 8
@@ -20,8 +22,27 @@ def empty(*, layers: int, rows: int, length: int, dtype: torch.dtype) -> KvRows:
     )
 
 
+def draw_pass(memory: KvRows, arranged: Layout) -> DrawPass:
+    return DrawPass(
+        HEADS,
+        memory,
+        arranged.parts,
+        slots=torch.from_numpy(arranged.slots),
+        into=torch.from_numpy(arranged.into),
+        back=torch.from_numpy(arranged.back),
+        hidden=torch.from_numpy(arranged.hidden),
+    )
+
+
+def shape(memory: KvRows) -> Shape:
+    return Shape(HEADS, GROUPS, memory.rows, memory.length)
+
+
+@pytest.mark.parametrize("arrange", [lean, alike])
 @pytest.mark.parametrize("seed", range(20))
-def test_each_token_sees_its_prompt_and_what_its_draw_has_written(seed: int) -> None:
+def test_each_token_sees_its_prompt_and_what_its_draw_has_written(
+    seed: int, arrange: Callable[[Shape, Written, int], Layout]
+) -> None:
     """Passes over draws that part and write by chance, against attention worked out draw by draw."""
     random = np.random.default_rng(seed)
     torch.manual_seed(seed)
@@ -48,7 +69,9 @@ def test_each_token_sees_its_prompt_and_what_its_draw_has_written(seed: int) -> 
         size = pass_size(total) + 1
         query = torch.randn(size, HEADS, WIDTH, dtype=torch.float64)
         key, value = (torch.randn(size, GROUPS, WIDTH, dtype=torch.float64) for _ in range(2))
-        attention = DrawPass(HEADS, memory, places.write(fed, PROMPTS), size)
+        for each in (query, key, value):  # as the runner pads
+            each[total:] = each[total - 1]
+        attention = draw_pass(memory, arrange(shape(memory), places.write(fed, PROMPTS), size))
         seen = attention.attend(1, query, key, value)
         start = 0
         for row, count in zip(rows, counts, strict=True):
@@ -69,8 +92,18 @@ def test_each_token_sees_its_prompt_and_what_its_draw_has_written(seed: int) -> 
 def test_a_scene_that_sees_far_leaves_the_others_their_span() -> None:
     memory = empty(layers=1, rows=3, length=3000, dtype=torch.float32)
     written = Places(3, 40).write([Fed(row, row, 0, 8) for row in range(3)], (20, 2000, 30))
-    spans = [mask.shape[-1] for _, mask in DrawPass(HEADS, memory, written, 24)._parts]
-    assert spans == [32, 2016, 64]
+    assert [part.span for part in lean(shape(memory), written, 24).parts] == [32, 2016, 64]
+
+
+def test_passes_are_alike_while_they_are_small() -> None:
+    memory = empty(layers=1, rows=16, length=3000, dtype=torch.float32)
+    parts = set()
+    for rows in (5, 6, 7, 8):
+        places = Places(16, 40)
+        for fed in range(10):
+            written = places.write([Fed(row, row, fed, 1) for row in range(rows)], (70,) * rows)
+            parts.add(alike(shape(memory), written, pass_size(rows)).parts)
+    assert parts == {(Part(0, 8, 1, 128),)}
 
 
 def test_passes_have_few_sizes_and_little_padding() -> None:

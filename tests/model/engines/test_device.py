@@ -12,9 +12,11 @@ from torch.utils._pytree import tree_leaves
 
 from model.engines.engine import Controls, DrawFinished, PlanRequest
 from model.engines.torch.decoder import Decoder
+from model.engines.torch.graphs import Capture
 from model.engines.torch.runner import Runner
 from model.network.checkpoint import load
 from tests.checkpoints import noisy_scene
+from tests.model.engines.decoding import Again
 
 _MOVES = {torch.ops.aten._to_copy.default, torch.ops.aten.copy_.default}
 
@@ -30,8 +32,9 @@ class OneDevice(TorchDispatchMode):  # type: ignore[no-untyped-call]
         return func(*args, **(kwargs or {}))
 
 
+@pytest.mark.parametrize("capture", [None, Again])
 def test_every_tensor_is_made_where_the_weights_are(
-    untrained_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+    untrained_checkpoint: Path, monkeypatch: pytest.MonkeyPatch, capture: Capture | None
 ) -> None:
     """With weights on the meta device, which stands for a GPU: it has shapes and no numbers."""
     loaded = load(untrained_checkpoint)
@@ -39,7 +42,7 @@ def test_every_tensor_is_made_where_the_weights_are(
     loaded = replace(loaded, model=model.to("meta"))
     monkeypatch.setattr(Tensor, "cpu", lambda self: torch.zeros(self.shape, dtype=self.dtype))
     with torch.inference_mode(), OneDevice():  # type: ignore[no-untyped-call]
-        runner = Runner(loaded, 4, clip_bytes=1 << 20)
+        runner = Runner(loaded, 4, clip_bytes=1 << 20, capture=capture)
         runner.warm_up(4)
         decoder = Decoder(runner)
         for scene, format in enumerate(("cf_vla", "traj_only")):

@@ -34,6 +34,7 @@ from model.formats.cf_vla import FORMATS
 from model.formats.pieces import Format
 from model.network.checkpoint import Loaded, load
 from tests.checkpoints import noisy_scene, write_untrained
+from tests.model.engines.decoding import Again
 from tests.model.engines.reference import Shares, exactly, reference
 from tests.model.formats.strategies import branching_formats
 
@@ -219,8 +220,14 @@ def test_nothing_that_makes_it_fast_changes_a_response(
     with noted() as plain_shares:
         plain = plainly(exact, requests, made_up)
     for number, mix in enumerate(together):
-        reuse = mix.shortcuts.reuse
-        runner = Runner(exact, mix.rows, clip_bytes=1 << 20, reuse=reuse, formats=made_up)
+        runner = Runner(
+            exact,
+            mix.rows,
+            clip_bytes=1 << 20,
+            reuse=mix.shortcuts.reuse,
+            capture=Again if mix.shortcuts.capture else None,
+            formats=made_up,
+        )
         pace = Counted(mix.row_s)
         decoder = Decoder(runner, mix.shortcuts, prompt_chunk=mix.chunk, clock=lambda: 0.0, pace=pace)
         with noted() as shares:

@@ -22,7 +22,7 @@ from model.formats.cursor import CompiledFormat
 from model.formats.pieces import BRANCH
 from model.formats.text import parse
 from model.network.checkpoint import Loaded, load
-from tests.model.engines.decoding import decode, request
+from tests.model.engines.decoding import Again, decode, request
 from tests.model.engines.reference import reference_draws
 
 PLAN = parse_plan(
@@ -56,7 +56,9 @@ def test_draws_are_those_of_the_plain_decoder(
     exact: Loaded, plainly: dict[tuple[str, int], Draw], off: str | None
 ) -> None:
     shortcuts = Shortcuts.none() if off == "all" else replace(Shortcuts(), **({off: False} if off else {}))
-    runner = Runner(exact, 13, clip_bytes=1 << 20, reuse=shortcuts.reuse)
+    runner = Runner(
+        exact, 13, clip_bytes=1 << 20, reuse=shortcuts.reuse, capture=Again if shortcuts.capture else None
+    )
     draws = decode(Decoder(runner, shortcuts, prompt_chunk=50), *MIX)
     assert draws.keys() == plainly.keys()
     for key, draw in draws.items():
