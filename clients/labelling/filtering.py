@@ -33,17 +33,19 @@ class Thresholds:
     everything: bool = False
 
     def keep(self, free: Sequence[Mapping[str, Any]], prefilled_m: float) -> tuple[int, ...]:
-        """Which of the free draws of a scene are kept."""
-        every = tuple(range(len(free)))
+        """Which of the free draws of a scene are kept; of those with the same plan the first."""
+        first: dict[str, int] = {}
+        for place, draw in enumerate(free):
+            if self._keeps(draw, free, prefilled_m):
+                first.setdefault(draw["plan"], place)
+        return tuple(first.values())
+
+    def _keeps(self, draw: Mapping[str, Any], free: Sequence[Mapping[str, Any]], prefilled_m: float) -> bool:
         if self.everything:
-            return every
+            return True
         if self.plan_iou is None:
-            return every if self._is_mended(min_ade_m(free), prefilled_m) else ()
-        return tuple(
-            place
-            for place, draw in enumerate(free)
-            if draw["plan_iou"] < self.plan_iou and self._is_mended(draw["ade_m"], prefilled_m)
-        )
+            return self._is_mended(min_ade_m(free), prefilled_m)
+        return draw["plan_iou"] < self.plan_iou and self._is_mended(draw["ade_m"], prefilled_m)
 
     def _is_mended(self, error_m: float, prefilled_m: float) -> bool:
         return error_m > self.epsilon_m and error_m - prefilled_m > self.gain_m
@@ -57,7 +59,7 @@ class Filtered:
         entry: of the ledger.
         free_m, prefilled_m: minADE without and with the expert's plan.
         plan_iou: mean of the free draws.
-        draws: those that are kept.
+        draws: those that are kept, each with a plan of its own.
     """
 
     entry: Entry

@@ -16,6 +16,7 @@ from fastapi.responses import JSONResponse, Response
 from clients.labelling.ledger import Ledger, Run
 from clients.labelling.rollout import Sampling, config_of, key_of
 from clients.wire import ModelName
+from model.driving.plan import parse_plan
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import write_scenes
 from tests.service.scenes import labelled
@@ -25,6 +26,10 @@ MODEL = ModelName(name="scripted", revision="r1")
 GOOD = "A slower vehicle is in my lane. Accelerating would close the gap, so I should slow down."
 """Passes every check for a plan to keep on where slowing down is better."""
 LEAKING = "A slower vehicle is in my lane, and the expert slows down."
+GO_FASTER = parse_plan(
+    "- longitudinal\n  - 0.0s-6.4s: Accelerate\n- lateral\n  - 0.0s-6.4s: Straight\n"
+    "- lane\n  - 0.0s-6.4s: Keep Lane\n"
+)
 
 
 def scenes(folder: Path, count: int) -> Path:
@@ -49,7 +54,7 @@ def rolled_out(folder: Path, count: int) -> Run:
             scene = named(one, f"scene-{number:04d}")
             keys.append(key_of(run, scene))
             ledger.finish(run, keys[-1], scene.scene.scene_id, rollout_record())
-        ledger.keep(run, [(key, (0, 1)) for key in keys])
+        ledger.keep(run, [(key, (0,)) for key in keys])
     return run
 
 
@@ -58,7 +63,10 @@ def rollout_record(free_m: float = 2.0, prefilled_m: float = 0.5, tags: tuple[st
     return {
         "tags": list(tags),
         "expert_plan": str(SLOW_DOWN),
-        "free": [{"ade_m": free_m, "tokens": 60, **draw}, {"ade_m": free_m + 1, "tokens": 60, **draw}],
+        "free": [
+            {"ade_m": free_m, "tokens": 60, **draw},
+            {"ade_m": free_m + 1, "tokens": 60, **draw, "plan": str(GO_FASTER)},
+        ],
         "prefilled": [{"ade_m": prefilled_m, "tokens": 8}],
     }
 

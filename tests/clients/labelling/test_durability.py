@@ -90,10 +90,9 @@ def test_nothing_is_lost_and_nothing_is_paid_twice(tmp_path: Path) -> None:
             scene = named(labelled("scene"), f"scene-{number:04d}")
             keys.append(key_of(rollout, scene))
             record = rollout_record()
-            for draw in record["free"]:
-                draw["plan"] = str(own_plan(number))
+            record["free"][0]["plan"] = str(own_plan(number))
             ledger.finish(rollout, keys[-1], scene.scene.scene_id, record)
-        ledger.keep(rollout, [(key, (0, 1)) for key in keys])
+        ledger.keep(rollout, [(key, (0,)) for key in keys])
         label = ledger.run("label", config_of(rollout, OpenAiTeacher(OpenAiSettings("", "some-vlm")), 0))
         plan_of = {
             job.key: str(job.subject.question.predicted)

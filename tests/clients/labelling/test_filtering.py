@@ -38,6 +38,13 @@ def test_plans_can_be_kept_one_by_one() -> None:
     assert summary([scene])["plans"] == 1
 
 
+def test_the_same_plan_twice_is_kept_once() -> None:
+    one = entry(2.0, 0.5)
+    one.record["free"].append(one.record["free"][0])
+    (scene,) = filtered([one], Thresholds())
+    assert scene.draws == (0, 1)
+
+
 def test_the_smallest_error_of_the_draws_counts() -> None:
     (scene,) = filtered([entry(2.0, 0.5)], Thresholds())
     assert (scene.free_m, scene.prefilled_m, scene.plan_iou) == (2.0, 0.5, 0.5)
