@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Final, cast
 
@@ -40,7 +42,6 @@ def drive(
     from rich.progress import Progress
 
     from clients import wire
-    from clients.answers import PlannerError
     from clients.metadrive.drive import EXPERT, Drive, DriveConfig
     from clients.metadrive.drive import drive as drive_episode
     from clients.metadrive.drive_table import driver_rows, format_table, to_json
@@ -79,6 +80,7 @@ def drive(
         raise typer.BadParameter(f"unknown drivers: {', '.join(sorted(unknown))}")
     with (
         told(),
+        _named(service),
         PlannerClient(service, Patience(timeout_s=120.0), access=Access.from_environment()) as planner,
     ):
         seeds = range(first_seed, first_seed + episodes)
@@ -106,10 +108,19 @@ def drive(
                     except MapError:
                         typer.echo(f"no map fits seed {seed}: left out", err=True)
                         break
-                    except PlannerError as error:
-                        raise RuntimeError(f"{service}: {error}") from error
                     found.setdefault(name, []).append(drove)
                     progress.update(task, advance=1, description=f"{name}: {drove.ended}")
         if gif is not None:
             film.save(gif)
         typer.echo(json.dumps(to_json(found)) if as_json else format_table(driver_rows(found)))
+
+
+@contextmanager
+def _named(service: str) -> Iterator[None]:
+    """Turn what a service refuses, or that nothing answers, into an error that says which."""
+    from clients.answers import PlannerError
+
+    try:
+        yield
+    except PlannerError as error:
+        raise RuntimeError(f"{service}: {error}") from error

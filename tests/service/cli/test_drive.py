@@ -44,3 +44,10 @@ def test_unknown_drivers_are_refused() -> None:
     result = CliRunner().invoke(app, ["drive", "--driver", "racer"])
     assert result.exit_code == 2
     assert "racer" in result.output
+
+
+def test_a_service_that_does_not_answer_is_named() -> None:
+    result = CliRunner().invoke(app, ["drive", "--service", "http://127.0.0.1:9", "--episodes", "1"])
+    assert result.exit_code == 2
+    assert result.output.startswith("looktwice: http://127.0.0.1:9: ")
+    assert len(result.output.splitlines()) == 1
