@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import time
@@ -43,14 +44,24 @@ def granted_cpus(cgroup: Path = _CGROUP) -> int | None:
 
 
 def fit_threads() -> None:
-    """Let torch's operations on this thread use no more threads than CPUs are granted.
+    """Let torch's operations on this thread use as many threads as CPUs are granted.
 
     torch counts the cores of the machine; where a container is granted fewer, its threads wait for each other
     until the next period of its quota. ``OMP_NUM_THREADS`` overrides it, as everywhere.
     """
-    granted = granted_cpus()
+    most, granted = _threads_at_first(), granted_cpus()
     if granted is not None and "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(min(granted, torch.get_num_threads()))
+        most = min(granted, most)
+    torch.set_num_threads(most)
+
+
+@functools.cache
+def _threads_at_first() -> int:
+    """What torch used before any engine here left cores to others.
+
+    A new thread begins with what was set last, on whichever thread that was.
+    """
+    return torch.get_num_threads()
 
 
 class CpuTimes(NamedTuple):

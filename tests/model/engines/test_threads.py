@@ -53,6 +53,23 @@ def test_the_engines_thread_uses_no_more(monkeypatch: pytest.MonkeyPatch) -> Non
         worker.close()
 
 
+def test_an_engine_is_not_held_back_by_what_another_left_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "granted_cpus", lambda: None)
+    monkeypatch.setattr(threads, "_threads_at_first", lambda: 3)
+    first = Worker("first")
+    try:
+        first.submit(threads.fit_threads).result()
+        first.submit(lambda: torch.set_num_threads(1)).result()
+        later = Worker("later")
+        try:
+            later.submit(threads.fit_threads).result()
+            assert later.submit(torch.get_num_threads).result() == 3
+        finally:
+            later.close()
+    finally:
+        first.close()
+
+
 class Machine:
     """Eight processors, so many of them in use by others, and a clock."""
 
