@@ -15,6 +15,8 @@ from model.evaluation.table import Row
 _THINK: Final = "#c9772b"
 _ERROR: Final = "#2b6cb0"
 _PALE: Final = "#9db8d4"
+_APART: Final = 0.03
+"""Of a picture's width: numbers less apart are left out."""
 
 
 def difficulty_plot(groups: Sequence[Difficulty], picture: Path) -> None:
@@ -52,14 +54,24 @@ def threshold_plot(points: Sequence[tuple[float, Row]], picture: Path) -> None:
     figure, axes = _axes("tokens a draw")
     tokens = [_of(row, "output_tokens") for _, row in points]
     axes.plot(tokens, [_of(row, "min_ade_m") for _, row in points], color=_ERROR, marker="o", label="minADE")
+    apart, last = _APART * (max(tokens) - min(tokens)), -1.0
     for (value, row), x in zip(points, tokens, strict=True):
-        axes.annotate(
-            f"{value:g}", (x, _of(row, "min_ade_m")), xytext=(0, 6), textcoords="offset points", fontsize=7
-        )
+        # Where thresholds cost the same their numbers would lie one on the other.
+        if last < 0 or abs(x - last) >= apart:
+            axes.annotate(
+                f"{value:g}",
+                (x, _of(row, "min_ade_m")),
+                xytext=(0, 6),
+                textcoords="offset points",
+                fontsize=7,
+            )
+            last = x
+    axes.margins(y=0.1)
     axes.set_ylabel("minADE, m (numbers: think threshold)", color=_ERROR)
     risk = axes.twinx()
     risk.plot(tokens, [_of(row, "collision_rate") for _, row in points], color=_THINK, marker="s")
     risk.set_ylabel("collision rate", color=_THINK)
+    risk.margins(y=0.1)
     figure.savefig(picture, format="png")
 
 
