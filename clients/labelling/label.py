@@ -74,8 +74,9 @@ def questions(
 
 
 def predicted_plans(entry: Entry, draws: Sequence[int], count: int, seed: int) -> list[str]:
-    """Some of the plans of draws that were kept, at random."""
-    texts = [entry.record["free"][draw]["plan"] for draw in draws]
+    """Different ones among the plans of some draws, at random."""
+    free = entry.record["free"]
+    texts = list(dict.fromkeys(free[draw]["plan"] for draw in draws))
     random.Random(f"{entry.key}/{seed}").shuffle(texts)
     return texts[:count]
 

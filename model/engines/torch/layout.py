@@ -80,7 +80,7 @@ def lean(shape: Shape, written: Written, size: int) -> Layout:
         for run in _together(brought, ends)
     ]
     slots, back, into, hidden = _laid_out(shape, written, parts)
-    return Layout(tuple(parts), slots.ravel(), into, _padded(back, size, "constant").ravel(), hidden)
+    return Layout(tuple(parts), slots.ravel(), into, padded(back, size, "constant").ravel(), hidden)
 
 
 def alike(shape: Shape, written: Written, size: int) -> Layout:
@@ -95,7 +95,7 @@ def alike(shape: Shape, written: Written, size: int) -> Layout:
     part = Part(0, rows, pass_size(int(brought.max())), span)
     slots, back, into, hidden = _laid_out(shape, written, [part])
     return Layout(
-        (part,), _padded(slots, size, "edge").ravel(), into, _padded(back, size, "edge").ravel(), hidden
+        (part,), padded(slots, size, "edge").ravel(), into, padded(back, size, "edge").ravel(), hidden
     )
 
 
@@ -147,9 +147,9 @@ def _laid_out(
     return slots, back, into, np.concatenate(every)
 
 
-def _padded(array: IntArray, size: int, mode: Literal["constant", "edge"]) -> IntArray:
+def padded(array: IntArray, size: int, mode: Literal["constant", "edge"]) -> IntArray:
     """More rows behind those of ``array``: zeros, or its last one again."""
-    return np.pad(array, ((0, size - len(array)), (0, 0)), mode=mode)
+    return np.pad(array, ((0, size - len(array)), *[(0, 0)] * (array.ndim - 1)), mode=mode)
 
 
 def _together(brought: IntArray, ends: IntArray) -> list[slice]:

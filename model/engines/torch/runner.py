@@ -20,7 +20,7 @@ from model.engines.torch.frames import Frames
 from model.engines.torch.graphs import Capture, Graphs, Numbers, Sizes
 from model.engines.torch.head import AllowedHead, Ids
 from model.engines.torch.kv import KvRows
-from model.engines.torch.layout import Shape, alike, lean, pass_size, reached
+from model.engines.torch.layout import Shape, alike, lean, padded, pass_size, reached
 from model.engines.torch.packed import PackedDecoder, Rotation
 from model.engines.torch.places import Fed, Places
 from model.formats.cf_vla import FORMATS
@@ -88,11 +88,6 @@ class _Opened(NamedTuple):
     keys: list[bytes]
     kept: dict[bytes, Tensor]
     patches: dict[bytes, npt.NDArray[np.uint8]]
-
-
-def _padded(values: npt.NDArray[np.int64], size: int) -> npt.NDArray[np.int64]:
-    """The last one again and again behind them."""
-    return np.pad(values, (0, size - len(values)), mode="edge" if len(values) else "constant")
 
 
 class Runner:
@@ -270,11 +265,12 @@ class Runner:
         size, wanted = pass_size(len(ids)), np.array([place for _, place, _ in asked], np.int64)
         layout = self._arrange(self._shape, written, size)
         numbers = [
-            _padded(ids, size),
-            _padded(places, size),
-            _padded(wanted, pass_size(len(asked)) if asked else 0),
+            padded(ids, size, "edge"),
+            padded(places, size, "edge"),
+            padded(wanted, pass_size(len(asked)) if asked else 0, "edge"),
             *(layout.slots, layout.into, layout.back),
         ]
+        # Before the pass, which may be a replay, in which nothing new is made zero.
         self._memory.reach(*reached(layout.parts))
         hidden = self._pass(
             Sizes(layout.parts, tuple(map(len, numbers))),

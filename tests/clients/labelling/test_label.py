@@ -89,12 +89,12 @@ def test_every_kept_scene_is_asked_about(ledger: Ledger, file: Path) -> None:
 
 def test_plans_are_chosen_by_chance_once_and_for_all() -> None:
     record = rollout_record()
-    record["free"] = [{**record["free"][0], "plan": str(plan)} for plan in (KEEP_ON, SLOW_DOWN)]
+    record["free"] = [{**record["free"][0], "plan": str(plan)} for plan in (KEEP_ON, SLOW_DOWN, KEEP_ON)]
     entries = [Entry(f"key {number}", "scene", "done", record, "") for number in range(40)]
-    firsts = [predicted_plans(entry, range(2), 1, 0) for entry in entries]
-    assert firsts == [predicted_plans(entry, range(2), 1, 0) for entry in entries]
+    firsts = [predicted_plans(entry, range(3), 1, 0) for entry in entries]
+    assert firsts == [predicted_plans(entry, range(3), 1, 0) for entry in entries]
     assert {text for texts in firsts for text in texts} == {str(KEEP_ON), str(SLOW_DOWN)}
-    more = [predicted_plans(entry, range(2), 9, 0) for entry in entries]
+    more = [predicted_plans(entry, range(3), 9, 0) for entry in entries]
     assert [plans[:1] for plans in more] == firsts
     assert {len(plans) for plans in more} == {2}
     assert predicted_plans(entries[0], [1], 9, 0) == [str(SLOW_DOWN)], "only draws that were kept"
