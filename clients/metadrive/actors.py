@@ -117,6 +117,8 @@ class Vehicle(Body):
     acceleration: float = 0.0
     shift: Shift | None = None
     drift: Drift | None = None
+    heedless: bool = False
+    """Does not heed what it should brake for."""
     wander_m: float = 0.0
     on_route: bool = True
     hazard_lights: bool = False

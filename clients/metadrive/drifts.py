@@ -42,6 +42,7 @@ class Drifter:
 
 
 def strays(car: Vehicle) -> bool:
-    """Whether a vehicle is on its way out."""
+    """Whether a vehicle is on its way out, or does not heed what it should."""
     drift = car.drift
-    return drift is not None and car.s + car.speed * STEP_S < drift.start_s + _STRAYING * drift.out
+    out = drift is not None and car.s + car.speed * STEP_S < drift.start_s + _STRAYING * drift.out
+    return out or car.heedless

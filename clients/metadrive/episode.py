@@ -16,6 +16,7 @@ from clients.metadrive.driver import SpeedLimits, Style
 from clients.metadrive.episode_log import EpisodeLog, Outcome, Recorder
 from clients.metadrive.expert import Expert, varied
 from clients.metadrive.hazards import Director
+from clients.metadrive.lapses import Lapses
 from clients.metadrive.maps import make_map
 from clients.metadrive.roads import Array, RoadMap
 from model.driving.metrics import box_corners
@@ -25,18 +26,21 @@ _AHEAD_M: Final = 170.0
 _BEHIND_M: Final = 80.0
 
 
-def run_episode(seed: int, duration_s: float = 48.0, *, drifts: bool = False) -> EpisodeLog:
+def run_episode(
+    seed: int, duration_s: float = 48.0, *, drifts: bool = False, lapses: bool = False
+) -> EpisodeLog:
     """Let the expert drive one episode; the same seed gives the same episode.
 
     Args:
         seed: of the episode.
         duration_s: at most.
         drifts: whether the expert strays from its line now and then, and comes back.
+        lapses: whether it brakes late now and then.
 
     Raises:
         MapError: no map fits the seed.
     """
-    world = make_world(seed, duration_s)
+    world = make_world(seed, duration_s, Lapses(seed) if lapses else None)
     drifter = Drifter(seed) if drifts else None
     near = world.remember()
     while not world.ended:
@@ -47,15 +51,15 @@ def run_episode(seed: int, duration_s: float = 48.0, *, drifts: bool = False) ->
     return world.log()
 
 
-def make_world(seed: int, duration_s: float = 48.0) -> World:
-    """An episode before its first step; raises `MapError`."""
+def make_world(seed: int, duration_s: float = 48.0, lapses: Lapses | None = None) -> World:
+    """An episode before its first step, its expert's ``lapses`` given; raises `MapError`."""
     rng = np.random.default_rng([seed, 2])
     speed = float(
         rng.choice([rng.uniform(22, 42), rng.uniform(42, 62), rng.uniform(62, 80)], p=[0.04, 0.14, 0.82])
     )
     style = varied(Style(speed / 3.6), rng)
     road_map = make_map(seed, max(320.0, 1.15 * duration_s * style.speed))
-    return World(seed, road_map, style, rng, round(duration_s / STEP_S))
+    return World(seed, road_map, style, rng, round(duration_s / STEP_S), lapses)
 
 
 class World:
@@ -67,6 +71,7 @@ class World:
         style: how the expert drives.
         rng: decides about everything else.
         steps: of 0.1 s, at most.
+        lapses: of the expert.
 
     Attributes:
         ego: the vehicle whose episode it is; whoever drives it may put another one in its place.
@@ -75,7 +80,13 @@ class World:
     """
 
     def __init__(
-        self, seed: int, road_map: RoadMap, style: Style, rng: np.random.Generator, steps: int
+        self,
+        seed: int,
+        road_map: RoadMap,
+        style: Style,
+        rng: np.random.Generator,
+        steps: int,
+        lapses: Lapses | None = None,
     ) -> None:
         self._map = road_map
         self._rng = rng
@@ -87,7 +98,7 @@ class World:
         self._oncoming_limits = SpeedLimits(road_map.oncoming_rails, 2.0)
         self.ego = self._new_ego(style)
         self._style = style
-        self._expert = Expert(road_map, style, self._limits, True, bool(rng.random() < 0.75))
+        self._expert = Expert(road_map, style, self._limits, True, bool(rng.random() < 0.75), lapses)
         self._director = Director(road_map, rng, self._next_id, style.speed)
         self._bodies: list[Body] = self._director.place(self.ego.progress)
         self._fill_oncoming_s()

@@ -20,6 +20,7 @@ from clients.metadrive.driver import (
     smoothed,
     wanted_acceleration,
 )
+from clients.metadrive.lapses import Lapses
 from clients.metadrive.roads import RoadMap
 
 _ROUND_M: Final = 11.0
@@ -38,16 +39,26 @@ class _Memory:
 
 
 class Expert:
-    """Decides speed and lane of one vehicle; with ``ambition`` it overtakes and prepares turns."""
+    """Decides speed and lane of one vehicle; with ``ambition`` it overtakes and prepares turns.
+
+    ``lapses`` make it brake late now and then.
+    """
 
     def __init__(
-        self, road_map: RoadMap, style: Style, limits: SpeedLimits, ambition: bool, eager: bool
+        self,
+        road_map: RoadMap,
+        style: Style,
+        limits: SpeedLimits,
+        ambition: bool,
+        eager: bool,
+        lapses: Lapses | None = None,
     ) -> None:
         self._map = road_map
         self.style = style
         self._limits = limits
         self._ambition = ambition
         self._eager = eager
+        self._lapses = lapses
         self._memory = _Memory()
 
     @property
@@ -59,7 +70,7 @@ class Expert:
         """Decide and move one step."""
         rails = self._map.rails if me.on_route else self._map.oncoming_rails
         view = look(me, rails[me.rail], bodies)
-        if me.on_route:
+        if me.on_route and not (self._lapses is not None and self._lapses.absorbed(me)):
             rail = self._lane_decision(me, view, bodies)
             if rail is not None:
                 view = look(me, rails[me.rail], bodies)
@@ -68,6 +79,8 @@ class Expert:
             return
         limit = self._limits.at(me.rail, me.s + 0.4 * me.speed)
         wanted = wanted_acceleration(me, self.style, limit, view, stands_off=self._ambition)
+        if self._lapses is not None:
+            wanted = self._lapses.heeded(me, limit, wanted)
         me.advance(rails, smoothed(me, self.style, wanted))
 
     def _lane_decision(self, me: Vehicle, view: View, bodies: list[Body]) -> int | None:

@@ -53,6 +53,7 @@ class GenerateConfig:
         surround: also render the six surround cameras.
         dense: also store per-pixel targets.
         drifts: the expert strays from its line now and then; scenes show how it comes back.
+        lapses: it brakes late now and then; scenes show how it brakes then.
     """
 
     stride_s: float = 0.5
@@ -61,6 +62,7 @@ class GenerateConfig:
     surround: bool = False
     dense: bool = True
     drifts: bool = False
+    lapses: bool = False
 
 
 @dataclass(frozen=True)
@@ -193,7 +195,7 @@ def run_seed(seed: int, rig: Rig, config: GenerateConfig) -> tuple[list[Labelled
     """One episode's scenes, and how it went."""
     started = time.monotonic()
     try:
-        log = run_episode(seed, config.duration_s, drifts=config.drifts)
+        log = run_episode(seed, config.duration_s, drifts=config.drifts, lapses=config.lapses)
         made = list(labelled_scenes(log, rig, config.stride_s, config.dense))
     except (MapError, shapely.errors.GEOSException) as error:
         return [], EpisodeOutcome(seed, type(error).__name__, "", 0, 0, time.monotonic() - started)

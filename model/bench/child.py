@@ -63,8 +63,8 @@ def contenders(names: list[str], checkpoint: Path, device: str) -> dict[str, Con
 
 def _torch_engine(name: str, checkpoint: Path, device: str) -> Any:
     """``torch``, or ``torch+…`` with some shortcuts only: ``torch+none``, ``torch+jump,shared_prompts``."""
-    from model.engines.torch.decoder import Shortcuts
     from model.engines.torch.engine import TorchEngine, TorchSettings
+    from model.engines.torch.shortcuts import Shortcuts
 
     settings = TorchSettings.on(device, _ROWS)
     if "+" in name:

@@ -26,12 +26,15 @@ def generate(
     drifts: Annotated[
         bool, typer.Option(help="The expert strays now and then; scenes show how it comes back.")
     ] = False,
+    lapses: Annotated[
+        bool, typer.Option(help="The expert brakes late now and then; scenes show how it brakes then.")
+    ] = False,
 ) -> None:
     """Drive episodes in MetaDrive and store their scenes; run again after a kill, it resumes."""
     with told():
         from clients.metadrive.generate import GenerateConfig, generate
 
-        config = GenerateConfig(stride_s=stride, surround=surround, drifts=drifts)
+        config = GenerateConfig(stride_s=stride, surround=surround, drifts=drifts, lapses=lapses)
         report = generate(out, range(first_seed, first_seed + episodes), workers=workers, config=config)
         typer.echo(str(report))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Final
 
@@ -27,6 +27,7 @@ from model.engines.torch.pace import Pace
 from model.engines.torch.rows import Request, Row
 from model.engines.torch.runner import ROWS_A_PROMPT, Feed, Prompt, Runner
 from model.engines.torch.schedule import Memory, Schedule
+from model.engines.torch.shortcuts import Shortcuts
 from model.engines.torch.turns import turn, works
 from model.formats.pieces import ACTION, BRANCH, THINKING
 
@@ -45,35 +46,6 @@ class Failed:
 
 StepEvent = tuple[str, Event | Failed]
 """A request id and what happened to it."""
-
-
-@dataclass(frozen=True)
-class Shortcuts:
-    """What makes decoding fast and changes no response. All can be switched off, to be compared with.
-
-    Attributes:
-        jump: a forced run goes through the network in one pass with the token before it.
-        shared_rows: draws that have written the same tokens are one row.
-        shared_prompts: a scene's prompt is worked out and held once for all its draws.
-        speculate: a revised plan is fed as far as it may repeat the first one, and any response as the last
-            one to the same pictures, or others, went on, as far as that is likely; what is fed ahead is
-            checked.
-        reuse: what pictures come to, and what all prompts begin with, is kept for those that come again (by
-            the `Runner`).
-        capture: on a GPU a pass is replayed as a whole where one of its sizes came before (by the `Runner`).
-    """
-
-    jump: bool = True
-    shared_rows: bool = True
-    shared_prompts: bool = True
-    speculate: bool = True
-    reuse: bool = True
-    capture: bool = True
-
-    @classmethod
-    def none(cls) -> Shortcuts:
-        """All switched off."""
-        return cls(**{option.name: False for option in fields(cls)})
 
 
 @dataclass(eq=False)

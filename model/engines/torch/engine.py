@@ -22,10 +22,11 @@ from model.engines.engine import (
     PlanRequest,
     RequestError,
 )
-from model.engines.torch.decoder import Counts, Decoder, Failed, Shortcuts
+from model.engines.torch.decoder import Counts, Decoder, Failed
 from model.engines.torch.frames import Frames
 from model.engines.torch.graphs import CudaGraph
 from model.engines.torch.runner import Runner
+from model.engines.torch.shortcuts import Shortcuts
 from model.engines.torch.threads import FreeCores, fit_threads
 from model.engines.torch.worker import Worker
 from model.engines.warm_up import warm_up

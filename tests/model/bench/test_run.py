@@ -16,7 +16,7 @@ from model.bench.roofline import Machine, Work
 from model.bench.run import Job, Row, can_do, run
 from model.bench.workload import Workload
 from model.bundled import SCENES
-from model.engines.torch.decoder import Shortcuts
+from model.engines.torch.shortcuts import Shortcuts
 
 
 def job(checkpoint: Path, *contenders: str, loads: tuple[Workload, ...]) -> Job:

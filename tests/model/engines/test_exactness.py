@@ -25,11 +25,12 @@ from hypothesis import strategies as st
 
 from model.driving.plan import plan_from_bins
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thinking
-from model.engines.torch.decoder import Decoder, Failed, Shortcuts
+from model.engines.torch.decoder import Decoder, Failed
 from model.engines.torch.pace import Pace, TimeFor
 from model.engines.torch.rows import Row
 from model.engines.torch.runner import Runner
 from model.engines.torch.sampler import probabilities
+from model.engines.torch.shortcuts import Shortcuts
 from model.formats.cf_vla import FORMATS
 from model.formats.pieces import Format
 from model.network.checkpoint import Loaded, load

@@ -15,8 +15,9 @@ from model.engines.engine import (
     SectionFinished,
     TextWritten,
 )
-from model.engines.torch.decoder import Counts, Decoder, Shortcuts
+from model.engines.torch.decoder import Counts, Decoder
 from model.engines.torch.runner import Runner
+from model.engines.torch.shortcuts import Shortcuts
 from model.formats.cf_vla import CF_VLA
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import BRANCH
