@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -42,32 +43,30 @@ def test_without_control_groups_nothing_is_known(tmp_path: Path) -> None:
     assert threads.granted_cpus(tmp_path) is None
 
 
+@contextmanager
+def fitted(name: str) -> Iterator[Worker]:
+    worker = Worker(name)
+    try:
+        worker.submit(threads.fit_threads).result()
+        yield worker
+    finally:
+        worker.close()
+
+
 def test_the_engines_thread_uses_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(threads, "granted_cpus", lambda: 1)
-    worker = Worker("fitted")
-    try:
-        worker.submit(threads.fit_threads).result()
+    with fitted("fitted") as worker:
         assert worker.submit(torch.get_num_threads).result() == 1
-    finally:
-        worker.close()
 
 
 def test_an_engine_is_not_held_back_by_what_another_left_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "granted_cpus", lambda: None)
     monkeypatch.setattr(threads, "_threads_at_first", lambda: 3)
-    first = Worker("first")
-    try:
-        first.submit(threads.fit_threads).result()
+    with fitted("first") as first:
         first.submit(lambda: torch.set_num_threads(1)).result()
-        later = Worker("later")
-        try:
-            later.submit(threads.fit_threads).result()
+        with fitted("later") as later:
             assert later.submit(torch.get_num_threads).result() == 3
-        finally:
-            later.close()
-    finally:
-        first.close()
 
 
 class Machine:
