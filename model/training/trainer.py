@@ -12,6 +12,7 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset
 from transformers import Trainer, TrainerCallback, TrainingArguments
 
+from model.network.allocator import FreedMemory
 from model.training.batches import TaskSampler
 from model.training.recipes import Recipe
 
@@ -69,7 +70,7 @@ class LearnerTrainer(Trainer):
             args=arguments,
             train_dataset=dataset,
             data_collator=collate,
-            callbacks=[_Log(folder / LOG_FILE, stage, validate, validate_every)],
+            callbacks=[_Log(folder / LOG_FILE, stage, validate, validate_every), _Frugal()],
         )
         self._recipe, self._sampler, self._dataset, self._learner = recipe, sampler, dataset, learner
         self._parts: dict[str, list[torch.Tensor]] = {}
@@ -127,6 +128,19 @@ class LearnerTrainer(Trainer):
     def _load_from_checkpoint(self, resume_from_checkpoint: str, model: nn.Module | None = None) -> None:
         state = torch.load(Path(resume_from_checkpoint) / _STATE_FILE, map_location="cpu", weights_only=True)
         (model or self._learner).load_state_dict(state)
+
+
+class _Frugal(TrainerCallback):
+    """Gives back, now and then, what steps have freed.
+
+    Batches of many sizes leave holes in the memory that `keep_freed_memory` keeps: 12 GB after 600 steps.
+    """
+
+    def __init__(self) -> None:
+        self._freed = FreedMemory()
+
+    def on_step_end(self, args: Any, state: Any, control: Any, **_: Any) -> None:
+        self._freed.give_back()
 
 
 class _Log(TrainerCallback):

@@ -202,7 +202,7 @@ class TorchEngine:
                 self._counts = decoder.counts
                 runner.warm_up(_WARM_TOKENS)
                 cores, freed = FreeCores(torch.get_num_threads()), FreedMemory()
-                while self._obey(decoder):
+                while self._obey(decoder, cores):
                     if cores.threads != cores.look():
                         torch.set_num_threads(cores.threads)
                     freed.give_back()
@@ -221,10 +221,15 @@ class TorchEngine:
         settings = self._settings
         return -(-settings.rows // _DRAWS_A_SCENE) if settings.shortcuts.shared_prompts else settings.rows
 
-    def _obey(self, decoder: Decoder) -> bool:
+    def _obey(self, decoder: Decoder, cores: FreeCores) -> bool:
         """Carry out what was asked for; waits only while there is nothing to decode. False ends the loop."""
         while decoder.idle or not self._commands.empty():
-            command = self._commands.get()
+            if decoder.idle:
+                cores.rest()
+                command = self._commands.get()
+                cores.resume()
+            else:
+                command = self._commands.get()
             if command is None:
                 return False
             command(decoder)

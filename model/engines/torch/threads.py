@@ -15,8 +15,6 @@ import torch
 _CGROUP: Final = Path("/sys/fs/cgroup")
 _STAT: Final = Path("/proc/stat")
 _EVERY_S: Final = 1.0
-_STALE_S: Final = 5.0
-"""What cores did longer ago than this says nothing about now."""
 _WAIT_S: Final = 5.0
 """A core that was in use must be free for so long before a thread is put on it again."""
 _SPARE: Final = 0.25
@@ -90,7 +88,8 @@ class FreeCores:
 
     The threads of an operation wait for the last of them, and a pass is hundreds of operations. Where
     something else wants one of two cores (a planner on the same machine, a neighbour on the same host), two
-    threads take three to ten times as long as one.
+    threads take three to ten times as long as one. Only what others do while there is work here counts:
+    whoever computes, asks and waits leaves all cores to the answer.
 
     Args:
         most: threads that may be used.
@@ -109,21 +108,41 @@ class FreeCores:
     ) -> None:
         self.threads = self._most = most
         self._read, self._clock = read, clock
-        self._before, self._read_s, self._crowded_s = read(), clock(), -math.inf
+        self._before, self._since_s, self._crowded_s = read(), clock(), -math.inf
+        self._worked_s = self._others_s = 0.0
+
+    def rest(self) -> None:
+        """There is no work from now on."""
+        self._count()
+
+    def resume(self) -> None:
+        """There is work again."""
+        if self._most > 1:
+            self._before, self._since_s = self._read(), self._clock()
 
     def look(self) -> int:
-        """``threads``, after a look at the machine where the last one was a while ago."""
+        """``threads``, after a look at the machine where there was work for a while since the last one."""
         now_s = self._clock()
-        past_s = now_s - self._read_s
-        if self._most == 1 or self._before is None or past_s < _EVERY_S:
+        if self._worked_s + now_s - self._since_s < _EVERY_S:
             return self.threads
-        before, self._before, self._read_s = self._before, self._read(), now_s
-        if self._before is None or past_s > _STALE_S:
+        self._count()
+        if self._before is None or not self._worked_s:
             return self.threads
-        free = self._before.processors - (self._before.others_s - before.others_s) / past_s
+        free = self._before.processors - self._others_s / self._worked_s
+        self._worked_s = self._others_s = 0.0
         fitting = min(self._most, max(1, math.floor(free + _SPARE)))
         if fitting <= self.threads and fitting < self._most:
             self._crowded_s = now_s
         if fitting < self.threads or now_s - self._crowded_s >= _WAIT_S:
             self.threads = fitting
         return self.threads
+
+    def _count(self) -> None:
+        """Add what others did since the last reading to what they did while there was work."""
+        if self._most == 1:
+            return
+        before, since_s = self._before, self._since_s
+        self._before, self._since_s = self._read(), self._clock()
+        if before is not None and self._before is not None:
+            self._worked_s += self._since_s - since_s
+            self._others_s += self._before.others_s - before.others_s

@@ -79,9 +79,12 @@ class Machine:
     def read(self) -> CpuTimes | None:
         return CpuTimes(self.others_s, 8) if self.known else None
 
-    def after(self, seconds: float, others: float) -> int:
+    def pass_by(self, seconds: float, others: float) -> None:
         self.now_s += seconds
         self.others_s += seconds * others
+
+    def after(self, seconds: float, others: float) -> int:
+        self.pass_by(seconds, others)
         return self.cores.look()
 
 
@@ -109,9 +112,28 @@ def test_no_more_are_used_than_are_granted() -> None:
     assert [machine.after(2, others=5.0) for _ in range(3)] == [1, 1, 2]
 
 
-def test_what_was_long_ago_and_what_is_not_known_change_nothing() -> None:
+def test_what_others_do_while_there_is_no_work_changes_nothing() -> None:
     machine = Machine()
-    assert machine.after(60, others=8.0) == 8
+    for _ in range(10):
+        machine.cores.rest()
+        machine.pass_by(0.8, others=8.0)
+        machine.cores.resume()
+        assert machine.after(0.3, others=0.0) == 8
+
+
+def test_of_short_spells_of_work_enough_are_counted_together() -> None:
+    machine = Machine()
+    threads = []
+    for _ in range(4):
+        threads.append(machine.after(0.3, others=6.0))
+        machine.cores.rest()
+        machine.pass_by(10.0, others=0.0)
+        machine.cores.resume()
+    assert threads == [8, 8, 8, 2]
+
+
+def test_what_is_not_known_changes_nothing() -> None:
+    machine = Machine()
     assert machine.after(0.5, others=8.0) == 8, "looked at a moment ago"
     machine.known = False
     assert machine.after(1, others=8.0) == 8
