@@ -48,8 +48,7 @@ class Lapses:
         self._left_s -= STEP_S
         if car.heedless:
             self._lasted_s += STEP_S
-            over = wanted <= -self._bears or self._lasted_s >= _LONGEST_S or car.speed > _TOO_FAST * limit
-            if over:
+            if wanted <= -self._bears or self._lasted_s >= _LONGEST_S or car.speed > _TOO_FAST * limit:
                 car.heedless, self._late = False, True
                 self._left_s = float(self._rng.uniform(*_APART_S))
         elif self._left_s <= 0 and self._may_begin(car, wanted):

@@ -224,12 +224,11 @@ class TorchEngine:
     def _obey(self, decoder: Decoder, cores: FreeCores) -> bool:
         """Carry out what was asked for; waits only while there is nothing to decode. False ends the loop."""
         while decoder.idle or not self._commands.empty():
-            if decoder.idle:
+            if waits := decoder.idle:
                 cores.rest()
-                command = self._commands.get()
+            command = self._commands.get()
+            if waits:
                 cores.resume()
-            else:
-                command = self._commands.get()
             if command is None:
                 return False
             command(decoder)

@@ -107,25 +107,29 @@ class FreeCores:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.threads = self._most = most
-        self._read, self._clock = read, clock
-        self._before, self._since_s, self._crowded_s = read(), clock(), -math.inf
+        # Where there is no choice nothing needs to be known.
+        self._read, self._clock = read if most > 1 else lambda: None, clock
+        self._before, self._since_s, self._crowded_s = self._read(), clock(), -math.inf
         self._worked_s = self._others_s = 0.0
 
     def rest(self) -> None:
-        """There is no work from now on."""
-        self._count()
+        """There is no work from now on: count what others did while there was."""
+        before, since_s = self._before, self._since_s
+        self.resume()
+        if before is not None and self._before is not None:
+            self._worked_s += self._since_s - since_s
+            self._others_s += self._before.others_s - before.others_s
 
     def resume(self) -> None:
-        """There is work again."""
-        if self._most > 1:
-            self._before, self._since_s = self._read(), self._clock()
+        """There is work again: what others did until now does not count."""
+        self._before, self._since_s = self._read(), self._clock()
 
     def look(self) -> int:
         """``threads``, after a look at the machine where there was work for a while since the last one."""
         now_s = self._clock()
         if self._worked_s + now_s - self._since_s < _EVERY_S:
             return self.threads
-        self._count()
+        self.rest()
         if self._before is None or not self._worked_s:
             return self.threads
         free = self._before.processors - self._others_s / self._worked_s
@@ -136,13 +140,3 @@ class FreeCores:
         if fitting < self.threads or now_s - self._crowded_s >= _WAIT_S:
             self.threads = fitting
         return self.threads
-
-    def _count(self) -> None:
-        """Add what others did since the last reading to what they did while there was work."""
-        if self._most == 1:
-            return
-        before, since_s = self._before, self._since_s
-        self._before, self._since_s = self._read(), self._clock()
-        if before is not None and self._before is not None:
-            self._worked_s += self._since_s - since_s
-            self._others_s += self._before.others_s - before.others_s
