@@ -16,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from model.bench.quiet import wait_until_quiet
 from model.bench.workload import Workload
 
 _SHARES: Final = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
@@ -100,6 +101,7 @@ def run(job: Job, tell: Callable[[str], None]) -> list[Row]:
             for name, load in pairs:
                 tell(f"round {repeat} of {job.repeats}: {name}, {load.scenes} x {load.n}, {load.thinking}")
                 number = repeat * len(job.workloads) + job.workloads.index(load)
+                wait_until_quiet()
                 reply = processes[name].ask(name, load, number)
                 if repeat:
                     replies[name, load].append(reply)
