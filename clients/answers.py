@@ -163,7 +163,8 @@ def retry_after_s(response: httpx.Response) -> float | None:
             then = parsedate_to_datetime(given)
         except ValueError:
             return None
-        seconds = (then - datetime.now(UTC)).total_seconds()
+        # HTTP's dates are in UTC, whether they say so or not.
+        seconds = (then.replace(tzinfo=then.tzinfo or UTC) - datetime.now(UTC)).total_seconds()
     return max(0.0, seconds) if math.isfinite(seconds) else None
 
 

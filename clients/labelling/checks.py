@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Final, Literal, NamedTuple
 
-from clients.labelling.direction import agrees
+from clients.labelling.direction import CORRECTION, agrees
 from clients.labelling.leaks import find_leaks
 from model.driving.plan import Plan
 
@@ -20,9 +20,6 @@ _MARKUP: Final = re.compile(
 )
 _SENTENCE_END: Final = re.compile(r"[.!?]$")
 _SENTENCES: Final = re.compile(r"(?<=[.!?;])\s+")
-_CORRECTION: Final = re.compile(
-    r"\b(?:should|must|ought to|have to|need to|had better|better to)\b", re.IGNORECASE
-)
 _THINGS: Final = (
     r"vehicles?|cars?|vans?|trucks?|bus(?:es)?|motorcycl\w+|cyclists?|bicycles?|leaders?|traffic|queues?|"
     r"brake lights?|tail lights?|pedestrians?|persons?|people|walkers?|cones?|barriers?|obstacles?|"
@@ -78,7 +75,7 @@ def _is_anchored(text: str) -> bool:
     """
     seen = corrections = 0
     for sentence in _SENTENCES.split(text):
-        asks = _CORRECTION.search(sentence)
+        asks = CORRECTION.search(sentence)
         if asks is None:
             seen += len(_CUE.findall(sentence))
             continue

@@ -62,10 +62,18 @@ _OPPOSITES: Final[dict[Change, tuple[Change, ...]]] = {
     "lane_right": ("keep_lane", "lane_left"),
     "keep_lane": ("lane_left", "lane_right"),
 }
+_MOVES: Final = frozenset[Change]({"slower", "faster", "left", "right", "lane_left", "lane_right"})
+"""To ask for going straight, or for the lane, is to ask for nothing."""
 _CLAUSES: Final = re.compile(
     r"[.;:!?,](?=\s|$)|\b(?:so(?! (?:long|much|far|early|late|fast|hard|soon))|but|therefore|thus|"
     r"instead(?! of)|which is why|rather than|instead of|while)\b"
 )
+CORRECTION: Final = re.compile(
+    r"\b(?:should|must|ought to|have to|need to|had better|better to)\b", re.IGNORECASE
+)
+"""What asks for a change."""
+_HENCE: Final = ("so", "therefore", "thus", "instead", "which is why")
+"""What asks for a change in the clause behind it."""
 _AGAINST: Final = re.compile(
     r"\b(?:if|would|could|might|risks?|too|not|no|never|without|avoid\w*|premature\w*|needless\w*|unnecessar\w+|"
     r"wrong\w*|leaves? (?:no|little)|instead of|rather than|my plan|i plan\w*|the plan|planned|keeps? me)\b"
@@ -88,13 +96,22 @@ def wanted_changes(before: Plan, after: Plan) -> list[frozenset[Change]]:
     return [changes for changes in found if changes]
 
 
-def told_changes(text: str) -> dict[Change, int]:
-    """How often a text speaks for each change, less how often it speaks against it."""
+def told_changes(text: str, *, corrections: bool = False) -> dict[Change, int]:
+    """How often a text speaks for each change, less how often it speaks against it.
+
+    Args:
+        text: a reflection.
+        corrections: count only what it says should be done.
+    """
     told = dict.fromkeys(_WORDS, 0)
     plain = " ".join(text.casefold().replace("-", " ").split())
     start = 0
     for end in [*_CLAUSES.finditer(plain), None]:
         clause = plain[start : end.start() if end else len(plain)]
+        asks = plain[:start].endswith(_HENCE) or CORRECTION.search(clause)
+        if corrections and not asks:
+            start = end.end() if end else len(plain)
+            continue
         against = bool(_AGAINST.search(clause)) or plain[:start].endswith(("rather than", "instead of"))
         for change, pattern in _WORDS.items():
             count = len(pattern.findall(clause))
@@ -104,11 +121,16 @@ def told_changes(text: str) -> dict[Change, int]:
 
 
 def agrees(text: str, before: Plan, after: Plan) -> bool:
-    """Whether a text speaks for one of the changes from ``before`` to ``after``, and against none of them.
+    """Whether a text speaks for one of the changes from ``before`` to ``after``, and asks for no other.
 
-    Speaking against the opposite of a change is speaking for it.
+    Nor may it speak against one. Speaking against the opposite of a change is speaking for it. What a text
+    only sees ("the road bends left") it does not ask for.
     """
     told, wanted = told_changes(text), wanted_changes(before, after)
+    about = {each for changes in wanted for change in changes for each in (change, *_OPPOSITES[change])}
+    asked = told_changes(text, corrections=True)
+    if any(asked[change] > 0 for change in _MOVES - about):
+        return False
     spoken = False
     for changes in wanted:
         score = sum(told[change] for change in changes)

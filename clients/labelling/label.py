@@ -28,8 +28,8 @@ from model.driving.plan import parse_plan
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
 
-CHECKS_VERSION: Final = 1
-"""Of `clients.labelling.checks`; raised when they ask for something else."""
+CHECKS_VERSION: Final = 2
+"""Of `clients.labelling.checks` and what they are made of; raised when they ask for something else."""
 
 
 class Asked(NamedTuple):

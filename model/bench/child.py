@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from model.bench.contenders import SHORTCUTS, Answer, Contender, EngineContender, PlainVllm, Transformers
-from model.bench.memory import peak_bytes
+from model.bench.memory import forget_peaks, peak_bytes
 from model.bench.workload import Workload
 from model.driving.scene_store import read_scenes
 from model.engines.engine import PlanRequest
@@ -84,6 +84,7 @@ async def _serve(job: Mapping[str, Any], replies: Any) -> None:
         asked = json.loads(line)
         contender = made[asked["contender"]]
         requests = Workload(**asked["workload"]).requests(scenes, asked["number"], asked["step"])
+        forget_peaks()
         before, began_s = contender.counts(), time.perf_counter()
         answers = await _answers(contender, requests, asked["arrivals_s"])
         wall_s = time.perf_counter() - began_s

@@ -52,8 +52,9 @@ class Job:
 class Row:
     """Figures of one contender at one workload; a plan is a request with all its draws.
 
-    ``plans_per_s_spread`` are the slowest and the fastest round; ``valid_share`` counts draws that parse,
-    ``forced_share`` tokens that the format left no choice about.
+    ``latency_p50_s_spread`` and ``plans_per_s_spread`` are the least and the most of a round; ``valid_share``
+    counts draws that parse, ``forced_share`` tokens that the format left no choice about. ``peak_bytes`` are
+    of the contender's process and its children at this work, with all that they keep between turns.
     """
 
     engine: str
@@ -62,6 +63,7 @@ class Row:
     thinking: str
     temperature: float
     latency_p50_s: float
+    latency_p50_s_spread: tuple[float, float]
     latency_p95_s: float
     plans_per_s: float
     plans_per_s_spread: tuple[float, float]
@@ -271,6 +273,7 @@ def _row(name: str, load: Workload, replies: Sequence[Mapping[str, Any]]) -> Row
     answers = [answer for reply in replies for answer in reply["answers"]]
     latencies = [answer["latency_s"] for answer in answers]
     responses = [response for answer in answers for response in answer["responses"]]
+    medians = [_median([reply]) for reply in replies]
     rates = [load.scenes / reply["wall_s"] for reply in replies]
     plans, tokens = len(answers), sum(each["tokens"] for each in responses)
     keys = replies[0]["counts"]
@@ -281,6 +284,7 @@ def _row(name: str, load: Workload, replies: Sequence[Mapping[str, Any]]) -> Row
         thinking=load.thinking,
         temperature=load.temperature,
         latency_p50_s=float(np.percentile(latencies, 50)),
+        latency_p50_s_spread=(min(medians), max(medians)),
         latency_p95_s=float(np.percentile(latencies, 95)),
         plans_per_s=statistics.median(rates),
         plans_per_s_spread=(min(rates), max(rates)),

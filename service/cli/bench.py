@@ -78,10 +78,9 @@ def engine(
         job = Job(names, loads, checkpoint, scenes, repeats, device, python)
         rows = run(job, tell)
         steps: list[Row] = []
-        if shortcuts and "torch" in names:
-            for chosen in _ladder(device):
-                ladder = tuple(load for load in loads if load.n > 1 and load.thinking == "adaptive")
-                steps += run(Job((chosen,), ladder, checkpoint, scenes, repeats, device), tell)
+        ladder = tuple(load for load in loads if load.n > 1 and load.thinking == "adaptive")
+        if shortcuts and ladder and "torch" in names:
+            steps = run(Job(_ladder(device), ladder, checkpoint, scenes, repeats, device), tell)
         planners = [run_planner(job, _whole(n)) for n in draws.split(",") if "torch" in names]
         rooflines = _rooflines(rows, checkpoint, device)
         deadlines = []
@@ -212,12 +211,12 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-def _ladder(device: str) -> list[str]:
+def _ladder(device: str) -> tuple[str, ...]:
     """The torch engine without shortcuts, then with one more at a time of those that the device knows."""
     from model.bench.contenders import SHORTCUTS
 
     known = [each for each in SHORTCUTS if device != "cpu" or each != "capture"]
-    return ["torch+none"] + [f"torch+{','.join(known[:count])}" for count in range(1, len(known) + 1)]
+    return "torch+none", *(f"torch+{','.join(known[:count])}" for count in range(1, len(known) + 1))
 
 
 def _random_checkpoint(preset: str, words_of: Path, folder: Path, device: str, agreed: bool) -> Path:

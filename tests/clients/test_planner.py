@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import httpx
@@ -149,6 +150,15 @@ def test_does_not_wait_longer_than_it_may() -> None:
     with PlannerClient("http://x", transport=transport) as planner, pytest.raises(ServiceBusy) as caught:
         planner.models()
     assert (len(seen), caught.value.retry_after_s) == (1, 3600)
+
+
+@pytest.mark.parametrize("zone", [" GMT", " -0000", ""])
+def test_dates_of_retry_after_are_in_utc(zone: str) -> None:
+    date = (datetime.now(UTC) + timedelta(hours=1)).strftime("%a, %d %b %Y %H:%M:%S") + zone
+    transport, _ = answering((503, {"Retry-After": date}))
+    with PlannerClient("http://x", transport=transport) as planner, pytest.raises(ServiceBusy) as caught:
+        planner.models()
+    assert caught.value.retry_after_s == pytest.approx(3600, abs=10)
 
 
 def test_does_not_wait_beyond_the_deadline() -> None:

@@ -12,7 +12,7 @@ from typing import Final
 
 from clients.labelling.checks import FailedCheck
 from clients.labelling.direction import Change, wanted_changes
-from clients.labelling.teachers.teacher import AnnotationsMissing, Answer, Question
+from clients.labelling.teachers.teacher import AnnotationsMissing, Answer, Question, TeacherError
 from clients.labelling.teachers.view import Sight, View, view_of
 from model.driving.plan import Group, Plan, format_tick
 from model.driving.scene import AgentKind
@@ -32,13 +32,14 @@ class RuleTeacher:
     """`clients.labelling.teachers.teacher.Teacher` by rule; nothing is asked of anybody."""
 
     name: Final = "rules"
-    revision: Final = "2"
+    revision: Final = "3"
 
     async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
         """One paragraph; the same for the same question, another one after complaints.
 
         Raises:
             AnnotationsMissing: the scene has no annotations.
+            TeacherError: nothing that the cameras can show asks for what the better plan does otherwise.
         """
         if question.surroundings is None:
             raise AnnotationsMissing(
@@ -50,28 +51,31 @@ class RuleTeacher:
         changes = wanted_changes(predicted, expert)
         if not changes:
             return Answer(_nothing_to_change(view, chance))
-        routed = scene.route is not None
-        said = [_on(min(each), view, predicted, expert, routed, chance) for each in changes[:2]]
+        told = (_on(min(each), view, predicted, expert, chance) for each in changes)
+        said = [text for text in told if text is not None][:2]
+        if not said:
+            raise TeacherError(f"nothing in view asks for another plan ({', '.join(map(min, changes))})")
         return Answer(" ".join(said))
 
     async def close(self) -> None:
         """There is nothing to close."""
 
 
-def _on(
-    change: Change, view: View, predicted: Plan, expert: Plan, routed: bool, chance: random.Random
-) -> str:
-    """What is to be seen, what is wrong with the plan, and what is better: one change of one track."""
+def _on(change: Change, view: View, predicted: Plan, expert: Plan, chance: random.Random) -> str | None:
+    """What is to be seen, what is wrong with the plan, and what is better: one change of one track.
+
+    None where nothing is to be seen that asks for it.
+    """
     if change == "slower":
         return _slower(view, predicted, expert, chance)
     if change == "faster":
         return _faster(view, predicted, chance)
     if change in ("left", "right", "straight"):
-        return _turning(change, view, predicted, routed, chance)
+        return _turning(change, view, predicted, chance)
     return _lanes(change, view, predicted, chance)
 
 
-def _slower(view: View, predicted: Plan, expert: Plan, chance: random.Random) -> str:
+def _slower(view: View, predicted: Plan, expert: Plan, chance: random.Random) -> str | None:
     near = view.first(
         "pedestrian", places=("my lane", "the left lane", "the right lane", "the left side", "the right side")
     )
@@ -113,10 +117,7 @@ def _slower(view: View, predicted: Plan, expert: Plan, chance: random.Random) ->
     if beside is not None and beside.ahead_m < _CLOSE_M:
         cue = f"{_a(beside, chance)} is in {beside.place}, {_ahead(beside.ahead_m)}."
         return f"{cue} {_capital(fast)} would leave little room beside it, so {better}."
-    cue = chance.choice(
-        ("The road ahead asks for less pace.", "The stretch of road ahead is not one for this pace.")
-    )
-    return f"{cue} {_capital(fast)} would be too much here, so {better}."
+    return None
 
 
 def _faster(view: View, predicted: Plan, chance: random.Random) -> str:
@@ -140,7 +141,7 @@ def _faster(view: View, predicted: Plan, chance: random.Random) -> str:
     return f"{cue} {_capital(slow)} for so long {result}, so {better}."
 
 
-def _turning(change: Change, view: View, predicted: Plan, routed: bool, chance: random.Random) -> str:
+def _turning(change: Change, view: View, predicted: Plan, chance: random.Random) -> str | None:
     planned = _first(predicted, "lateral", "Left Turn") or _first(predicted, "lateral", "Right Turn")
     if change == "straight":
         cue = chance.choice(("The lane runs straight on here.", "The lane markings run straight ahead."))
@@ -154,41 +155,37 @@ def _turning(change: Change, view: View, predicted: Plan, routed: bool, chance: 
         cue = chance.choice(
             (f"The junction lets me go {change} here.", f"A lane leads {change} off this road.")
         )
-    elif routed:
-        cue = f"My way leads {change} off this road."
     else:
-        cue = "The road ahead is not one to go straight through."
+        return None
     result = chance.choice(("would carry me out of the lane", "would miss the way"))
     better = chance.choice((f"I should turn {change}", f"I should steer to the {change} in time"))
     return f"{cue} Going on as planned {result}, so {better}."
 
 
-def _lanes(change: Change, view: View, predicted: Plan, chance: random.Random) -> str:
+def _lanes(change: Change, view: View, predicted: Plan, chance: random.Random) -> str | None:
     if change == "keep_lane":
+        ahead = view.first("vehicle", "cone", "barrier", "pedestrian", places=("my lane",))
         moved = "left" if _first(predicted, "lane", "Left Lane Change") is not None else "right"
-        other = view.first(
-            "vehicle", "cone", "barrier", places=("the left lane" if moved == "left" else "the right lane",)
-        )
-        cue = (
-            chance.choice(("My lane is open ahead.", "Nothing on the road calls for another lane."))
-            if other is None
-            else f"{_a(other, chance)} is in {other.place}, {_ahead(other.ahead_m)}."
-        )
+        beside = _in_lane(moved, view)
+        if beside is not None:
+            cue = f"{_a(beside, chance)} is in {beside.place}, {_ahead(beside.ahead_m)}."
+        elif ahead is None:
+            cue = chance.choice(("My lane is open ahead.", "There is nothing in my lane."))
+        elif ahead.kind == "vehicle" and not _holds_up(ahead, view):
+            cue = f"{_a(ahead, chance)} in my lane leaves room enough, {_ahead(ahead.ahead_m)}."
+        else:
+            return None
         return f"{cue} Moving over would be unnecessary, so I should stay in my lane for longer."
     side = "left" if change == "lane_left" else "right"
     ahead = view.first("vehicle", "cone", "barrier", places=("my lane",))
     if ahead is not None:
         cue = f"{_a(ahead, chance)} {_motion(ahead, view, chance)} in my lane, {_ahead(ahead.ahead_m)}."
-    elif side not in view.beside:
-        cue = "My lane is not the one to stay in here."
-    elif view.first(
-        "vehicle", "cone", "barrier", places=("the left lane" if side == "left" else "the right lane",)
-    ):
-        cue = "The lane markings allow to move over here."
-    else:
+    elif side in view.beside and _in_lane(side, view) is None:
         cue = chance.choice(
             (f"There is room in the {side} lane.", f"The lane to the {side} of mine is open.")
         )
+    else:
+        return None
     better = chance.choice(
         (f"I should move to the {side} lane", f"I should change to the {side} lane in time")
     )
@@ -203,6 +200,13 @@ def _nothing_to_change(view: View, chance: random.Random) -> str:
         else f"{_a(ahead, chance)} in my lane leaves room, {_ahead(ahead.ahead_m)}"
     )
     return f"{cue}, and what I have in mind fits the road as it runs."
+
+
+def _in_lane(side: str, view: View) -> Sight | None:
+    """The first thing in the lane beside mine."""
+    return view.first(
+        "vehicle", "cone", "barrier", places=("the left lane" if side == "left" else "the right lane",)
+    )
 
 
 def _holds_up(sight: Sight, view: View) -> bool:

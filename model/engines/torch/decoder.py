@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -195,7 +196,16 @@ class Decoder:
         events: list[StepEvent] = []
         places = [place for place, row in enumerate(self._rows) if row.request in going_on]
         rows = [self._rows[place] for place in places]
-        feeds = [self._feed_of(row, place, len(rows)) for row, place in zip(rows, places, strict=True)]
+        feeds: list[Feed] = []
+        for row, place in zip(rows, places, strict=True):
+            try:
+                feeds.append(self._feed_of(row, place, len(rows)))
+            except Exception as error:  # one draw that cannot go on must not end the others
+                failure = EngineError.because("a draw could not go on", error)
+                # Its rows are gone and others are in their places: begin anew.
+                return [self._fail(row.request, failure), *self._feed_rows(going_on)]
+        if not feeds:
+            return []
         self._count(rows, feeds)
         began_s = self._clock()
         found = self._runner.feed(feeds)
@@ -220,18 +230,19 @@ class Decoder:
         begun = [each.prompt for each in self._beginnings if each.prompt is not None]
         used = {id(row.prompt) for row in self._rows} | {id(prompt) for prompt in begun}
         assert held == used, "a prompt is held for nobody, or missing"
-        draws = [(row.request.id, draw, row.draft) for row in self._rows for draw in row.draws]
-        draws += [
-            (each.request.id, draw, row.draft)
-            for each in self._beginnings
-            for row in each.rows
-            for draw in row.draws
-        ]
+        draws = [(row.request.id, draw, row.draft) for row in self._every_row() for draw in row.draws]
         assert len(draws) == len(set(draws)), "a draw runs twice"
-        assert len(self._rows) <= self._runner.rows
-        assert len(self._prompts) <= self._runner.prompts
-        if not self._rows and not self._beginnings and self.idle:
-            assert self._schedule.free == Memory(self._runner.rows, self._runner.prompts)
+        reserved = self._schedule.reserved()
+        reading = [(each.request.id, each.prompt, row) for each in self._beginnings for row in each.rows]
+        claimed = [(row.request.id, row.prompt, row) for row in self._rows] + reading
+        rows = Counter(name for name, _, _ in claimed)
+        prompts = Counter(name for name, _ in {(name, id(prompt)) for name, prompt, _ in claimed if prompt})
+        assert rows.keys() == reserved.keys(), "memory is reserved for nobody, or somebody runs without"
+        for name, memory in reserved.items():
+            assert Memory(rows[name], prompts[name]).within(memory), "a request uses more than it reserved"
+        assert prompts.total() == len(self._prompts), "requests share a prompt's memory"
+        assert all(name in self._schedule and name not in reserved for name in self._paused)
+        assert all(name in self._schedule for name, _ in self._drafts), "a draft is kept for nobody"
         for row in self._rows:
             assert row.draws
             assert row.pending or row.cursor.done, "a row has nothing to feed"
@@ -379,6 +390,8 @@ class Decoder:
                     self._runner.loaded.vocabulary,
                     self._runner.loaded.codec,
                 )
+                if not row.draft:
+                    self._ahead.finished(row)
             except Exception as error:  # a response that cannot be read back must not end the others
                 failure = EngineError.because("a response could not be read back", error)
                 events.append(self._fail(row.request, failure))
@@ -392,7 +405,6 @@ class Decoder:
                 self._drafts.update({(row.request.id, draw.index): draw for draw in draws})
                 self._free_row(row)
                 continue
-            self._ahead.finished(row)
             self._free_row(row)
             events += self._answer(row.request, draws)
         return events

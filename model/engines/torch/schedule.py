@@ -63,6 +63,10 @@ class Schedule:
         """What no admitted request may claim."""
         return self._left(self._admitted.values())
 
+    def reserved(self) -> dict[str, Memory]:
+        """What each running request may claim, by its id."""
+        return {name: self.memory_of(request) for name, request in self._admitted.items()}
+
     def memory_of(self, request: Request) -> Memory:
         """What a request may come to use: a row for every draw, and one for its draft."""
         rows_a_draw = 2 if request.drafts else 1

@@ -1,9 +1,14 @@
 from __future__ import annotations
 
+import hashlib
+from pathlib import Path
+
 import pytest
 
+from clients.labelling import checks, direction, leaks
 from clients.labelling.checks import MOST_WORDS, check_reflection
 from clients.labelling.direction import agrees, wanted_changes
+from clients.labelling.label import CHECKS_VERSION
 from model.driving.plan import Plan, track_from_words
 
 
@@ -72,6 +77,8 @@ def test_the_limit_is_eighty_words() -> None:
         ("Cones close my lane, so change to the left lane.", plan(), plan(lane="Left Lane Change")),
         ("A car is beside me, so stay in this lane.", plan(lane="Right Lane Change"), plan()),
         ("All looks fine on this road.", plan(), plan()),
+        ("The road bends left and a car moves to the right lane, so I should slow down.", FAST, SLOW),
+        ("A car brakes ahead, so I should slow down and stay in my lane.", FAST, SLOW),
     ],
 )
 def test_texts_that_go_the_way_of_the_plan_agree(text: str, before: Plan, after: Plan) -> None:
@@ -92,6 +99,9 @@ def test_texts_that_go_the_way_of_the_plan_agree(text: str, before: Plan, after:
             FAST,
             plan("Decelerate", lane="Left Lane Change"),
         ),
+        ("A car brakes ahead, so I should slow down and change to the left lane.", FAST, SLOW),
+        ("A car brakes ahead, so slow down and turn right.", FAST, SLOW),
+        ("All looks fine on this road, so I should accelerate.", plan(), plan()),
     ],
 )
 def test_texts_that_go_another_way_do_not(text: str, before: Plan, after: Plan) -> None:
@@ -104,3 +114,11 @@ def test_short_differences_ask_for_nothing() -> None:
     assert wanted_changes(FAST, SLOW) == [{"slower"}]
     both = wanted_changes(plan(lane="Left Lane Change"), plan("Accelerate", lane="Right Lane Change"))
     assert both == [{"faster"}, {"lane_right"}]
+
+
+def test_other_checks_have_another_version() -> None:
+    """What was checked otherwise does not count as done: a label's key holds the version."""
+    sources = [Path(str(module.__file__)).read_bytes() for module in (checks, direction, leaks)]
+    digest = hashlib.sha256(b"".join(sources)).hexdigest()[:12]
+    told = "raise CHECKS_VERSION if these ask for something else now, and tell both here"
+    assert (CHECKS_VERSION, digest) == (2, "24e64c2ce533"), told

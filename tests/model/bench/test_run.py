@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from model.bench.contenders import SHORTCUTS
-from model.bench.memory import peak_bytes
+from model.bench.memory import forget_peaks, peak_bytes
 from model.bench.report import BenchReport, Roofline
 from model.bench.roofline import Machine, Work
 from model.bench.run import Job, Row, can_do, run
@@ -74,6 +74,17 @@ def test_memory_of_this_process_is_known() -> None:
     assert peak_bytes(os.getpid()) > 20 << 20
 
 
+@pytest.mark.skipif(not os.access("/proc/self/clear_refs", os.W_OK), reason="the kernel keeps peaks")
+def test_a_peak_is_of_what_was_done_since() -> None:
+    forget_peaks()
+    before = peak_bytes()
+    much = b"x" * (300 << 20)
+    assert peak_bytes() > before + (200 << 20)
+    del much
+    forget_peaks()
+    assert peak_bytes() < before + (100 << 20)
+
+
 def row(engine: str, latency_s: float, plans_per_s: float) -> Row:
     return Row(
         engine,
@@ -82,6 +93,7 @@ def row(engine: str, latency_s: float, plans_per_s: float) -> Row:
         "adaptive",
         1.0,
         latency_s,
+        (latency_s, latency_s),
         latency_s,
         plans_per_s,
         (1, 2),

@@ -2,10 +2,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from model.engines.torch.decoder import Decoder
 from model.network.checkpoint import Loaded, load
 from tests.model.engines.reference import exactly
 
@@ -21,3 +23,19 @@ def inference() -> Iterator[None]:
     """What a decoder is called under."""
     with torch.inference_mode():
         yield
+
+
+@pytest.fixture(autouse=True)
+def _books(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """After every test the books of all decoders that it made agree with each other."""
+    made: list[Decoder] = []
+    initialise = Decoder.__init__
+
+    def noting(decoder: Decoder, *args: Any, **named: Any) -> None:
+        initialise(decoder, *args, **named)
+        made.append(decoder)
+
+    monkeypatch.setattr(Decoder, "__init__", noting)
+    yield
+    for decoder in made:
+        decoder.check_integrity()

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from model.engines.engine import Controls, Draw, PlanRequest, RequestError
+from model.engines.torch.ahead import Ahead
 from model.engines.torch.decoder import Decoder, Failed
 from model.engines.torch.pace import TimeFor
 from model.engines.torch.rows import Row
@@ -93,6 +94,39 @@ def test_a_draw_that_cannot_go_on_ends_its_request_alone(
     assert list(failed) == [BAD]
     assert "a draw could not go on: no" in str(failed[BAD])
     assert_as_alone(exact, draws, good)
+
+
+@pytest.mark.parametrize(
+    ("method", "message"), [("feed", "could not go on"), ("finished", "could not be read")]
+)
+def test_a_guess_that_goes_wrong_ends_its_request_alone(
+    exact: Loaded, monkeypatch: pytest.MonkeyPatch, method: str, message: str
+) -> None:
+    guess = getattr(Ahead, method)
+
+    def guessing(ahead: Ahead, row: Row, *rest: Any) -> Any:
+        if row.request.id == BAD and len(row.tokens) > 20:
+            raise ArithmeticError("no")
+        return guess(ahead, row, *rest)
+
+    monkeypatch.setattr(Ahead, method, guessing)
+    good = request("good", 2, n=2, seed=2)
+    draws, failed = decode_some(Decoder(Runner(exact, 8)), request(BAD, 7, n=4, seed=7), good)
+    assert list(failed) == [BAD]
+    assert message in str(failed[BAD])
+    assert_as_alone(exact, draws, good)
+
+
+def test_rows_that_nobody_owns_are_found(exact: Loaded) -> None:
+    decoder = Decoder(Runner(exact, 8))
+    decoder.add(request("running", n=2))
+    for _ in range(3):
+        decoder.step()
+    decoder.check_integrity()
+    decoder._schedule.release("running")
+    with pytest.raises(AssertionError, match="somebody runs without"):
+        decoder.check_integrity()
+    decoder.cancel("running")
 
 
 @pytest.mark.parametrize(
