@@ -62,6 +62,11 @@ async def label(
     except ReflectionRefused as error:
         metrics.label_asked(teacher.name, [each.check for each in error.failed], written=False)
         raise ProblemError(LABEL_REFUSED, f"{teacher.name}, asked {error.attempts} times: {error}") from None
+    finally:
+        input_tokens = sum(answer.input_tokens for answer in answers)
+        output_tokens = sum(answer.output_tokens for answer in answers)
+        cost_usd = sum(answer.cost_usd for answer in answers)
+        metrics.teacher_paid(teacher.name, input_tokens, output_tokens, cost_usd)
     metrics.label_asked(teacher.name, [each.check for each in reflection.failed], written=True)
     return wire.LabelResponse(
         request_id=request_id,
@@ -69,9 +74,9 @@ async def label(
         teacher=teacher_name(teacher),
         attempts=reflection.attempts,
         failed_checks=[f"{each.check}: {each.detail}" for each in reflection.failed],
-        input_tokens=sum(answer.input_tokens for answer in answers),
-        output_tokens=sum(answer.output_tokens for answer in answers),
-        cost_usd=sum(answer.cost_usd for answer in answers),
+        input_tokens=input_tokens,
+        output_tokens=output_tokens,
+        cost_usd=cost_usd,
     )
 
 

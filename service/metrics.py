@@ -137,6 +137,18 @@ class Metrics:
             ["teacher", "check"],
             registry=registry,
         )
+        self._teacher_tokens = Counter(
+            "looktwice_teacher_tokens",
+            "Tokens of teachers' answers, taken or not, as the teachers count.",
+            ["teacher", "direction"],
+            registry=registry,
+        )
+        self._teacher_cost = Counter(
+            "looktwice_teacher_cost_usd",
+            "What teachers' answers cost, taken or not, at the prices of the settings.",
+            ["teacher"],
+            registry=registry,
+        )
         self._think_probability = Histogram(
             "looktwice_think_probability",
             "Probability of a second look at the branch.",
@@ -221,6 +233,12 @@ class Metrics:
             self._labels.labels(teacher).inc()
         for check in failed:
             self._label_checks_failed.labels(teacher, check).inc()
+
+    def teacher_paid(self, teacher: str, input_tokens: int, output_tokens: int, cost_usd: float) -> None:
+        """Count what a question to a teacher took."""
+        self._teacher_tokens.labels(teacher, "input").inc(input_tokens)
+        self._teacher_tokens.labels(teacher, "output").inc(output_tokens)
+        self._teacher_cost.labels(teacher).inc(cost_usd)
 
     def draw_finished(self, draw: Draw, thinking: Thinking, endpoint: str) -> None:
         """Count one draw."""

@@ -88,6 +88,10 @@ class Spent(NamedTuple):
     output_tokens: int
     cost_usd: float
 
+    def since(self, before: Spent) -> dict[str, float]:
+        """What was spent after ``before``, by name."""
+        return {name: now - then for name, now, then in zip(self._fields, self, before, strict=True)}
+
 
 class Entered(NamedTuple):
     """Rows of a run: outcomes (key, scene, state, record) and answers (key, attempt, answer)."""

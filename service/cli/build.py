@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain, islice
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -29,7 +30,7 @@ app = typer.Typer(
 
 Folder = Annotated[Path, typer.Argument(help="The build: its ledger and what is made of it.")]
 Scenes = Annotated[Path, typer.Argument(help="Labelled scenes: a file or a folder.")]
-Limit = Annotated[int | None, typer.Option(help="At most so many pieces of work.", min=1)]
+Limit = Annotated[int | None, typer.Option(help="At most so many pieces of work more.", min=1)]
 Every = Annotated[int, typer.Option(help="Take every so many-th scene only.", min=1)]
 DryRun = Annotated[int, typer.Option(help="Do so many, print what comes of them, keep nothing.", min=0)]
 AtOnce = Annotated[int, typer.Option(help="Most requests under way; fewer while the service is busy.", min=1)]
@@ -214,8 +215,7 @@ def label(
                     total=ledger.count_kept(rollout, plans_per_scene),
                     quiet=as_json,
                 )
-            after = ledger.spent(begun)
-            spent.update({name: after[place] - before[place] for place, name in enumerate(after._fields)})
+            spent.update(ledger.spent(begun).since(before))
             return begun, tally
         finally:
             await asked.close()
@@ -293,9 +293,10 @@ def take(
 
     with told(), Ledger(folder) as ledger, results.open() as lines:
         settings, begun, found = _batch(ledger, scenes, plans_per_scene, seed, run)
+        before = ledger.spent(begun)
         tally = take_results(ledger, begun, found, read_results(lines, settings))
         write_dead_letters(ledger, folder)
-        _report(begun, tally, as_json)
+        _report(begun, tally, as_json, **ledger.spent(begun).since(before))
 
 
 def _batch(
@@ -360,12 +361,23 @@ async def _work(
 ) -> Tally:
     from clients.labelling.pipeline import work_through
 
-    with _progress(run, min(total, limit or total), quiet=quiet) as show:
-        return await work_through(ledger, run, islice(jobs, limit), do, limits, show)
+    with _progress(run, total if limit is None else None, quiet=quiet) as show:
+        return await work_through(ledger, run, _first(jobs, ledger, limit), do, limits, show)
+
+
+def _first(jobs: Iterator[Job[Any]], ledger: Ledger, limit: int | None) -> Iterator[Job[Any]]:
+    """Jobs up to so many that the ledger does not have yet; all without a limit."""
+    left = inf if limit is None else limit
+    for job in jobs:
+        new = not ledger.has(job.key)
+        yield job
+        left -= new
+        if left <= 0:
+            return
 
 
 @contextmanager
-def _progress(run: Run, total: int, *, quiet: bool) -> Iterator[Callable[[Tally], None]]:
+def _progress(run: Run, total: int | None, *, quiet: bool) -> Iterator[Callable[[Tally], None]]:
     """A bar on stderr, moved by what it is told."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

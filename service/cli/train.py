@@ -80,6 +80,10 @@ def train(
         if recipe == "ladder":
             if test is None:
                 raise ValueError("give the scenes for the table: --test FOLDER")
+            if paper and source is None:
+                raise ValueError(
+                    "the paper's recipes begin with a model that writes meta-actions: --from FOLDER"
+                )
             options = _options(
                 context, but=("recipe", "scenes", "target", "source", "test", "every", "processes")
             )

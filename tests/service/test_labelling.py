@@ -121,3 +121,5 @@ def test_checks_that_a_teacher_never_passes_are_counted_by_reason(settings: Sett
             labels = {"teacher": "upstream", "check": check}
             assert served.metric("looktwice_label_checks_failed_total", **labels) == failed
         assert served.metric("looktwice_labels_total", teacher="upstream") == 0
+        paid = {"teacher": "upstream", "direction": "input"}
+        assert served.metric("looktwice_teacher_tokens_total", **paid) == 3 * 100

@@ -74,6 +74,23 @@ def test_guesses_that_are_not_sure_are_made_while_few_rows_share_a_pass(loaded: 
     assert len(ahead.feed(row, rows=40)[0]) > len(row.pending)
 
 
+def test_a_revised_plan_is_fed_as_the_first_went_on_while_it_repeats_it(loaded: Loaded) -> None:
+    row = beginning(loaded, thinking="always")
+    while row.cursor.section != "revised_plan":
+        ids, stop_id = row.cursor.allowed().ids, row.cursor.stop_id
+        if row.cursor.allowed().choice == BRANCH:
+            ids = ids[[branch_of(row.cursor, int(id)) == THINKING for id in ids]]
+        row.write((int(ids[0]) if stop_id is None or stop_id not in ids else stop_id,), loaded.vocabulary)
+    first = [token.id for token in row.tokens if token.section == "plan"]
+    already = sum(token.section == "revised_plan" for token in row.tokens)
+    tokens, decisions = Ahead().feed(row, rows=1)
+    assert tokens[len(row.pending) :][: len(first) - already] == first[already:]
+    assert len(decisions) > 3, "all decisions of the plan are checked in one pass"
+    other = next(int(id) for id in row.cursor.allowed().ids if int(id) != first[already])
+    row.write((other,), loaded.vocabulary)
+    assert Ahead().feed(row, rows=1)[0] == row.pending
+
+
 def test_the_more_rows_the_less_of_the_last_answer_is_fed(loaded: Loaded) -> None:
     ahead, first = Ahead(), whole(loaded)
     ahead.finished(first)

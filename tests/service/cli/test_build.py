@@ -61,18 +61,21 @@ def test_rolled_out_once_and_for_all(rolled: Path, url: str) -> None:
 
 def test_labelled_and_exported_in_every_form(rolled: Path, tmp_path: Path) -> None:
     done = told("label", rolled, SCENES, "--json")
-    assert (done["done"], done["dead"], done["answers"]) == (COUNT, 0, COUNT)
+    written = done["done"]
+    # Of a scene in which nothing asks for another plan the built-in teacher writes nothing.
+    assert (written + done["dead"], done["answers"]) == (COUNT, written)
+    assert written >= COUNT - 1
     run = done["run"][:8]
     ran("export", rolled, "--to", tmp_path / "r.parquet", "--run", run)
-    assert len(list(read_reflections(tmp_path / "r.parquet"))) == COUNT
+    assert len(list(read_reflections(tmp_path / "r.parquet"))) == written
     ran("export", rolled, "--form", "messages", "--scenes", SCENES, "--to", tmp_path / "m", "--run", run)
-    assert len((tmp_path / "m" / "messages.jsonl").read_text().splitlines()) == COUNT
+    assert len((tmp_path / "m" / "messages.jsonl").read_text().splitlines()) == written
     assert "--scenes" in ran("export", rolled, "--form", "messages", "--to", tmp_path / "n", code=2)
 
 
 def test_labelled_by_the_service(rolled: Path, url: str) -> None:
     arguments = ("--teacher", "service", "--service", url, "--seed", 1, "--json")
-    assert told("label", rolled, SCENES, *arguments)["done"] == COUNT
+    assert told("label", rolled, SCENES, *arguments)["done"] >= COUNT - 1
 
 
 def test_labelled_by_an_endpoint(rolled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,7 +87,14 @@ def test_labelled_by_an_endpoint(rolled: Path, monkeypatch: pytest.MonkeyPatch) 
     assert (done["done"], done["dead"], done["answers"]) == (0, 3, 9)
     assert (done["input_tokens"], done["output_tokens"]) == (9000, 450)
     letters = [json.loads(line) for line in (rolled / "dead_letters.jsonl").read_text().splitlines()]
-    assert {letter["text"] for letter in letters} == {LEAKING}
+    assert [letter.get("text") for letter in letters].count(LEAKING) == 3
+
+
+def test_a_limit_is_of_new_work(rolled: Path) -> None:
+    tallies = [told("label", rolled, SCENES, "--seed", 5, "--limit", 2, "--json") for _ in range(2)]
+    assert [(each["done"], each["earlier"]) for each in tallies] == [(2, 0), (2, 2)]
+    shown = ran("label", rolled, SCENES, "--seed", 5, "--dry-run", 2)
+    assert shown.count('"reflection"') == 2
 
 
 def test_a_dry_run_keeps_nothing(rolled: Path, url: str, tmp_path: Path) -> None:

@@ -97,3 +97,20 @@ def test_it_begins_with_a_checkpoint_and_goes_on_where_it_was(
     commands.clear()
     climbed(folder, "--from", str(untrained_checkpoint))
     assert [command[3] for command in commands] == ["evaluate"], "only the table is told again"
+
+
+def test_the_papers_recipes_need_a_model_to_begin_with(commands: list[list[str]], tmp_path: Path) -> None:
+    asked = [
+        "train",
+        "ladder",
+        "--scenes",
+        str(SCENES),
+        "--test",
+        str(SCENES),
+        "--to",
+        str(tmp_path / "ladder"),
+    ]
+    result = CliRunner().invoke(app, [*asked, "--paper"])
+    assert result.exit_code == 2
+    assert "--from" in result.output
+    assert commands == []

@@ -27,6 +27,7 @@ from transformers import (
 )
 
 from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from clients.labelling.teachers.service import ServiceTeacher
 from clients.labelling.teachers.teacher import (
     Answer,
     Question,
@@ -38,9 +39,11 @@ from clients.labelling.teachers.teacher import (
 )
 from model.network.corpus import nano_corpus
 from model.network.vocabulary import build_nano_tokenizer
+from service.settings import Settings
 from tests.clients.labelling.builds import GOOD
 from tests.service.scenes import scene
-from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN
+from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN, ScriptedEngine
+from tests.service.serving import serve
 
 START_WITHIN_S = 240
 KEY = "sk-of-a-test"
@@ -170,6 +173,23 @@ def test_a_real_endpoint_looks_at_the_pictures_and_answers(url: str) -> None:
     # Eight pictures of 16 tokens each at least, and the rules.
     assert answer.input_tokens > 8 * 16 + 300
     assert answer.output_tokens > 5
+
+
+def test_the_service_labels_with_a_real_endpoint_behind_it(url: str, tmp_path: Path) -> None:
+    choice = {"structured_outputs": {"choice": [GOOD]}}
+    teacher = OpenAiTeacher(OpenAiSettings(url, "tiny", KEY, extra_body=choice))
+
+    async def labelled(service: str) -> Answer:
+        remote = await ServiceTeacher.connect(service)
+        try:
+            return await remote.reflect(QUESTION)
+        finally:
+            await remote.close()
+
+    with serve(ScriptedEngine(), Settings(bundled_scenes=tmp_path / "none"), teacher=teacher) as served:
+        answer = asyncio.run(labelled(served.url))
+    assert answer.text == GOOD
+    assert answer.input_tokens > 8 * 16 + 300
 
 
 def test_nonsense_is_asked_again_and_refused(url: str) -> None:
