@@ -7,6 +7,7 @@ at a trained network, whose responses are shorter.
 
 from __future__ import annotations
 
+import gc
 import os
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
@@ -280,12 +281,20 @@ def same_shares(shares: Shares, others: Shares) -> None:
         np.testing.assert_allclose(found, others[position], rtol=1e-9)
 
 
+def resident_bytes() -> int:
+    """Of this process, garbage left out."""
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
 def test_a_soak_leaves_nothing_behind(exact: Loaded) -> None:
-    """Requests come, end and are cancelled by chance; all others end, and everything is free."""
+    """Requests come, end and are cancelled by chance; all others end, everything is free, memory is flat."""
     random = np.random.default_rng(0)
     decoder = Decoder(Runner(exact, 12, clip_bytes=1 << 20), prompt_chunk=64)
     names: list[str] = []
-    for step in range(int(os.environ.get("LOOKTWICE_SOAK_STEPS", "300"))):
+    steps = int(os.environ.get("LOOKTWICE_SOAK_STEPS", "300"))
+    halfway = 0
+    for step in range(steps):
         if random.random() < 0.2:
             names.append(f"s{step}")
             format = "traj_only" if random.random() < 0.6 else "cf_vla"
@@ -299,6 +308,12 @@ def test_a_soak_leaves_nothing_behind(exact: Loaded) -> None:
         for _, event in decoder.step():
             assert not isinstance(event, Failed), event
         decoder.check_integrity()
+        if step == steps // 2:
+            halfway = resident_bytes()
+    assert resident_bytes() < 1.1 * halfway, "memory grows"
+    print(
+        f"{len(names)} requests, {halfway / 1e9:.2f} GB halfway, {resident_bytes() / 1e9:.2f} GB at the end"
+    )
     for _ in range(2000):
         decoder.step()
         decoder.check_integrity()
