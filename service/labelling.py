@@ -12,6 +12,7 @@ from clients.labelling.teachers.patience import patiently
 from clients.labelling.teachers.teacher import (
     AnnotationsMissing,
     Answer,
+    NothingInView,
     Question,
     ReflectionRefused,
     Teacher,
@@ -28,6 +29,7 @@ from service.problems import (
     INVALID_REQUEST,
     LABEL_REFUSED,
     NEEDS_ANNOTATIONS,
+    NOTHING_IN_VIEW,
     TEACHER_AWAY,
     TEACHER_REFUSED,
     ProblemError,
@@ -57,6 +59,8 @@ async def label(
         raise ProblemError(TEACHER_AWAY, f"{teacher.name}: {error}") from None
     except AnnotationsMissing as error:
         raise ProblemError(NEEDS_ANNOTATIONS, f"{teacher.name}: {error}") from None
+    except NothingInView as error:
+        raise ProblemError(NOTHING_IN_VIEW, f"{teacher.name}: {error}") from None
     except TeacherError as error:
         raise ProblemError(TEACHER_REFUSED, f"{teacher.name}: {error}") from None
     except ReflectionRefused as error:

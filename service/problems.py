@@ -57,6 +57,9 @@ QUEUE_FULL: Final = Kind("queue-full", 429, "The service has as much to do as it
 RATE_LIMITED: Final = Kind("rate-limited", 429, "The caller has asked for as much as is allowed")
 INTERNAL: Final = Kind("internal", 500, "The service failed")
 NEEDS_ANNOTATIONS: Final = Kind("needs-annotations", 422, "The teacher needs what the request lacks")
+NOTHING_IN_VIEW: Final = Kind(
+    "nothing-in-view", 422, "The teacher sees nothing that asks for the better plan"
+)
 TEACHER_REFUSED: Final = Kind("teacher-refused", 502, "The teacher does not take the question")
 LABEL_REFUSED: Final = Kind("label-refused", 502, "None of the teacher's answers passed the checks")
 TEACHER_AWAY: Final = Kind("teacher-away", 503, "The teacher does not answer")

@@ -19,6 +19,7 @@ _CHANGE_OF: Final[dict[Group, dict[str, Change]]] = {
     "lateral": {"Left Turn": "left", "Right Turn": "right", "Straight": "straight"},
     "lane": {"Left Lane Change": "lane_left", "Right Lane Change": "lane_right", "Keep Lane": "keep_lane"},
 }
+_PACE: Final[dict[Change, tuple[str, ...]]] = {"slower": ("Decelerate", "Wait"), "faster": ("Accelerate",)}
 MIN_TICKS: Final = 5
 """Half a second, the shortest that the labeller calls an action of its own."""
 
@@ -62,8 +63,36 @@ _OPPOSITES: Final[dict[Change, tuple[Change, ...]]] = {
     "lane_right": ("keep_lane", "lane_left"),
     "keep_lane": ("lane_left", "lane_right"),
 }
-_MOVES: Final = frozenset[Change]({"slower", "faster", "left", "right", "lane_left", "lane_right"})
-"""To ask for going straight, or for the lane, is to ask for nothing."""
+_HENCE: Final = re.compile(r"^(?:(?:so|therefore|thus|instead|then)\b,?\s*)+")
+_BECAUSE: Final = re.compile(
+    r"\b(?:because|since|as|before|after|for|when|where|while|until|unless|if|than|instead of|that|which|who|"
+    r"to(?! (?:the|my|a)\b))\b"
+)
+"""What comes behind it is a reason and no request; "to" as in "to pass the slow truck"."""
+_REQUESTS: Final[dict[Change, str]] = {
+    "slower": (
+        r"slow(?= (?:down|sooner|earlier|early)|$)|ease off|brake(?! lights?)|decelerate|"
+        r"(?:stop|yield)(?! signs?| lines?)|wait|back off|give way|hold back|lift off"
+    ),
+    "faster": r"accelerate|speed up|pick up speed|pull away|get going|move off|set off|gain speed|go faster",
+    "left": r"(?:turn|steer|bear)(?: \w+){0,2} left",
+    "right": r"(?:turn|steer|bear)(?: \w+){0,2} right",
+    "lane_left": r"(?:move|change|merge|pull|shift|switch)(?: \w+){0,3} left",
+    "lane_right": r"(?:move|change|merge|pull|shift|switch)(?: \w+){0,3} right",
+}
+_ASKED: Final = {
+    change: re.compile(rf"(?:(?:\w+ly|also|then|just|rather|first|now|i should)\s+)*(?:{verbs})\b")
+    for change, verbs in _REQUESTS.items()
+}
+"""Requests by the verb that they begin with."""
+_ALIKE: Final[dict[Change, Change]] = {
+    "left": "lane_left",
+    "right": "lane_right",
+    "lane_left": "left",
+    "lane_right": "right",
+}
+"""One steers left to get into the left lane."""
+_SENTENCES: Final = re.compile(r"[.;:!?](?=\s|$)\s*")
 _CLAUSES: Final = re.compile(
     r"[.;:!?,](?=\s|$)|\b(?:so(?! (?:long|much|far|early|late|fast|hard|soon))|but|therefore|thus|"
     r"instead(?! of)|which is why|rather than|instead of|while)\b"
@@ -72,8 +101,6 @@ CORRECTION: Final = re.compile(
     r"\b(?:should|must|ought to|have to|need to|had better|better to)\b", re.IGNORECASE
 )
 """What asks for a change."""
-_HENCE: Final = ("so", "therefore", "thus", "instead", "which is why")
-"""What asks for a change in the clause behind it."""
 _AGAINST: Final = re.compile(
     r"\b(?:if|would|could|might|risks?|too|not|no|never|without|avoid\w*|premature\w*|needless\w*|unnecessar\w+|"
     r"wrong\w*|leaves? (?:no|little)|instead of|rather than|my plan|i plan\w*|the plan|planned|keeps? me)\b"
@@ -96,28 +123,38 @@ def wanted_changes(before: Plan, after: Plan) -> list[frozenset[Change]]:
     return [changes for changes in found if changes]
 
 
-def told_changes(text: str, *, corrections: bool = False) -> dict[Change, int]:
-    """How often a text speaks for each change, less how often it speaks against it.
-
-    Args:
-        text: a reflection.
-        corrections: count only what it says should be done.
-    """
+def told_changes(text: str) -> dict[Change, int]:
+    """How often a text speaks for each change, less how often it speaks against it."""
     told = dict.fromkeys(_WORDS, 0)
     plain = " ".join(text.casefold().replace("-", " ").split())
     start = 0
     for end in [*_CLAUSES.finditer(plain), None]:
         clause = plain[start : end.start() if end else len(plain)]
-        asks = plain[:start].endswith(_HENCE) or CORRECTION.search(clause)
-        if corrections and not asks:
-            start = end.end() if end else len(plain)
-            continue
         against = bool(_AGAINST.search(clause)) or plain[:start].endswith(("rather than", "instead of"))
         for change, pattern in _WORDS.items():
             count = len(pattern.findall(clause))
             told[change] += -count if against else count
         start = end.end() if end else len(plain)
     return told
+
+
+def asked_changes(text: str) -> set[Change]:
+    """What a text asks for in so many words: "I should …", "so …", and sentences that begin with the verb."""
+    found: set[Change] = set()
+    plain = " ".join(text.casefold().replace("-", " ").split())
+    for sentence in _SENTENCES.split(plain):
+        for clause in re.split(
+            r",\s+(?=so\b|therefore\b|thus\b|instead\b|but\b)|\bso (?=\w)", f"{sentence} "
+        ):
+            request = _HENCE.sub("", clause)
+            if marker := CORRECTION.search(request):
+                request = request[marker.end() :].strip()
+            request = _BECAUSE.split(request, maxsplit=1)[0]
+            parts = re.split(r",|\b(?:and|or|then)\b", request)
+            found |= {
+                change for part in parts for change, asked in _ASKED.items() if asked.match(part.strip())
+            }
+    return found
 
 
 def agrees(text: str, before: Plan, after: Plan) -> bool:
@@ -128,8 +165,8 @@ def agrees(text: str, before: Plan, after: Plan) -> bool:
     """
     told, wanted = told_changes(text), wanted_changes(before, after)
     about = {each for changes in wanted for change in changes for each in (change, *_OPPOSITES[change])}
-    asked = told_changes(text, corrections=True)
-    if any(asked[change] > 0 for change in _MOVES - about):
+    about |= {_ALIKE[change] for change in about if change in _ALIKE} | _done_in(after)
+    if asked_changes(text) - about:
         return False
     spoken = False
     for changes in wanted:
@@ -140,6 +177,19 @@ def agrees(text: str, before: Plan, after: Plan) -> bool:
             return False
         spoken |= score > 0
     return spoken or not wanted
+
+
+def _done_in(plan: Plan) -> set[Change]:
+    """What a plan does for half a second or longer."""
+    ticks = [plan.word_at("longitudinal", tick) for tick in range(TICKS)]
+    found: set[Change] = {
+        change for change, words in _PACE.items() if sum(tick in words for tick in ticks) >= MIN_TICKS
+    }
+    for group, changes in _CHANGE_OF.items():
+        for word, change in changes.items():
+            if sum(plan.word_at(group, tick) == word for tick in range(TICKS)) >= MIN_TICKS:
+                found.add(change)
+    return found
 
 
 def _longer(before: Plan, after: Plan, group: Group) -> frozenset[Change]:

@@ -13,6 +13,7 @@ from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
 from clients.labelling.rollout import key_of
 from clients.labelling.teachers.teacher import (
     ATTEMPTS,
+    NothingInView,
     Question,
     Reflection,
     ReflectionRefused,
@@ -103,6 +104,8 @@ def labeller(ledger: Ledger, run: Run, teacher: Teacher) -> Callable[[Job[Asked]
             raise
         except TeacherClosed as error:
             raise StageStopped(f"{teacher.name}: {error}") from error
+        except NothingInView as error:
+            raise CannotBeDone(str(error), fault=False) from error
         except TeacherError as error:
             raise CannotBeDone(str(error)) from error
         except ReflectionRefused as error:

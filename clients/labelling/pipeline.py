@@ -22,12 +22,13 @@ class CannotBeDone(Exception):
     """A piece of work that will never succeed; it becomes a dead letter.
 
     Attributes:
+        fault: whether something went wrong; else there was nothing to be done.
         more: what else its dead letter says.
     """
 
-    def __init__(self, reason: str, **more: Any) -> None:
+    def __init__(self, reason: str, *, fault: bool = True, **more: Any) -> None:
         super().__init__(reason)
-        self.more = more
+        self.fault, self.more = fault, more
 
 
 class StageStopped(RuntimeError):
@@ -41,7 +42,7 @@ class Limits:
     Attributes:
         at_once: most pieces of work under way.
         give_up_after_s: that the other side may be away before the stage stops.
-        max_error_rate: share of dead letters among what ended, beyond which the stage stops.
+        max_error_rate: share of faults among what ended, beyond which the stage stops.
     """
 
     at_once: int = 32
@@ -60,10 +61,14 @@ class Job(Generic[_Subject]):
 
 @dataclass
 class Tally:
-    """What a stage did this time, in how many seconds; ``earlier`` were there before."""
+    """What a stage did this time, in how many seconds; ``earlier`` were there before.
+
+    ``faults`` are those of the ``dead`` letters that something went wrong with.
+    """
 
     done: int = 0
     dead: int = 0
+    faults: int = 0
     earlier: int = 0
     seconds: float = 0.0
 
@@ -104,6 +109,7 @@ async def work_through(
         except CannotBeDone as error:
             ledger.bury(run, job.key, job.scene_id, str(error), **error.more)
             tally.dead += 1
+            tally.faults += error.fault
         except TryLater as error:
             told = f"nothing came for {limits.give_up_after_s:g} s: {error}"
             if tally.done == done_before:
@@ -111,14 +117,15 @@ async def work_through(
             # Others were served meanwhile: it is this one.
             ledger.bury(run, job.key, job.scene_id, told)
             tally.dead += 1
+            tally.faults += 1
         else:
             ledger.finish(run, job.key, job.scene_id, record)
             tally.done += 1
         on_progress(tally)
         ended = tally.done + tally.dead
-        if ended >= ERRORS_COUNT_FROM and tally.dead > limits.max_error_rate * ended:
+        if ended >= ERRORS_COUNT_FROM and tally.faults > limits.max_error_rate * ended:
             raise StageStopped(
-                f"{tally.dead} of {ended} could not be done, the last one ({job.scene_id}) because: "
+                f"{tally.faults} of {ended} could not be done, the last one ({job.scene_id}) because: "
                 f"{_last_reason(ledger, run)}"
             )
 

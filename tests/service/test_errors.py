@@ -293,6 +293,7 @@ def test_types_are_stable() -> None:
         "invalid-scene-file": 422,
         "internal": 500,
         "needs-annotations": 422,
+        "nothing-in-view": 422,
         "label-refused": 502,
         "teacher-away": 503,
         "scenes-unreadable": 500,

@@ -12,7 +12,7 @@ from typing import Final
 
 from clients.labelling.checks import FailedCheck
 from clients.labelling.direction import Change, wanted_changes
-from clients.labelling.teachers.teacher import AnnotationsMissing, Answer, Question, TeacherError
+from clients.labelling.teachers.teacher import AnnotationsMissing, Answer, NothingInView, Question
 from clients.labelling.teachers.view import Sight, View, view_of
 from model.driving.plan import Group, Plan, format_tick
 from model.driving.scene import AgentKind
@@ -39,7 +39,7 @@ class RuleTeacher:
 
         Raises:
             AnnotationsMissing: the scene has no annotations.
-            TeacherError: nothing that the cameras can show asks for what the better plan does otherwise.
+            NothingInView: nothing that the cameras can show asks for what the better plan does otherwise.
         """
         if question.surroundings is None:
             raise AnnotationsMissing(
@@ -54,7 +54,7 @@ class RuleTeacher:
         told = (_on(min(each), view, predicted, expert, chance) for each in changes)
         said = [text for text in told if text is not None][:2]
         if not said:
-            raise TeacherError(f"nothing in view asks for another plan ({', '.join(map(min, changes))})")
+            raise NothingInView(f"nothing in view asks for another plan ({', '.join(map(min, changes))})")
         return Answer(" ".join(said))
 
     async def close(self) -> None:

@@ -9,6 +9,7 @@ from clients.answers import BadAnswer, PlannerError, PlannerProblem, PlannerUnre
 from clients.labelling.checks import FailedCheck
 from clients.labelling.teachers.teacher import (
     Answer,
+    NothingInView,
     Question,
     TeacherBusy,
     TeacherClosed,
@@ -19,7 +20,7 @@ from clients.wire import MAX_SEED, TeacherName
 
 PATIENCE = Patience(timeout_s=120.0, attempts=1)
 """Who waits how long is the asker's to say."""
-LABEL_REFUSED = "label-refused"
+LABEL_REFUSED, NOTHING_IN_VIEW = "label-refused", "nothing-in-view"
 
 
 class ServiceTeacher:
@@ -70,6 +71,8 @@ class ServiceTeacher:
         except PlannerProblem as error:
             if error.type.endswith(LABEL_REFUSED):
                 return Answer("", unusable=error.detail)
+            if error.type.endswith(NOTHING_IN_VIEW):
+                raise NothingInView(error.detail) from error
             raise TeacherError(error.detail) from error
         except BadAnswer as error:
             raise TeacherClosed(str(error)) from error

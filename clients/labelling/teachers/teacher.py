@@ -27,6 +27,10 @@ class AnnotationsMissing(TeacherError):
     """A teacher that needs to be told who is around in the scene."""
 
 
+class NothingInView(TeacherError):
+    """A teacher that sees nothing that asks for the better plan, and makes up no reason."""
+
+
 class TeacherClosed(TeacherError):
     """A teacher that answers nobody as things are set up: a wrong key, model or address."""
 

@@ -21,6 +21,7 @@ def plan(longitudinal: str = "Keep Speed", lateral: str = "Straight", lane: str 
     return Plan(**tracks)
 
 
+LEFT = plan(lane="Left Lane Change")
 FAST, SLOW = plan("Keep Speed|Accelerate"), plan("Keep Speed|Decelerate")
 GOOD = (
     "The van ahead in my lane is close and its brake lights are on. Accelerating from 3.0s would close the "
@@ -79,6 +80,20 @@ def test_the_limit_is_eighty_words() -> None:
         ("All looks fine on this road.", plan(), plan()),
         ("The road bends left and a car moves to the right lane, so I should slow down.", FAST, SLOW),
         ("A car brakes ahead, so I should slow down and stay in my lane.", FAST, SLOW),
+        ("A truck is slow, so I should change to the left lane to pass the slow truck.", plan(), LEFT),
+        (
+            "A bus blocks my lane, the traffic behind it brakes. I should change to the left lane.",
+            plan(),
+            LEFT,
+        ),
+        ("A car turns, so I should brake because it is turning left.", FAST, SLOW),
+        ("There is a stop sign, so I should ease off before the road curves right.", FAST, SLOW),
+        (
+            "The van ahead brakes, so I should keep slowing down and turn left.",
+            SLOW,
+            plan("Keep Speed|Decelerate", lateral="Left Turn"),
+        ),
+        ("A van brakes ahead, so I should slow down.", SLOW, SLOW),
     ],
 )
 def test_texts_that_go_the_way_of_the_plan_agree(text: str, before: Plan, after: Plan) -> None:
@@ -101,6 +116,8 @@ def test_texts_that_go_the_way_of_the_plan_agree(text: str, before: Plan, after:
         ),
         ("A car brakes ahead, so I should slow down and change to the left lane.", FAST, SLOW),
         ("A car brakes ahead, so slow down and turn right.", FAST, SLOW),
+        ("A car brakes ahead. Therefore, slow down and turn right.", FAST, SLOW),
+        ("A car brakes ahead. Slow down, then gently steer to the left.", FAST, SLOW),
         ("All looks fine on this road, so I should accelerate.", plan(), plan()),
     ],
 )
@@ -121,4 +138,4 @@ def test_other_checks_have_another_version() -> None:
     sources = [Path(str(module.__file__)).read_bytes() for module in (checks, direction, leaks)]
     digest = hashlib.sha256(b"".join(sources)).hexdigest()[:12]
     told = "raise CHECKS_VERSION if these ask for something else now, and tell both here"
-    assert (CHECKS_VERSION, digest) == (2, "24e64c2ce533"), told
+    assert (CHECKS_VERSION, digest) == (2, "f255caadf74c"), told

@@ -28,8 +28,8 @@ from model.driving.plan import plan_from_bins
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thinking
 from model.engines.torch.decoder import Decoder, Failed
 from model.engines.torch.pace import Pace, TimeFor
-from model.engines.torch.rows import Row
-from model.engines.torch.runner import Runner
+from model.engines.torch.rows import Request, Row
+from model.engines.torch.runner import Prompt, Runner
 from model.engines.torch.sampler import probabilities
 from model.engines.torch.shortcuts import Shortcuts
 from model.formats.cf_vla import FORMATS
@@ -319,3 +319,6 @@ def test_a_soak_leaves_nothing_behind(exact: Loaded) -> None:
         decoder.check_integrity()
     assert decoder.idle, "a request is stuck"
     assert decoder.rows_used == 0
+    gc.collect()
+    left = [each for each in gc.get_objects() if type(each) in (Row, Request, Prompt)]
+    assert not left, "kept for nobody"
