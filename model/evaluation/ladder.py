@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from model.driving.scene import LabelledScene
 from model.engines.engine import Controls, Draw, Thinking
@@ -217,27 +220,36 @@ def ladder_report(results: Results) -> LadderReport:
     return LadderReport(Report(tuple(rows), tuple(comparisons)), difficulty)
 
 
+def write_scenes(results: Results, path: Path) -> None:
+    """Write every scene's measures in every row as Parquet, for comparisons that the report does not make."""
+    rows = [
+        {"row": variant.name} | {name: value for name, value in vars(scene).items() if name != "tags"}
+        for variant, scenes in results.items()
+        for scene in scenes
+    ]
+    pq.write_table(pa.Table.from_pylist(rows), path, compression="zstd")
+
+
 def revision(name: str, results: Sequence[SceneResult]) -> Comparison:
     """Plan IOU behind and before the second look, over the draws that took one."""
     revised = [replace(result, thought_iou_first=result.thought_iou_revised) for result in results]
     return compare(f"{name}: revised : first plan, where it thinks", revised, results, "thought_iou_first")
 
 
+_MEASURES: Final = ("min_ade_m", "avg_ade_m", "collision_rate")
 _COMPARED: Final = (
     ((META_ACT, "traj-only"), "min_ade_m"),
     ((f"{META_ACT}, expert plan", META_ACT), "min_ade_m"),
-    ((f"{META_ACT}, {MULTI_ROUND}", META_ACT), "min_ade_m"),
+    *(((f"{META_ACT}, {MULTI_ROUND}", META_ACT), measure) for measure in _MEASURES),
     *(
         ((f"{rung}, adaptive", other), measure)
         for rung in (COUNTERFACTUAL, ROUND_2)
         for other, measure in (
-            (META_ACT, "min_ade_m"),
-            (META_ACT, "avg_ade_m"),
-            (META_ACT, "collision_rate"),
-            (f"{META_ACT}, {MULTI_ROUND}", "min_ade_m"),
+            *((META_ACT, measure) for measure in _MEASURES),
+            *((f"{META_ACT}, {MULTI_ROUND}", measure) for measure in _MEASURES),
             (f"{rung}, never thinks", "min_ade_m"),
             (f"{rung}, always thinks", "min_ade_m"),
-            (f"{WHOLE_DATASET}, adaptive", "min_ade_m"),
+            *((f"{WHOLE_DATASET}, adaptive", measure) for measure in _MEASURES),
         )
     ),
     ((f"{ROUND_2}, adaptive", f"{COUNTERFACTUAL}, adaptive"), "min_ade_m"),

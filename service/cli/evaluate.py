@@ -54,6 +54,9 @@ def evaluate(
         int, typer.Option(help="Scenes for the ladder's temperatures, evenly chosen.", min=1)
     ] = 240,
     plots: Annotated[Path | None, typer.Option(help="Folder for the ladder's pictures.")] = None,
+    per_scene: Annotated[
+        Path | None, typer.Option(help="Parquet file for every scene's measures in every row of the ladder.")
+    ] = None,
     keep: Annotated[
         Path | None,
         typer.Option(help="SQLite file that keeps all draws: started again, it goes on where it was."),
@@ -76,7 +79,16 @@ def evaluate(
         report: Report | LadderReport
         if preset == "ladder":
             report = _ladder(
-                labelled, engine_of, checkpoint, ladder, controls, rows, sweep, plots, quiet=as_json
+                labelled,
+                engine_of,
+                checkpoint,
+                ladder,
+                controls,
+                rows,
+                sweep,
+                plots,
+                per_scene,
+                quiet=as_json,
             )
         else:
             from model.evaluation.report import evaluate_checkpoint
@@ -104,6 +116,7 @@ def _ladder(
     rows: int,
     sweep: int,
     plots: Path | None,
+    per_scene: Path | None,
     *,
     quiet: bool,
 ) -> LadderReport:
@@ -120,6 +133,7 @@ def _ladder(
         temperature_variants,
         threshold_results,
         threshold_variants,
+        write_scenes,
     )
     from model.evaluation.report import evaluate_variants
 
@@ -147,6 +161,8 @@ def _ladder(
             run = _run(evaluate_variants, swept, engine_of(path), variants, controls.n, rows, quiet=quiet)
             results |= asyncio.run(run)
     report = ladder_report(results)
+    if per_scene is not None:
+        write_scenes(results, per_scene)
     if plots is not None:
         plots.mkdir(parents=True, exist_ok=True)
         row_of = {row.name: row for row in report.report.rows if row.subgroup is None}

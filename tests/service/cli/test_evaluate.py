@@ -7,6 +7,7 @@ from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
@@ -36,7 +37,12 @@ def test_a_ladder_is_climbed_once_and_told_again(
     for name in ("meta-act", "multi-round"):
         (rungs / name).symlink_to(untrained_checkpoint, target_is_directory=True)
     plots = tmp_path / "plots"
-    told = ladder(untrained_checkpoint, tmp_path, "--ladder", str(rungs), "--plots", str(plots))
+    files = ["--plots", str(plots), "--per-scene", str(tmp_path / "scenes.parquet")]
+    told = ladder(untrained_checkpoint, tmp_path, "--ladder", str(rungs), *files)
+    scenes = pq.read_table(tmp_path / "scenes.parquet").to_pylist()
+    for row in (each for each in told["rows"] if each["subgroup"] is None):
+        measured = [scene["min_ade_m"] for scene in scenes if scene["row"] == row["name"]]
+        assert sum(measured) / len(measured) == pytest.approx(row["min_ade_m"])
     names = {row["name"] for row in told["rows"]}
     assert {"traj-only", "meta-act", "meta-act, expert plan", "meta-act, multi-round"} <= names
     for way in ("adaptive", "never thinks", "always thinks", "threshold 0", "threshold 1", "temperature 0.2"):
