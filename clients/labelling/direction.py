@@ -24,7 +24,7 @@ MIN_TICKS: Final = 5
 """Half a second, the shortest that the labeller calls an action of its own."""
 
 _SLOWER: Final = (
-    r"slow(?:s|ing|er)?(?: down| sooner| early)?|eas(?:e|es|ing) off|brak(?:e|es|ing)(?! lights?)|"
+    r"slow(?:s|ing|er(?! than))?(?: down| sooner| early)?|eas(?:e|es|ing) off|brak(?:e|es|ing)(?! lights?)|"
     r"decelerat\w+|hold(?:ing)? back|wait(?:s|ing)?|stop(?:s|ping)?|yield(?:s|ing)?|back(?:ing)? off|"
     r"come to a (?:stop|halt|standstill)|(?:reduce|lower|shed|lose)\w* (?:my |the )?speed|less speed|"
     r"stay(?:ing)? behind|give way|keep(?:ing)? (?:more |a larger |a safe )?(?:distance|gap)|"
@@ -36,7 +36,9 @@ _FASTER: Final = (
     r"mak(?:e|es|ing) progress|driv(?:e|es|ing) on|go(?:ing)? faster|rais\w+ (?:my |the )?speed"
 )
 _LEFT: Final = r"(?:turn|bend|steer|curv)\w*(?: \w+){0,2} left|left(?: hand)? (?:turn|bend|curve)\w*"
-_RIGHT: Final = r"(?:turn|bend|steer|curv)\w*(?: \w+){0,2} right|right(?: hand)? (?:turn|bend|curve)\w*"
+_RIGHT: Final = (
+    r"(?:turn|bend|steer|curv)\w*(?: \w+){0,2} right(?! ahead)|right(?: hand)? (?:turn|bend|curve)\w*"
+)
 _STRAIGHT: Final = r"straight(?:en\w*)?"
 _MOVE: Final = r"(?:mov|chang|merg|pull|shift|switch)(?:e|es|ing|ge|ging)?(?: \w+){0,3}"
 _LANE_LEFT: Final = rf"{_MOVE} left(?: lane)?|left lane change\w*"

@@ -120,7 +120,7 @@ def _slower(view: View, predicted: Plan, expert: Plan, chance: random.Random) ->
     return None
 
 
-def _faster(view: View, predicted: Plan, chance: random.Random) -> str:
+def _faster(view: View, predicted: Plan, chance: random.Random) -> str | None:
     ahead = view.first("vehicle", "cone", "barrier", "pedestrian", places=("my lane",))
     slow = next(
         (
@@ -132,6 +132,8 @@ def _faster(view: View, predicted: Plan, chance: random.Random) -> str:
     )
     if ahead is None:
         cue = chance.choice(("My lane is clear as far as I can see.", "The road ahead in my lane is free."))
+    elif ahead.ahead_m < _CLOSE_M and ahead.speed_ms < view.speed_ms - _SLOWER_BY_MS:
+        return None
     elif ahead.kind == "vehicle" and ahead.speed_ms > view.speed_ms + _SLOWER_BY_MS:
         cue = f"{_a(ahead, chance)} in my lane is drawing ahead, {_ahead(ahead.ahead_m)}."
     else:
