@@ -378,9 +378,10 @@ def _first(jobs: Iterator[Job[Any]], ledger: Ledger, limit: int | None) -> Itera
 
 @contextmanager
 def _progress(run: Run, total: int | None, *, quiet: bool) -> Iterator[Callable[[Tally], None]]:
-    """A bar on stderr, moved by what it is told."""
+    """A bar on stderr, moved by what it is told; it also says who is waited for."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from stamina.instrumentation import RetryDetails, get_on_retry_hooks, set_on_retry_hooks
 
     columns = (TextColumn(run.stage), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bar = TextColumn("{task.description}")
@@ -392,7 +393,16 @@ def _progress(run: Run, total: int | None, *, quiet: bool) -> Iterator[Callable[
             told = f"{tally.dead} dead letters" if tally.dead else ""
             progress.update(task, completed=ended, description=told)
 
-        yield show
+        def wait(details: RetryDetails) -> None:
+            # Not a line for each of many that wait, on the output that scripts read.
+            progress.update(task, description=f"waiting: {details.caused_by}")
+
+        hooks = get_on_retry_hooks()
+        set_on_retry_hooks([wait])
+        try:
+            yield show
+        finally:
+            set_on_retry_hooks(hooks)
 
 
 def _count(scenes: Path) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,9 +11,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from clients.labelling.ledger import Run
+from clients.labelling.teachers.patience import TryLater, patiently
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.reflection_store import read_reflections
 from model.engines.torch.engine import TorchEngine, TorchSettings
+from service.cli.build import _progress
 from service.cli.commands import app
 from service.settings import Settings
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer
@@ -129,6 +133,23 @@ def test_a_batch_goes_out_and_its_results_come_in(
     # The same words fit the change that some scenes want and not that of others.
     asked_again = ran("export", rolled, "--form", "openai-batch", "--scenes", SCENES, "--to", asked)
     assert f"{COUNT - taken['done']} written" in asked_again
+
+
+def test_waiting_is_told_beside_the_bar_alone(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    refusals = iter([TryLater("busy", 0.0), TryLater("busy", 0.0)])
+
+    async def answer() -> str:
+        for refusal in refusals:
+            raise refusal
+        return "done"
+
+    with _progress(Run("id", "rollout", {}), 1, quiet=False):
+        assert asyncio.run(patiently(answer, 10.0)) == "done"
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert "waiting: busy" in told.err
 
 
 def test_mistakes_are_told_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
