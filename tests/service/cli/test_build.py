@@ -68,7 +68,7 @@ def test_labelled_and_exported_in_every_form(rolled: Path, tmp_path: Path) -> No
     written = done["done"]
     # Of a scene in which nothing asks for another plan the built-in teacher writes nothing.
     assert (written + done["dead"], done["answers"]) == (COUNT, written)
-    assert written >= COUNT - 1
+    assert written > COUNT / 2
     run = done["run"][:8]
     ran("export", rolled, "--to", tmp_path / "r.parquet", "--run", run)
     assert len(list(read_reflections(tmp_path / "r.parquet"))) == written
@@ -79,7 +79,9 @@ def test_labelled_and_exported_in_every_form(rolled: Path, tmp_path: Path) -> No
 
 def test_labelled_by_the_service(rolled: Path, url: str) -> None:
     arguments = ("--teacher", "service", "--service", url, "--seed", 1, "--json")
-    assert told("label", rolled, SCENES, *arguments)["done"] >= COUNT - 1
+    done = told("label", rolled, SCENES, *arguments)
+    assert done["done"] > COUNT / 2
+    assert done["done"] + done["dead"] == COUNT
 
 
 def test_labelled_by_an_endpoint(rolled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
