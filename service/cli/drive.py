@@ -38,6 +38,8 @@ def drive(
     as_json: Json = False,
 ) -> None:
     """Drive closed loop, planning anew every half second; expert and constant velocity are the limits."""
+    if gif is not None and gif.suffix.lower() != ".gif":
+        raise typer.BadParameter(f"{gif} does not end in .gif", param_hint="--gif")
     from rich.console import Console
     from rich.progress import Progress
 

@@ -46,6 +46,12 @@ def test_unknown_drivers_are_refused() -> None:
     assert "racer" in result.output
 
 
+def test_a_film_of_another_kind_is_refused_before_anything_is_driven() -> None:
+    result = CliRunner().invoke(app, ["drive", "--service", "http://127.0.0.1:9", "--gif", "film.mp4"])
+    assert result.exit_code == 2
+    assert ".gif" in result.output
+
+
 def test_a_service_that_does_not_answer_is_named() -> None:
     result = CliRunner().invoke(app, ["drive", "--service", "http://127.0.0.1:9", "--episodes", "1"])
     assert result.exit_code == 2
