@@ -68,11 +68,11 @@ def test_bad_batches(served: Served, engine: ScriptedEngine, requests: Any, slug
 
 def test_a_batch_waits_where_a_scene_would_be_refused(served: Served, engine: ScriptedEngine) -> None:
     served.in_loop(engine.may_finish.clear)
-    answers: list[httpx.Response] = []
+    answers: dict[str, httpx.Response] = {}  # they end together, in any order
 
     def post(path: str, document: Any) -> threading.Thread:
         def ask() -> None:
-            answers.append(httpx.post(served.url + path, json=document, timeout=30))
+            answers[path] = httpx.post(served.url + path, json=document, timeout=30)
 
         thread = threading.Thread(target=ask)
         thread.start()
@@ -87,8 +87,8 @@ def test_a_batch_waits_where_a_scene_would_be_refused(served: Served, engine: Sc
     served.in_loop(engine.may_finish.set)
     for thread in (alone, batch):
         thread.join()
-    assert [answer.status_code for answer in answers] == [200, 200]
-    results = answers[1].json()["results"]
+    assert [answer.status_code for answer in answers.values()] == [200, 200]
+    results = answers["/v1/plan/batch"].json()["results"]
     assert [result["status"] for result in results] == [200] * 3
     assert all(result["response"]["timing"]["queue_ms"] > 0 for result in results)
     assert served.metric("looktwice_queue_draws") == 0
