@@ -183,22 +183,21 @@ def agrees(text: str, before: Plan, after: Plan) -> bool:
 
 def _done_in(plan: Plan) -> set[Change]:
     """What a plan does for half a second or longer."""
-    ticks = [plan.word_at("longitudinal", tick) for tick in range(TICKS)]
-    found: set[Change] = {
-        change for change, words in _PACE.items() if sum(tick in words for tick in ticks) >= MIN_TICKS
-    }
+    ticks = {change: _ticks(plan, "longitudinal", *words) for change, words in _PACE.items()}
     for group, changes in _CHANGE_OF.items():
-        for word, change in changes.items():
-            if sum(plan.word_at(group, tick) == word for tick in range(TICKS)) >= MIN_TICKS:
-                found.add(change)
-    return found
+        ticks |= {change: _ticks(plan, group, word) for word, change in changes.items()}
+    return {change for change, count in ticks.items() if count >= MIN_TICKS}
 
 
 def _longer(before: Plan, after: Plan, group: Group) -> frozenset[Change]:
     """The words of a track that ``after`` says for longer."""
-    more: set[Change] = set()
-    for word, change in _CHANGE_OF[group].items():
-        ticks = [sum(plan.word_at(group, tick) == word for tick in range(TICKS)) for plan in (before, after)]
-        if ticks[1] - ticks[0] >= MIN_TICKS:
-            more.add(change)
-    return frozenset(more)
+    return frozenset(
+        change
+        for word, change in _CHANGE_OF[group].items()
+        if _ticks(after, group, word) - _ticks(before, group, word) >= MIN_TICKS
+    )
+
+
+def _ticks(plan: Plan, group: Group, *words: str) -> int:
+    """For how many ticks a track of a plan says one of some words."""
+    return sum(plan.word_at(group, tick) in words for tick in range(TICKS))

@@ -43,11 +43,13 @@ class Limits:
         at_once: most pieces of work under way.
         give_up_after_s: that the other side may be away before the stage stops.
         max_error_rate: share of faults among what ended, beyond which the stage stops.
+        at_most: pieces of work that are begun, those done earlier not counted; None for all.
     """
 
     at_once: int = 32
     give_up_after_s: float = 300.0
     max_error_rate: float = 0.1
+    at_most: int | None = None
 
 
 @dataclass(frozen=True)
@@ -61,14 +63,10 @@ class Job(Generic[_Subject]):
 
 @dataclass
 class Tally:
-    """What a stage did this time, in how many seconds; ``earlier`` were there before.
-
-    ``faults`` are those of the ``dead`` letters that something went wrong with.
-    """
+    """What a stage did this time, in how many seconds; ``earlier`` were there before."""
 
     done: int = 0
     dead: int = 0
-    faults: int = 0
     earlier: int = 0
     seconds: float = 0.0
 
@@ -97,19 +95,21 @@ async def work_through(
     crowd, tally, began_s = Crowd(limits.at_once), Tally(), time.monotonic()
     under_way: set[asyncio.Task[None]] = set()
     begun: set[str] = set()
+    faults = 0
 
     async def attempt(job: Job[_Subject]) -> Record:
         async with crowd.place():
             return await do(job)
 
     async def finish(job: Job[_Subject]) -> None:
+        nonlocal faults
         done_before = tally.done
         try:
             record = await patiently(lambda: attempt(job), limits.give_up_after_s)
         except CannotBeDone as error:
             ledger.bury(run, job.key, job.scene_id, str(error), **error.more)
             tally.dead += 1
-            tally.faults += error.fault
+            faults += error.fault
         except TryLater as error:
             told = f"nothing came for {limits.give_up_after_s:g} s: {error}"
             if tally.done == done_before:
@@ -117,15 +117,15 @@ async def work_through(
             # Others were served meanwhile: it is this one.
             ledger.bury(run, job.key, job.scene_id, told)
             tally.dead += 1
-            tally.faults += 1
+            faults += 1
         else:
             ledger.finish(run, job.key, job.scene_id, record)
             tally.done += 1
         on_progress(tally)
         ended = tally.done + tally.dead
-        if ended >= ERRORS_COUNT_FROM and tally.faults > limits.max_error_rate * ended:
+        if ended >= ERRORS_COUNT_FROM and faults > limits.max_error_rate * ended:
             raise StageStopped(
-                f"{tally.faults} of {ended} could not be done, the last one ({job.scene_id}) because: "
+                f"{faults} of {ended} could not be done, the last one ({job.scene_id}) because: "
                 f"{_last_reason(ledger, run)}"
             )
 
@@ -138,7 +138,10 @@ async def work_through(
                 task.result()
 
     try:
-        while (job := await asyncio.to_thread(next, jobs, None)) is not None:
+        while limits.at_most is None or len(begun) < limits.at_most:
+            job = await asyncio.to_thread(next, jobs, None)
+            if job is None:
+                break
             if ledger.has(job.key) or job.key in begun:
                 tally.earlier += 1
                 on_progress(tally)

@@ -9,7 +9,6 @@ from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain, islice
-from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -72,7 +71,7 @@ def rollout(
     from clients.wire import ModelName
 
     sampling, access = Sampling(n, temperature, top_p, seed, route), Access.from_environment()
-    limits = Limits(at_once, give_up_after, max_error_rate)
+    limits = Limits(at_once, give_up_after, max_error_rate, dry_run or limit)
     unlabelled: list[str] = []
 
     async def roll(ledger: Ledger) -> tuple[Run, Tally]:
@@ -98,7 +97,6 @@ def rollout(
                 islice(jobs(run, scenes, unlabelled.append), 0, None, every),
                 lambda job: roll_out(planner, job.subject, model, sampling),
                 limits,
-                limit=dry_run or limit,
                 total=-(-_count(scenes) // every),
                 quiet=as_json,
             )
@@ -195,7 +193,7 @@ def label(
             if retry_dead:
                 ledger.forget_dead(begun)
             before = ledger.spent(begun)
-            limits = Limits(at_once, give_up_after, max_error_rate)
+            limits = Limits(at_once, give_up_after, max_error_rate, dry_run or limit)
             if on_ray is not None:
                 from clients.labelling.on_ray import LabelWork, chunks, work_on_ray
 
@@ -211,7 +209,6 @@ def label(
                     jobs(begun, found),
                     labeller(ledger, begun, asked),
                     limits,
-                    limit=dry_run or limit,
                     total=ledger.count_kept(rollout, plans_per_scene),
                     quiet=as_json,
                 )
@@ -355,25 +352,13 @@ async def _work(
     do: Callable[[Job[Any]], Awaitable[Record]],
     limits: Limits,
     *,
-    limit: int | None,
     total: int,
     quiet: bool,
 ) -> Tally:
     from clients.labelling.pipeline import work_through
 
-    with _progress(run, total if limit is None else None, quiet=quiet) as show:
-        return await work_through(ledger, run, _first(jobs, ledger, limit), do, limits, show)
-
-
-def _first(jobs: Iterator[Job[Any]], ledger: Ledger, limit: int | None) -> Iterator[Job[Any]]:
-    """Jobs up to so many that the ledger does not have yet; all without a limit."""
-    left = inf if limit is None else limit
-    for job in jobs:
-        new = not ledger.has(job.key)
-        yield job
-        left -= new
-        if left <= 0:
-            return
+    with _progress(run, total if limits.at_most is None else None, quiet=quiet) as show:
+        return await work_through(ledger, run, jobs, do, limits, show)
 
 
 @contextmanager

@@ -233,10 +233,10 @@ class Decoder:
         draws = [(row.request.id, draw, row.draft) for row in self._every_row() for draw in row.draws]
         assert len(draws) == len(set(draws)), "a draw runs twice"
         reserved = self._schedule.reserved()
-        reading = [(each.request.id, each.prompt, row) for each in self._beginnings for row in each.rows]
-        claimed = [(row.request.id, row.prompt, row) for row in self._rows] + reading
-        rows = Counter(name for name, _, _ in claimed)
-        prompts = Counter(name for name, _ in {(name, id(prompt)) for name, prompt, _ in claimed if prompt})
+        claimed = [(row.request.id, row.prompt) for row in self._rows]
+        claimed += [(each.request.id, each.prompt) for each in self._beginnings for _ in each.rows]
+        rows = Counter(name for name, _ in claimed)
+        prompts = Counter(name for name, _ in {(name, id(prompt)) for name, prompt in claimed if prompt})
         assert rows.keys() == reserved.keys(), "memory is reserved for nobody, or somebody runs without"
         for name, memory in reserved.items():
             assert Memory(rows[name], prompts[name]).within(memory), "a request uses more than it reserved"

@@ -77,6 +77,20 @@ def test_too_many_errors_stop_it_and_nothing_is_lost(tmp_path: Path) -> None:
     assert len(records(tmp_path)) == 50 == done + patient.done
 
 
+def test_where_there_was_nothing_to_be_done_it_goes_on(tmp_path: Path) -> None:
+    async def silent(job: Job[int]) -> Record:
+        raise CannotBeDone("nothing to say", fault=False)
+
+    tally = worked(tmp_path, jobs(100), silent, Limits(at_once=4, max_error_rate=0.1))
+    assert (tally.done, tally.dead) == (0, 100)
+
+
+def test_so_many_more_are_begun_and_no_others(tmp_path: Path) -> None:
+    worked(tmp_path, jobs(5), square)
+    tally = worked(tmp_path, jobs(30), square, Limits(at_most=3))
+    assert (tally.done, tally.earlier) == (3, 5)
+
+
 def test_who_is_busy_is_asked_again(tmp_path: Path) -> None:
     asked: dict[int, int] = {}
 
