@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -35,6 +35,10 @@ class CameraSpec:
     up_m: float = 1.5
     width: int = 224
     height: int = 112
+
+    def resized(self, width: int) -> CameraSpec:
+        """The same camera with pictures ``width`` pixels wide, of the same shape."""
+        return replace(self, width=width, height=round(width * self.height / self.width))
 
     @cached_property
     def focal_px(self) -> float:

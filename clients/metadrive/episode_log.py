@@ -12,7 +12,7 @@ import numpy.typing as npt
 from clients.metadrive.actors import Body, Vehicle
 from clients.metadrive.drifts import strays
 from clients.metadrive.roads import Array, RoadMap
-from model.driving.scene import AgentKind
+from model.driving.scene import AgentKind, Light
 
 Outcome = Literal["time", "route_end", "collision"]
 
@@ -139,6 +139,12 @@ class Recorder:
             live.strays[past],
             actors,
         )
+
+
+def lights_on(bits: int) -> frozenset[Light]:
+    """The lights that an `ActorLog`'s bits say are on."""
+    names: dict[int, Light] = {BRAKE_LIGHT: "brake", LEFT_LIGHT: "left", RIGHT_LIGHT: "right"}
+    return frozenset(name for bit, name in names.items() if bits & bit)
 
 
 def _lights(body: Body) -> int:

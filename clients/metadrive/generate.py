@@ -54,6 +54,7 @@ class GenerateConfig:
         dense: also store per-pixel targets.
         drifts: the expert strays from its line now and then; scenes show how it comes back.
         lapses: it brakes late now and then; scenes show how it brakes then.
+        width_px: of the pictures, which are twice as wide as high.
     """
 
     stride_s: float = 0.5
@@ -63,6 +64,7 @@ class GenerateConfig:
     dense: bool = True
     drifts: bool = False
     lapses: bool = False
+    width_px: int = 224
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,8 @@ def _run_blocks(
 
 def write_block(out_dir: Path, seeds: range, config: GenerateConfig) -> None:
     """Generate one block in this process and put its file in place."""
-    rig = Rig(FRONT_CAMERAS + (SURROUND_CAMERAS if config.surround else ()))
+    cameras = FRONT_CAMERAS + (SURROUND_CAMERAS if config.surround else ())
+    rig = Rig(tuple(camera.resized(config.width_px) for camera in cameras))
     scenes: list[LabelledScene] = []
     outcomes: list[EpisodeOutcome] = []
     for seed in seeds:

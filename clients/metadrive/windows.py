@@ -10,7 +10,7 @@ import shapely
 import shapely.affinity
 
 from clients.metadrive.annotate import Tagger, dense_target, route_ahead, to_ego
-from clients.metadrive.episode_log import EpisodeLog
+from clients.metadrive.episode_log import EpisodeLog, lights_on
 from clients.metadrive.rig import Picture, Rig
 from clients.metadrive.roads import Array
 from clients.metadrive.stage import Stage
@@ -149,7 +149,8 @@ class _Moment:
             poses = np.full(track.shape, np.nan)
             poses[there, :2] = to_ego(track[there, :2], self._ego)
             poses[there, 2] = np.unwrap(track[there, 2] - self._ego[2])
-            yield Agent(actor.actor_id, actor.kind, *actor.size, poses.astype(np.float32))
+            lights = lights_on(int(actor.lights[self._step]))
+            yield Agent(actor.actor_id, actor.kind, *actor.size, poses.astype(np.float32), lights)
 
     def lane_lines(self) -> tuple[FloatArray, ...]:
         """Centre lines of the lanes around."""

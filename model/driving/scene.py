@@ -50,6 +50,10 @@ TAGS: Final[tuple[Tag, ...]] = (
 AgentKind = Literal["vehicle", "pedestrian", "cone", "barrier"]
 AGENT_KINDS: Final[tuple[AgentKind, ...]] = ("vehicle", "pedestrian", "cone", "barrier")
 
+Light = Literal["brake", "left", "right"]
+LIGHTS: Final[tuple[Light, ...]] = ("brake", "left", "right")
+"""Lights of a vehicle that others act on; left and right together are hazard lights."""
+
 SemanticClass = Literal["sky", "off_road", "road", "vehicle", "pedestrian", "obstacle"]
 SEMANTIC_CLASSES: Final[tuple[SemanticClass, ...]] = (
     "sky",
@@ -127,6 +131,7 @@ class Agent:
         length_m, width_m, height_m: the box; length lies along the heading.
         poses: float32 [80, 3] (x, y, heading) of the box's centre, ego frame of the scene's instant,
             row 15 is now; NaN where the agent is absent.
+        lights: those that are on now.
     """
 
     agent_id: int
@@ -135,10 +140,13 @@ class Agent:
     width_m: float
     height_m: float
     poses: FloatArray
+    lights: frozenset[Light] = frozenset()
 
     def __post_init__(self) -> None:
         if self.poses.shape != (TRACK_STEPS, 3):
             raise SceneError(f"agent poses must have shape [80, 3], got {list(self.poses.shape)}")
+        if unknown := set(self.lights) - set(LIGHTS):
+            raise SceneError(f"unknown lights: {', '.join(sorted(unknown))}; known are {', '.join(LIGHTS)}")
 
     @property
     def future(self) -> FloatArray:
@@ -246,6 +254,7 @@ __all__ = [
     "EGO_WIDTH_M",
     "FRONT_TELE",
     "FRONT_WIDE",
+    "LIGHTS",
     "SEMANTIC_CLASSES",
     "TAGS",
     "TRACK_STEPS",
@@ -256,6 +265,7 @@ __all__ = [
     "GeometryError",
     "LabelledScene",
     "LaneTrace",
+    "Light",
     "Scene",
     "SceneError",
     "Tag",

@@ -29,7 +29,7 @@ from model.driving.scene import (
 )
 from model.driving.trajectory import GeometryError
 
-SCENE_VERSION: Final = "1"
+SCENE_VERSION: Final = "2"
 _VERSION_KEY: Final = b"looktwice.scene_version"
 ROW_GROUP: Final = 128
 
@@ -56,6 +56,7 @@ _SCHEMA: Final = pa.schema(
                         ("kind", pa.string()),
                         ("size_m", _FLOATS),
                         ("poses", _FLOATS),
+                        ("lights", pa.list_(pa.string())),
                     ]
                 )
             ),
@@ -190,6 +191,7 @@ def _to_row(labelled: LabelledScene) -> dict[str, Any]:
                 "kind": agent.kind,
                 "size_m": [agent.length_m, agent.width_m, agent.height_m],
                 "poses": _flat(agent.poses),
+                "lights": sorted(agent.lights),
             }
             for agent in labelled.agents
         ],
@@ -261,6 +263,7 @@ def _agent(row: dict[str, Any]) -> Agent:
         width_m=width_m,
         height_m=height_m,
         poses=_array(row["poses"], 3),
+        lights=frozenset(row["lights"]),
     )
 
 
