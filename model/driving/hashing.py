@@ -18,7 +18,8 @@ def hash_of(*parts: object) -> str:
 
 
 def scene_hash(scene: Scene) -> str:
-    """Stands for a scene with its name, its pictures and its way, behind and ahead."""
+    """Stands for a scene with its name, its pictures, its way, behind and ahead, and its tracks."""
     arrays = (scene.history, *(() if scene.route is None else (scene.route,)))
     pictures = [picture for clip in scene.clips for picture in (clip.camera.encode(), *clip.images)]
-    return hash_of(scene.scene_id, *pictures, *(array.tobytes() for array in arrays))
+    tracks = () if scene.tracks is None else ([vars(t) | {"lights": sorted(t.lights)} for t in scene.tracks],)
+    return hash_of(scene.scene_id, *pictures, *(array.tobytes() for array in arrays), *tracks)

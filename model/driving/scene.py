@@ -8,9 +8,17 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
+from model.driving.agents import (
+    AGENT_KINDS,
+    LIGHTS,
+    TRACK_STEPS,
+    Agent,
+    AgentKind,
+    Light,
+    SceneError,
+)
+from model.driving.tracks import Track, check_tracks
 from model.driving.trajectory import (
-    FUTURE_STEPS,
-    HISTORY_STEPS,
     FloatArray,
     GeometryError,
     check_history,
@@ -34,9 +42,6 @@ CAMERAS: Final = (
 CLIP_FRAMES: Final = 4
 CLIP_PERIOD_S: Final = 0.5
 
-TRACK_STEPS: Final = HISTORY_STEPS + FUTURE_STEPS
-"""Rows of an agent's track: 16 past poses (the last one is now), then 64 future ones."""
-
 Tag = Literal["lead_vehicle", "cut_in", "pedestrian", "lane_change", "turn", "hard_brake"]
 TAGS: Final[tuple[Tag, ...]] = (
     "lead_vehicle",
@@ -46,13 +51,6 @@ TAGS: Final[tuple[Tag, ...]] = (
     "turn",
     "hard_brake",
 )
-
-AgentKind = Literal["vehicle", "pedestrian", "cone", "barrier"]
-AGENT_KINDS: Final[tuple[AgentKind, ...]] = ("vehicle", "pedestrian", "cone", "barrier")
-
-Light = Literal["brake", "left", "right"]
-LIGHTS: Final[tuple[Light, ...]] = ("brake", "left", "right")
-"""Lights of a vehicle that others act on; left and right together are hazard lights."""
 
 SemanticClass = Literal["sky", "off_road", "road", "vehicle", "pedestrian", "obstacle"]
 SEMANTIC_CLASSES: Final[tuple[SemanticClass, ...]] = (
@@ -67,10 +65,6 @@ SEMANTIC_CLASSES: Final[tuple[SemanticClass, ...]] = (
 
 EGO_LENGTH_M: Final = 4.51
 EGO_WIDTH_M: Final = 1.85
-
-
-class SceneError(ValueError):
-    """A scene that cannot be planned for; the text says what is wrong with it."""
 
 
 @dataclass(frozen=True)
@@ -96,12 +90,15 @@ class Scene:
         clips: one clip per camera, at least one.
         history: float32 [16, 4] ego poses at 10 Hz, the last row is (0, 0, 0, 0).
         route: float32 [20, 2] points every 4 m along the way to go, or None.
+        tracks: at most 16 tracked objects, the ego frame now; None where nobody tracks, empty where
+            nobody is there.
     """
 
     scene_id: str
     clips: tuple[Clip, ...]
     history: FloatArray
     route: FloatArray | None = None
+    tracks: tuple[Track, ...] | None = None
 
     def __post_init__(self) -> None:
         cameras = [clip.camera for clip in self.clips]
@@ -112,6 +109,8 @@ class Scene:
         object.__setattr__(self, "history", check_history(self.history))
         if self.route is not None:
             object.__setattr__(self, "route", check_route(self.route))
+        if self.tracks is not None:
+            object.__setattr__(self, "tracks", check_tracks(self.tracks))
 
     def clip(self, camera: str) -> Clip:
         """The clip of ``camera``; raises `SceneError` where the scene has none."""
@@ -119,45 +118,6 @@ class Scene:
             if clip.camera == camera:
                 return clip
         raise SceneError(f"scene {self.scene_id} has no clip of camera {camera}")
-
-
-@dataclass(frozen=True, eq=False)
-class Agent:
-    """Another road user or obstacle as an oriented box, over past and future.
-
-    Attributes:
-        agent_id: stable within an episode.
-        kind: what it is.
-        length_m, width_m, height_m: the box; length lies along the heading.
-        poses: float32 [80, 3] (x, y, heading) of the box's centre, ego frame of the scene's instant,
-            row 15 is now; NaN where the agent is absent.
-        lights: those that are on now.
-    """
-
-    agent_id: int
-    kind: AgentKind
-    length_m: float
-    width_m: float
-    height_m: float
-    poses: FloatArray
-    lights: frozenset[Light] = frozenset()
-
-    def __post_init__(self) -> None:
-        if self.poses.shape != (TRACK_STEPS, 3):
-            raise SceneError(f"agent poses must have shape [80, 3], got {list(self.poses.shape)}")
-        if unknown := set(self.lights) - set(LIGHTS):
-            raise SceneError(f"unknown lights: {', '.join(sorted(unknown))}; known are {', '.join(LIGHTS)}")
-
-    @property
-    def future(self) -> FloatArray:
-        """float32 [64, 3], aligned with a trajectory's rows."""
-        return self.poses[HISTORY_STEPS:]
-
-    @property
-    def present(self) -> FloatArray:
-        """float32 [3], NaN when absent now."""
-        row: FloatArray = self.poses[HISTORY_STEPS - 1]
-        return row
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,5 +229,6 @@ __all__ = [
     "Scene",
     "SceneError",
     "Tag",
+    "Track",
     "split_of_seed",
 ]

@@ -1,0 +1,80 @@
+"""Tracks as numbers for networks: where each stands and moves, seen from the ego and along the route."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from model.driving.route_frame import RouteFrame
+from model.driving.tracks import MAX_TRACKS, Track
+from model.driving.trajectory import FloatArray
+
+TRACK_FEATURES: Final = (
+    "present",
+    "x",
+    "y",
+    "cos_heading",
+    "sin_heading",
+    "speed",
+    "on_route",
+    "along",
+    "left",
+    "speed_along",
+    "speed_left",
+    "pedestrian",
+    "obstacle",
+    "hazard",
+    "brake",
+    "indicator",
+    "length",
+    "width",
+    "standing",
+)
+MIRRORED: Final = tuple(
+    TRACK_FEATURES.index(name) for name in ("y", "sin_heading", "left", "speed_left", "indicator")
+)
+"""Columns that change sign where left and right are swapped."""
+_STANDING_MS: Final = 0.3
+
+
+def track_features(tracks: Sequence[Track], route: FloatArray | None) -> FloatArray:
+    """float32 [16, len(TRACK_FEATURES)], rows of nobody zero; lengths and speeds scaled to order one.
+
+    The columns from ``along`` to ``speed_left`` are relative to the ``route`` [20, 2]; zero without one.
+    """
+    features = np.zeros((MAX_TRACKS, len(TRACK_FEATURES)), np.float32)
+    if not tracks:
+        return features
+    xy = np.array([(track.x_m, track.y_m) for track in tracks])
+    frame = None if route is None else RouteFrame(route)
+    places = np.zeros((len(tracks), 2)) if frame is None else frame.places(xy)
+    headings = np.zeros(len(tracks)) if frame is None else frame.headings(xy)
+    for row, track in enumerate(tracks):
+        turn = track.heading_rad - headings[row]
+        hazard = {"left", "right"} <= track.lights
+        indicator = 0 if hazard else ("left" in track.lights) - ("right" in track.lights)
+        features[row] = (
+            1.0,
+            track.x_m / 30,
+            track.y_m / 5,
+            math.cos(track.heading_rad),
+            math.sin(track.heading_rad),
+            track.speed_ms / 10,
+            frame is not None,
+            places[row, 0] / 30,
+            places[row, 1] / 3,
+            0.0 if frame is None else track.speed_ms * math.cos(turn) / 10,
+            0.0 if frame is None else track.speed_ms * math.sin(turn) / 2,
+            track.kind == "pedestrian",
+            track.kind in ("cone", "barrier"),
+            hazard,
+            "brake" in track.lights,
+            indicator,
+            track.length_m / 4,
+            track.width_m / 2,
+            abs(track.speed_ms) < _STANDING_MS,
+        )
+    return features
