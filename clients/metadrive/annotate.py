@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from clients.cameras import CameraSpec
 from clients.metadrive.episode_log import ActorLog, EpisodeLog
 from clients.metadrive.roads import Array, Rail
+from model.driving.cameras import CameraSpec
 from model.driving.scene import SEMANTIC_CLASSES, DenseTarget, Tag
 from model.driving.trajectory import FUTURE_STEPS, ROUTE_POINTS, ROUTE_SPACING_M
 

@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from clients.cameras import FRONT_CAMERAS, CameraSpec
 from clients.metadrive.actors import STEP_S
 from clients.metadrive.annotate import to_ego
 from clients.metadrive.drive import Shot
+from model.driving.cameras import FRONT_CAMERAS, CameraSpec
 from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
 from model.driving.trajectory import FloatArray
 

@@ -23,12 +23,12 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from clients.cameras import FRONT_CAMERAS, SURROUND_CAMERAS
 from clients.metadrive import simulator
 from clients.metadrive.episode import run_episode
 from clients.metadrive.maps import MapError
 from clients.metadrive.rig import Rig
 from clients.metadrive.windows import labelled_scenes, window_steps
+from model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS
 from model.driving.scene import LabelledScene, split_of_seed
 from model.driving.scene_store import SCENE_VERSION, write_scenes
 

@@ -9,11 +9,11 @@ from typing import Any, Final
 import numpy as np
 
 from clients import wire
-from clients.cameras import FRONT_CAMERAS, CameraSpec
 from clients.navsim.history import PERIOD_S, STATUSES, history_of
 from clients.navsim.inputs import AgentInput, Cameras, InputError
 from clients.navsim.views import seen_as
 from clients.planner import Access, Patience, PlannerClient
+from model.driving.cameras import FRONT_CAMERAS, CameraSpec
 from model.driving.images import encode_jpeg
 from model.driving.scene import Clip, Scene
 from model.driving.trajectory import STEP_S, FloatArray, agreed

@@ -45,7 +45,8 @@ class RouteFrame:
     def headings(self, points: npt.NDArray[np.floating]) -> Array:
         """The route's heading beside points [n, 2], rad [n] in the ego frame."""
         segment, _, _ = self._nearest(np.asarray(points, np.float64))
-        return np.arctan2(self._units[segment, 1], self._units[segment, 0])
+        headings: Array = np.arctan2(self._units[segment, 1], self._units[segment, 0])
+        return headings
 
     def _nearest(self, points: Array) -> tuple[npt.NDArray[np.intp], Array, Array]:
         """The nearest segment [n] of each point, how far along it lies, and how far to its left."""

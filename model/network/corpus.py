@@ -13,6 +13,7 @@ from typing import Final
 from model.driving.plan import GROUPS, TICKS, WORDS, Plan, track_from_words
 from model.driving.scene import CAMERAS
 from model.network.prompts import TASKS, prompt_text
+from model.network.settings import VlaSettings
 
 _SLOTS: Final[dict[str, tuple[str, ...]]] = {
     "agent": (
@@ -230,4 +231,6 @@ def nano_corpus() -> Iterator[str]:
     for format in TASKS:
         for route in (False, True):
             # Often enough that the prompt's own words become single tokens.
-            yield from [prompt_text(format, CAMERAS, 1, route=route)] * 20
+            for tokens in (0, 1):
+                settings = VlaSettings(cameras=CAMERAS, scene_tokens=tokens)
+                yield from [prompt_text(format, settings, route=route, tracks=route)] * 20

@@ -14,6 +14,7 @@ from model.driving.trajectory import FloatArray
 from model.network.patches import normalise, patchify, resize
 from model.network.prompts import prompt_text
 from model.network.settings import VlaSettings
+from model.network.track_features import track_features
 from model.network.vocabulary import VIDEO_PAD, Vocabulary
 
 IntArray = npt.NDArray[np.int64]
@@ -45,6 +46,7 @@ class ModelInputs:
         video_grid_thw: int64 [cameras, 3] slices, rows and columns of patches per clip.
         history: float32 [16, 4].
         route: float32 [20, 2] or None.
+        tracks: float32 [16, features] of `track_features`, or None.
     """
 
     prompt: Prompt
@@ -52,6 +54,7 @@ class ModelInputs:
     video_grid_thw: IntArray
     history: FloatArray
     route: FloatArray | None
+    tracks: FloatArray | None = None
 
     @property
     def pixel_values_videos(self) -> npt.NDArray[np.float32]:
@@ -65,7 +68,7 @@ class InputBuilder:
     def __init__(self, vocabulary: Vocabulary, settings: VlaSettings) -> None:
         self._vocabulary = vocabulary
         self.settings = settings
-        self._prompts: dict[tuple[str, bool], Prompt] = {}
+        self._prompts: dict[tuple[str, bool, bool], Prompt] = {}
 
     @property
     def video_grid_thw(self) -> IntArray:
@@ -80,14 +83,25 @@ class InputBuilder:
             ImageError: a picture cannot be decoded.
             PromptError: an unknown format.
         """
-        route = scene.route if self.settings.with_route else None
+        route, tracks = self.way(scene), self.tracks(scene)
         return ModelInputs(
-            prompt=self.prompt(format, route=route is not None),
+            prompt=self.prompt(format, route=route is not None, tracks=tracks is not None),
             patches=np.concatenate([self.patches(pictures) for pictures in self.slices(scene)]),
             video_grid_thw=self.video_grid_thw,
             history=scene.history,
             route=route,
+            tracks=tracks,
         )
+
+    def way(self, scene: Scene) -> FloatArray | None:
+        """The route [20, 2] that the network is given, or None."""
+        return scene.route if self.settings.with_route else None
+
+    def tracks(self, scene: Scene) -> FloatArray | None:
+        """The tracks' features [16, features] that the network is given, or None."""
+        if not self.settings.with_tracks or scene.tracks is None:
+            return None
+        return track_features(scene.tracks, scene.route)
 
     def slices(self, scene: Scene) -> list[tuple[bytes, ...]]:
         """The encoded pictures of each time slice, camera by camera; the tower sees slices one by one.
@@ -114,12 +128,12 @@ class InputBuilder:
         """The patches of the `frame`s of one slice, uint8 [p, 1176]."""
         return patchify(np.stack(frames), self.settings)
 
-    def prompt(self, format: str, *, route: bool) -> Prompt:
+    def prompt(self, format: str, *, route: bool, tracks: bool = False) -> Prompt:
         """The prompt of a format; raises `PromptError` for an unknown one."""
-        key = (format, route)
+        key = (format, route, tracks)
         if key not in self._prompts:
             settings = self.settings
-            text = prompt_text(format, settings.cameras, settings.clip_tokens, route=route)
+            text = prompt_text(format, settings, route=route, tracks=tracks)
             ids = np.array(self._vocabulary.encode(text), np.int64)
             positions = rotary_positions(ids == self._vocabulary.id_of(VIDEO_PAD), settings)
             self._prompts[key] = Prompt(ids, positions, int(positions.max()) + 1 - len(ids))
@@ -131,11 +145,14 @@ def rotary_positions(is_video: npt.NDArray[np.bool_], settings: VlaSettings) -> 
 
     Text counts on in all three rows; a clip's tokens count slices (spaced by real time), rows and
     columns from its beginning, and the text behind goes on after its larger side
-    (transformers, `Qwen2_5_VLModel.get_rope_index`).
+    (transformers, `Qwen2_5_VLModel.get_rope_index`). What a resampler gathered has no place in a picture,
+    and counts as text.
 
     Raises:
         ValueError: the placeholders are not whole clips.
     """
+    if settings.scene_tokens:
+        return np.tile(np.arange(len(is_video), dtype=np.int64), (3, 1))
     slices, rows, columns = settings.grid
     merge = settings.spatial_merge_size
     spacing = settings.tokens_per_second * settings.seconds_per_slice

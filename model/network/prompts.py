@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
+from model.driving.tracks import MAX_TRACKS
+from model.network.settings import VlaSettings
 from model.network.vocabulary import (
     HISTORY,
     HISTORY_END,
@@ -14,6 +15,9 @@ from model.network.vocabulary import (
     ROUTE,
     ROUTE_END,
     ROUTE_START,
+    TRACK,
+    TRACKS_END,
+    TRACKS_START,
     VIDEO_PAD,
     VISION_END,
     VISION_START,
@@ -33,7 +37,7 @@ class PromptError(ValueError):
     """No prompt is known for a response format."""
 
 
-def prompt_text(format: str, cameras: Sequence[str], clip_tokens: int, *, route: bool) -> str:
+def prompt_text(format: str, settings: VlaSettings, *, route: bool, tracks: bool = False) -> str:
     """The whole prompt, placeholders included, up to where the response begins.
 
     What all scenes share comes first and the history after the pictures, so that caches of common
@@ -41,23 +45,34 @@ def prompt_text(format: str, cameras: Sequence[str], clip_tokens: int, *, route:
 
     Args:
         format: the response format's name; it decides the task.
-        cameras: in this order.
-        clip_tokens: placeholders per clip.
+        settings: cameras, in their order, and the number of placeholders.
         route: whether the scene has a route.
+        tracks: whether it has tracks.
 
     Raises:
         PromptError: ``format`` has no task.
     """
     if format not in TASKS:
         raise PromptError(f"no prompt is known for format {format!r}; known are {', '.join(TASKS)}")
-    clips = "".join(f"{camera}:{VISION_START}{VIDEO_PAD * clip_tokens}{VISION_END}\n" for camera in cameras)
     return (
         f"{IM_START}system\n{_SYSTEM}{IM_END}\n"
         f"{IM_START}user\n{TASKS[format]}\n"
-        f"{clips}"
+        f"{_seen(settings)}"
         f"{motion_text(route=route)}"
+        f"{_tracks() if tracks else ''}"
         f"{IM_END}\n{IM_START}assistant\n"
     )
+
+
+def _seen(settings: VlaSettings) -> str:
+    if settings.scene_tokens:
+        return f"cameras:{VISION_START}{VIDEO_PAD * settings.scene_tokens}{VISION_END}\n"
+    clip = f"{VISION_START}{VIDEO_PAD * settings.clip_tokens}{VISION_END}"
+    return "".join(f"{camera}:{clip}\n" for camera in settings.cameras)
+
+
+def _tracks() -> str:
+    return f"tracks:{TRACKS_START}{TRACK * MAX_TRACKS}{TRACKS_END}\n"
 
 
 def motion_text(*, route: bool) -> str:

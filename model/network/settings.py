@@ -27,6 +27,9 @@ class VlaSettings:
         image_width, image_height: pixels that pictures are resized to; multiples of a merged patch.
         codec_size: trajectory codes per stage.
         with_route: whether it has a route encoder.
+        with_tracks: whether it has an encoder of tracks.
+        scene_tokens: 0 where every vision token stands in the prompt, as in Qwen2.5-VL; otherwise a
+            resampler brings those of all cameras down to so many.
         patch_size, temporal_patch_size, spatial_merge_size, tokens_per_second: as in the backbone's
             vision configuration.
     """
@@ -38,6 +41,8 @@ class VlaSettings:
     image_height: int = 112
     codec_size: int = 512
     with_route: bool = True
+    with_tracks: bool = False
+    scene_tokens: int = 0
     patch_size: int = 14
     temporal_patch_size: int = 2
     spatial_merge_size: int = 2
@@ -53,6 +58,8 @@ class VlaSettings:
             raise SettingsError(f"temporal_patch_size {self.temporal_patch_size} must divide {CLIP_FRAMES}")
         if unknown := [camera for camera in self.cameras if camera not in CAMERAS]:
             raise SettingsError(f"unknown camera {', '.join(unknown)}; known are {', '.join(CAMERAS)}")
+        if self.scene_tokens < 0:
+            raise SettingsError(f"scene_tokens must not be negative, got {self.scene_tokens}")
         if not self.cameras or not self.formats:
             raise SettingsError("a checkpoint needs at least one camera and one response format")
 
@@ -70,6 +77,11 @@ class VlaSettings:
         """Vision tokens of one clip."""
         slices, rows, columns = self.grid
         return slices * rows * columns // self.spatial_merge_size**2
+
+    @property
+    def vision_tokens(self) -> int:
+        """Vision tokens of all clips."""
+        return len(self.cameras) * self.clip_tokens
 
     @property
     def seconds_per_slice(self) -> float:
@@ -100,3 +112,9 @@ class VlaSettings:
             return cls(**fields)
         except TypeError as error:
             raise SettingsError(f"not LookTwice settings: {error}") from error
+
+
+NANO_SETTINGS: Final = VlaSettings(
+    image_width=336, image_height=168, temporal_patch_size=4, with_tracks=True, scene_tokens=16
+)
+"""Of the model that is trained from scratch: motion is seen within one patch, over all four frames."""

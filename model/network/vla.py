@@ -14,9 +14,10 @@ import torch
 from torch import Tensor, nn
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
-from model.driving.trajectory import FloatArray
-from model.network.encoders import HistoryEncoder, RouteEncoder
+from model.driving.trajectory import ROUTE_POINTS, FloatArray
+from model.network.encoders import HistoryEncoder, RouteEncoder, TrackEncoder
 from model.network.inputs import ModelInputs, Prompt, rotary_positions
+from model.network.resampler import SceneResampler
 from model.network.settings import CONFIG_KEY, VlaSettings
 from model.network.vision import attends_to_whole_pictures, encode_pictures, normalised
 from model.network.vocabulary import (
@@ -25,6 +26,7 @@ from model.network.vocabulary import (
     IM_END,
     IMAGE_PAD,
     ROUTE,
+    TRACK,
     VIDEO_PAD,
     VISION_END,
     VISION_START,
@@ -65,6 +67,13 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         hidden_size = config.text_config.hidden_size
         self.history_encoder = HistoryEncoder(hidden_size)
         self.route_encoder = RouteEncoder(hidden_size) if self.settings.with_route else None
+        self.track_encoder = TrackEncoder(hidden_size) if self.settings.with_tracks else None
+        self.track_token_id: int | None = extra.get("track_token_id")
+        self.resampler = (
+            SceneResampler(hidden_size, self.settings.vision_tokens, self.settings.scene_tokens)
+            if self.settings.scene_tokens
+            else None
+        )
         self._fast_vision = attends_to_whole_pictures(config.vision_config)
         self.post_init()  # type: ignore[no-untyped-call]
 
@@ -95,16 +104,21 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         vision_tokens: Tensor | None = None,
         history: Tensor | None = None,
         route: Tensor | None = None,
+        tracks: Tensor | None = None,
     ) -> Tensor:
-        """Input embeddings [b, t, hidden] with pictures, histories and routes in their places.
+        """Input embeddings [b, t, hidden] with pictures, histories, routes and tracks in their places.
 
         Args:
             input_ids: int64 [b, t].
-            vision_tokens: [k, hidden] from `vision`, for the k video placeholders of the batch in order.
+            vision_tokens: [k, hidden] from `vision`, of all clips of the batch in order.
             history: [b, 16, 4].
             route: [b, 20, 2]; rows whose prompt has no route token are ignored.
+            tracks: [b, 16, features]; rows whose prompt has no track tokens are ignored.
         """
         embeddings: Tensor = self.get_input_embeddings()(input_ids)
+        if vision_tokens is not None and self.resampler is not None:
+            assert history is not None, "the resampler needs the history"
+            vision_tokens = self.resample(vision_tokens, history, route, input_ids)
         if vision_tokens is not None:
             here = (input_ids == self.config.video_token_id)[..., None]
             embeddings = embeddings.masked_scatter(here, vision_tokens.to(embeddings.dtype))
@@ -115,24 +129,52 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
             if values is not None and encoder is not None:
                 here = (input_ids == token_id)[..., None]
                 embeddings = torch.where(here, encoder(values)[:, None].to(embeddings.dtype), embeddings)
+        if tracks is not None and self.track_encoder is not None:
+            here = input_ids == self.track_token_id
+            given = here.any(dim=1)
+            tokens = self.track_encoder(tracks[given]).to(embeddings.dtype)
+            embeddings = embeddings.masked_scatter(here[..., None], tokens)
         return embeddings
+
+    def resample(
+        self, vision_tokens: Tensor, history: Tensor, route: Tensor | None, input_ids: Tensor
+    ) -> Tensor:
+        """What the resampler gathers from the clips of whole scenes, [b x scene_tokens, hidden].
+
+        A row looks along its route where its prompt [b, t] has the route's token.
+        """
+        assert self.resampler is not None
+        rows = len(input_ids)
+        if route is None:
+            route, has_route = history.new_zeros(rows, ROUTE_POINTS, 2), input_ids.new_zeros(rows).bool()
+        else:
+            has_route = (input_ids == self.route_token_id).any(dim=1)
+        tokens = vision_tokens.view(rows, self.settings.vision_tokens, -1)
+        gathered: Tensor = self.resampler(tokens, history, route, has_route)
+        return gathered.flatten(0, 1)
 
     def encode_prompt_embeddings(self, inputs: ModelInputs) -> PromptEmbeddings:
         """One scene's prompt, ready to be prefilled."""
         patches = torch.from_numpy(inputs.patches).to(self.device)
         vision_tokens = self.vision(patches, torch.from_numpy(inputs.video_grid_thw))
-        return self.embed_prompt(inputs.prompt, vision_tokens, inputs.history, inputs.route)
+        return self.embed_prompt(inputs.prompt, vision_tokens, inputs.history, inputs.route, inputs.tracks)
 
     def embed_prompt(
-        self, prompt: Prompt, vision_tokens: Tensor, history: FloatArray, route: FloatArray | None
+        self,
+        prompt: Prompt,
+        vision_tokens: Tensor,
+        history: FloatArray,
+        route: FloatArray | None,
+        tracks: FloatArray | None = None,
     ) -> PromptEmbeddings:
-        """A prompt whose pictures are encoded: ``vision_tokens`` [k, hidden] of all its placeholders."""
+        """A prompt whose pictures are encoded: ``vision_tokens`` [k, hidden] of all its clips."""
         device = self.device
         embeddings = self.embed(
             torch.from_numpy(prompt.ids).to(device)[None],
             vision_tokens,
             _tensor(history, device)[None],
             None if route is None else _tensor(route, device)[None],
+            None if tracks is None else _tensor(tracks, device)[None],
         )
         positions = torch.from_numpy(prompt.position_ids).to(device)
         return PromptEmbeddings(embeddings[0], positions, prompt.position_offset)
@@ -159,9 +201,10 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         video_grid_thw: Tensor | None = None,
         history: Tensor | None = None,
         route: Tensor | None = None,
+        tracks: Tensor | None = None,
         **kwargs: Any,
     ) -> Any:
-        """As Qwen2.5-VL's, with ``history`` [b, 16, 4] and ``route`` [b, 20, 2] for their tokens.
+        """As Qwen2.5-VL's, with ``history`` [b, 16, 4], ``route`` [b, 20, 2] and ``tracks`` for their tokens.
 
         ``position_ids`` [3, b, t] are worked out here for whole sequences when they are not given.
         """
@@ -170,7 +213,7 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
             if pixel_values_videos is not None:
                 assert video_grid_thw is not None, "pixel_values_videos need video_grid_thw"
                 tokens = self.vision(pixel_values_videos, video_grid_thw)
-            inputs_embeds = self.embed(input_ids, tokens, history, route)
+            inputs_embeds = self.embed(input_ids, tokens, history, route, tracks)
             if position_ids is None and (past_key_values is None or not past_key_values.get_seq_length()):
                 position_ids = self.position_ids(input_ids, attention_mask)
         kwargs.pop("mm_token_type_ids", None)
@@ -195,7 +238,8 @@ def with_settings(config: VlaConfig, settings: VlaSettings, vocabulary: Vocabula
         config,
         CONFIG_KEY,
         settings.to_dict()
-        | {"history_token_id": vocabulary.id_of(HISTORY), "route_token_id": vocabulary.id_of(ROUTE)},
+        | {"history_token_id": vocabulary.id_of(HISTORY), "route_token_id": vocabulary.id_of(ROUTE)}
+        | ({"track_token_id": vocabulary.id_of(TRACK)} if settings.with_tracks else {}),
     )
     config.architectures = [LookTwiceVla.__name__]
     config.image_token_id = vocabulary.id_of(IMAGE_PAD)

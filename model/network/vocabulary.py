@@ -33,6 +33,9 @@ FUTURE_END: Final = "<|traj_future_end|>"
 ROUTE_START: Final = "<|traj_route_start|>"
 ROUTE: Final = "<|traj_route|>"
 ROUTE_END: Final = "<|traj_route_end|>"
+TRACKS_START: Final = "<|tracks_start|>"
+TRACK: Final = "<|track|>"
+TRACKS_END: Final = "<|tracks_end|>"
 
 QWEN_TOKENS: Final = (
     END_OF_TEXT,
@@ -56,6 +59,8 @@ OUR_TOKENS: Final = (
     ROUTE_END,
 )
 """Markers that are added to it, before the codes."""
+TRACK_TOKENS: Final = (TRACKS_START, TRACK, TRACKS_END)
+"""Markers behind the codes, for checkpoints that take tracks."""
 
 # The pre-tokenisation of Qwen2 (transformers, models/qwen2): words with their leading space, single digits.
 _QWEN_WORDS: Final = (
@@ -197,6 +202,7 @@ def expand_tokenizer(tokenizer: Any, codec_size: int) -> int:
     codes = [code_token(stage, code) for stage in range(CODE_STAGES) for code in range(codec_size)]
     # Not special: grammars of other engines only see ordinary tokens.
     _add(tokenizer, codes, special=False)
+    _add(tokenizer, TRACK_TOKENS, special=True)
     return len(tokenizer) - before
 
 

@@ -16,14 +16,18 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
+from model.driving.hashing import hash_of
 from model.driving.labeller import expert_plan
 from model.driving.plan import Plan, plan_from_bins
 from model.driving.scene import CLIP_FRAMES, LabelledScene
 from model.driving.scene_store import read_scenes, scene_files
+from model.driving.tracks import tracks_of
 from model.driving.trajectory import FloatArray
+from model.network.track_features import track_features
+from model.training.dense import coarse, no_target, relative_motion
 from model.training.facts import scene_facts
 
-CACHE_VERSION: Final = 2
+CACHE_VERSION: Final = 3
 DENSE_FAR_M: Final = 200.0
 """Ranges beyond are all the same to a dense target."""
 
@@ -39,8 +43,11 @@ class Examples:
         route: float32 [N, 20, 2]; NaN where a scene has none.
         future: float32 [N, 64, 4].
         plan_bins: int8 [N, 3, 64].
-        dense_classes: uint8 [N, cameras, h, w].
-        dense_range_log: float16 [N, cameras, h, w], log(1 + metres); 0 where there is nothing.
+        tracks: float32 [N, 16, features], see `track_features`.
+        dense_classes: uint8 [N, cameras, 24, 48]; `UNLABELLED` where a scene has no dense targets.
+        dense_range_log: float16 [N, cameras, 24, 48], log(1 + metres); 0 where there is nothing.
+        dense_motion: float16 [N, cameras, 2, 24, 48], speed of agents relative to the ego, forward and to the
+            left in the ego frame, divided by `SPEED_SCALE_MS`; 0 where no agent is.
         facts: float32 [N, facts].
         episode: int64 [N], the simulator's seed.
         scene_id: str [N].
@@ -52,8 +59,10 @@ class Examples:
     route: FloatArray
     future: FloatArray
     plan_bins: npt.NDArray[np.int8]
+    tracks: FloatArray
     dense_classes: npt.NDArray[np.uint8]
     dense_range_log: npt.NDArray[np.float16]
+    dense_motion: npt.NDArray[np.float16]
     facts: FloatArray
     episode: npt.NDArray[np.int64]
     scene_id: npt.NDArray[np.str_]
@@ -72,7 +81,7 @@ class Examples:
 
     @classmethod
     def from_scenes(cls, scenes: Iterable[LabelledScene], cameras: Sequence[str]) -> Examples:
-        """Gather scenes; every scene needs all ``cameras`` and their dense targets, or none of the latter."""
+        """Gather scenes; every scene needs all ``cameras``, dense targets it may lack."""
         blob, spans_of = bytearray(), dict[bytes, tuple[int, int]]()
         columns: dict[str, list[Any]] = {field.name: [] for field in fields(cls)}
         for labelled in scenes:
@@ -91,16 +100,24 @@ class Examples:
             )
             columns["future"].append(labelled.future)
             columns["plan_bins"].append(expert_plan(labelled).bins())
-            dense = {target.camera: target for target in labelled.dense}
-            columns["dense_classes"].append([dense[camera].classes for camera in cameras])
+            columns["tracks"].append(track_features(tracks_of(labelled.agents), scene.route))
+            dense = {target.camera: coarse(target) for target in labelled.dense}
+            cells = [dense.get(camera) or no_target(camera) for camera in cameras]
+            columns["dense_classes"].append([target.classes for target in cells])
             columns["dense_range_log"].append(
-                [np.log1p(np.minimum(dense[camera].range_m, DENSE_FAR_M)) for camera in cameras]
+                [np.log1p(np.minimum(target.range_m, DENSE_FAR_M)) for target in cells]
             )
+            columns["dense_motion"].append([relative_motion(target, labelled) for target in cells])
             columns["facts"].append(scene_facts(labelled))
             columns["episode"].append(labelled.seed)
             columns["scene_id"].append(scene.scene_id)
         types: dict[str, Any] = {"picture_spans": np.int64, "plan_bins": np.int8, "dense_classes": np.uint8}
-        types |= {"dense_range_log": np.float16, "episode": np.int64, "scene_id": np.str_}
+        types |= {
+            "dense_range_log": np.float16,
+            "dense_motion": np.float16,
+            "episode": np.int64,
+            "scene_id": np.str_,
+        }
         arrays = {
             name: np.asarray(values, types.get(name, np.float32))
             for name, values in columns.items()
@@ -121,11 +138,14 @@ class Examples:
         return cls(**columns)
 
 
+def _cache_name(file: Path, cameras: Sequence[str]) -> str:
+    """Of two folders' files of one name, and of two choices of cameras, each has an entry of its own."""
+    return f"{file.stem}-{hash_of(str(file.resolve()), *cameras)[:12]}.v{CACHE_VERSION}.npz"
+
+
 def load_examples(scenes: Path, cache: Path, cameras: Sequence[str], workers: int = 2) -> Examples:
     """The examples of a scene file or folder, through the cache folder."""
-    jobs = [
-        (file, cache / f"{file.parent.name}-{file.stem}.v{CACHE_VERSION}.npz") for file in scene_files(scenes)
-    ]
+    jobs = [(file, cache / _cache_name(file, cameras)) for file in scene_files(scenes)]
     stale = [
         (file, cached)
         for file, cached in jobs

@@ -1,91 +1,135 @@
-"""Facts about a scene that its latest pictures show: targets for grounding the vision tower.
+"""Facts about a scene that decide how to drive, as numbers: targets for grounding the vision tower.
 
-A vision-language model comes with such knowledge; a tower trained from scratch must learn it first.
+A vision-language model comes with such knowledge; a tower trained from scratch must learn it first. What
+counts is who is ahead in each lane, how far and how fast, whether they stand or brake, what closes a lane,
+who is about to cross, and where the road goes. Lanes are those of the route: the own one and its neighbours.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
-from model.driving.scene import EGO_LENGTH_M, Agent, LabelledScene
-from model.driving.trajectory import HISTORY_STEPS, STEP_S, FloatArray, present_speed
+from model.driving.route_frame import RouteFrame
+from model.driving.scene import EGO_LENGTH_M, LabelledScene
+from model.driving.tracks import Track, tracks_of
+from model.driving.trajectory import FloatArray
 
-PATH_HALF_WIDTH_M: Final = 1.75
-"""Half a lane: an agent whose centre is closer to the way ahead stands in it."""
-FACT_RANGE_M: Final = 80.0
-NEAREST: Final = 3
-"""How many of the nearest agents ahead are asked for."""
+LANES: Final = ("own", "left", "right")
+RANKS: Final = 2
+"""So many agents ahead are told for each lane."""
+LEAD_FIELDS: Final = ("present", "gap_log_m", "speed", "standing", "braking", "fixed")
+OBSTACLE_FIELDS: Final = ("present", "gap_log_m")
+WALKERS: Final = 2
+WALKER_FIELDS: Final = ("present", "along_log_m", "left", "speed_left")
+ROAD_DISTANCES_M: Final = tuple(range(8, 81, 8))
 
 FACTS: Final = (
-    "lead_present",
-    "lead_gap_log_m",
-    "lead_speed_ms",
-    *(f"route_left_{distance}m" for distance in range(8, 81, 8)),
-    *(f"agent_{rank}_{what}" for rank in range(NEAREST) for what in ("present", "x_log_m", "left_over_x")),
+    *(f"{lane}_{rank}_{field}" for lane in LANES for rank in range(RANKS) for field in LEAD_FIELDS),
+    *(f"{lane}_obstacle_{field}" for lane in LANES for field in OBSTACLE_FIELDS),
+    *(f"walker_{rank}_{field}" for rank in range(WALKERS) for field in WALKER_FIELDS),
+    *(f"road_left_{distance}m" for distance in ROAD_DISTANCES_M),
+)
+IS_YES_OR_NO: Final[npt.NDArray[np.bool_]] = np.array(
+    [name.endswith(("present", "standing", "braking", "fixed")) for name in FACTS]
+)
+"""Which facts are told as probabilities."""
+
+LANE_WIDTH_M: Final = 3.5
+FACT_RANGE_M: Final = 80.0
+WALKER_RANGE_M: Final = 60.0
+WALKER_BESIDE_M: Final = 8.0
+SPEED_SCALE_MS: Final = 10.0
+WALKER_SPEED_SCALE_MS: Final = 2.0
+WALKER_LEFT_SCALE_M: Final = 3.0
+ROAD_SCALE_M: Final = 10.0
+_STANDING_MS: Final = 0.5
+
+_MIRROR: Final[npt.NDArray[np.int64]] = np.array(
+    [
+        FACTS.index(
+            name.replace("left_", "right_", 1)
+            if name.startswith("left_")
+            else name.replace("right_", "left_", 1)
+            if name.startswith("right_")
+            else name
+        )
+        for name in FACTS
+    ]
+)
+_SIGNED: Final[npt.NDArray[np.bool_]] = np.array(
+    [name.startswith("road_") or name.endswith(("_left", "speed_left")) for name in FACTS]
 )
 
 
 def scene_facts(labelled: LabelledScene) -> FloatArray:
-    """float32 [len(FACTS)]: the facts of one scene; NaN where a fact does not apply.
+    """float32 [len(FACTS)] of one scene; NaN where a fact does not apply, all NaN without a route.
 
-    Lengths are logarithms (an error of one metre matters more nearby), the lead's speed is relative to the
-    ego's, and route points are metres to the left divided by 10.
+    Gaps are metres between bumpers, as log(1 + metres): an error of one metre matters more nearby. Speeds
+    are over the ground along the route, divided by `SPEED_SCALE_MS`.
     """
+    if labelled.scene.route is None:
+        return np.full(len(FACTS), np.nan, np.float32)
+    return facts_of(tracks_of(labelled.agents), labelled.scene.route)
+
+
+def facts_of(tracks: Sequence[Track], route: FloatArray) -> FloatArray:
+    """float32 [len(FACTS)]: what tracks tell; see `scene_facts`."""
     facts = dict.fromkeys(FACTS, float("nan"))
-    lead = lead_agent(labelled)
-    facts["lead_present"] = float(lead is not None)
-    if lead is not None:
-        facts["lead_gap_log_m"] = np.log1p(max(0.0, _gap(lead)))
-        facts["lead_speed_ms"] = (_speed(lead) - present_speed(labelled.scene.history)) / 10
-    if labelled.scene.route is not None:
-        for index, distance in enumerate(range(8, 81, 8)):
-            facts[f"route_left_{distance}m"] = float(labelled.scene.route[2 * index + 1, 1]) / 10
-    for rank in range(NEAREST):
-        facts[f"agent_{rank}_present"] = 0.0
-    for rank, agent in enumerate(_nearest_ahead(labelled)):
-        x, left = float(agent.present[0]), float(agent.present[1])
-        facts[f"agent_{rank}_present"] = 1.0
-        facts[f"agent_{rank}_x_log_m"] = np.log1p(x)
-        facts[f"agent_{rank}_left_over_x"] = left / (x + 1)
+    facts |= {name: 0.0 for name in FACTS if name.endswith("present")}
+    frame = RouteFrame(route)
+    xy = np.array([(track.x_m, track.y_m) for track in tracks]).reshape(-1, 2)
+    placed = list(zip(tracks, frame.places(xy), frame.headings(xy), strict=True))
+    for lane, middle in zip(LANES, (0.0, LANE_WIDTH_M, -LANE_WIDTH_M), strict=True):
+        ahead = sorted(
+            (
+                (max(0.0, along - (track.length_m + EGO_LENGTH_M) / 2), track, heading)
+                for track, (along, left), heading in placed
+                if track.kind != "pedestrian"
+                and abs(left - middle) < LANE_WIDTH_M / 2
+                and 0 < along < FACT_RANGE_M
+            ),
+            key=lambda lead: lead[0],
+        )
+        for rank, (gap, track, heading) in enumerate(ahead[:RANKS]):
+            speed = track.speed_ms * math.cos(track.heading_rad - heading)
+            values = (1.0, math.log1p(gap), speed / SPEED_SCALE_MS, *_states(track))
+            facts |= _named(f"{lane}_{rank}", LEAD_FIELDS, values)
+        obstacle = next((gap for gap, track, _ in ahead if _is_fixed(track)), None)
+        if obstacle is not None:
+            facts |= _named(f"{lane}_obstacle", OBSTACLE_FIELDS, (1.0, math.log1p(obstacle)))
+    walkers = sorted(
+        (along, left, track.speed_ms * math.sin(track.heading_rad - heading))
+        for track, (along, left), heading in placed
+        if track.kind == "pedestrian" and 0 < along < WALKER_RANGE_M and abs(left) < WALKER_BESIDE_M
+    )
+    for rank, (along, left, speed) in enumerate(walkers[:WALKERS]):
+        values = (1.0, math.log1p(along), left / WALKER_LEFT_SCALE_M, speed / WALKER_SPEED_SCALE_MS)
+        facts |= _named(f"walker_{rank}", WALKER_FIELDS, values)
+    for distance in ROAD_DISTANCES_M:
+        facts[f"road_left_{distance}m"] = float(route[distance // 4 - 1, 1]) / ROAD_SCALE_M
     return np.array([facts[name] for name in FACTS], np.float32)
 
 
-def lead_agent(labelled: LabelledScene) -> Agent | None:
-    """The nearest agent standing in the way ahead (the route, or straight on without one)."""
-    way = labelled.scene.route
-    if way is None:
-        way = np.stack([np.arange(4.0, 84.0, 4.0), np.zeros(20)], axis=1).astype(np.float32)
-    leads = [
-        agent
-        for agent in labelled.agents
-        if np.isfinite(agent.present[0])
-        and 0 < agent.present[0] < FACT_RANGE_M
-        and np.linalg.norm(way - agent.present[:2], axis=1).min()
-        < np.hypot(PATH_HALF_WIDTH_M, 2.0)  # points lie 4 m apart
-    ]
-    return min(leads, key=_gap, default=None)
+def mirrored(facts: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Facts [..., len(FACTS)] of a scene whose left and right are swapped."""
+    swapped: npt.NDArray[np.float32] = np.where(_SIGNED, -facts[..., _MIRROR], facts[..., _MIRROR])
+    return swapped
 
 
-def _gap(agent: Agent) -> float:
-    return float(agent.present[0]) - (EGO_LENGTH_M + agent.length_m) / 2
+def _states(track: Track) -> tuple[float, float, float]:
+    standing = abs(track.speed_ms) < _STANDING_MS
+    return float(standing), float("brake" in track.lights), float(_is_fixed(track))
 
 
-def _speed(agent: Agent) -> float:
-    """Speed over the last 0.5 s, in the ego frame of now, m/s; along x."""
-    before = agent.poses[HISTORY_STEPS - 6]
-    if not np.isfinite(before[0]):
-        return float("nan")
-    return float(agent.present[0] - before[0]) / (5 * STEP_S)
+def _is_fixed(track: Track) -> bool:
+    """Whether it has to be driven round: cones, barriers, vehicles with hazard lights."""
+    return track.kind in ("cone", "barrier") or {"left", "right"} <= track.lights
 
 
-def _nearest_ahead(labelled: LabelledScene) -> list[Agent]:
-    ahead = [
-        agent
-        for agent in labelled.agents
-        if np.isfinite(agent.present[0])
-        and 1.0 < agent.present[0] < FACT_RANGE_M
-        and abs(agent.present[1]) < 1.7 * agent.present[0]  # within the wide camera's 120 degrees
-    ]
-    return sorted(ahead, key=lambda agent: float(np.hypot(*agent.present[:2])))[:NEAREST]
+def _named(prefix: str, fields: Sequence[str], values: Sequence[float]) -> dict[str, float]:
+    return {f"{prefix}_{field}": value for field, value in zip(fields, values, strict=True)}

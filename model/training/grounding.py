@@ -1,14 +1,16 @@
-"""Grounding: the vision tower learns what the simulator knows about a picture.
+"""Grounding: the vision tower and the resampler learn what the simulator knows about a scene.
 
-The latest pair of frames of each camera goes through the tower; small heads, thrown away afterwards, predict
-for every vision token the classes and ranges of the cells it covers (dense, so one picture teaches
-thousands of things), and for the whole scene the facts of `model.training.facts`.
+All frames of each camera go through the tower; small heads predict for every vision token what the cells
+it covers show, how far that is and how it moves (dense, so one picture teaches thousands of things). From
+what the resampler gathers, other heads tell the facts of `model.training.facts`, by which perception is
+judged, and the expert's trajectory, so that what a plan needs is gathered. The heads are kept beside the
+checkpoint: `looktwice evaluate --perception` reads with them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -18,113 +20,287 @@ from torch.utils.data import Dataset
 
 from model.driving.images import decode_image
 from model.driving.scene import SEMANTIC_CLASSES
+from model.driving.trajectory import STEP_S
+from model.network.codec import TrajectoryCodec
 from model.network.inputs import InputBuilder
 from model.network.patches import patchify, resize
+from model.network.trajectory_head import TrajectoryHead
 from model.network.vla import LookTwiceVla
+from model.training.dense import FIRST_AGENT_CLASS, UNLABELLED
 from model.training.examples import Examples
-from model.training.facts import FACTS
-from model.training.probe import fact_loss
+from model.training.facts import (
+    FACTS,
+    IS_YES_OR_NO,
+    LANES,
+    LEAD_FIELDS,
+    OBSTACLE_FIELDS,
+    RANKS,
+    ROAD_DISTANCES_M,
+    WALKER_FIELDS,
+    WALKERS,
+    mirrored,
+)
 
 _CLASSES: Final = len(SEMANTIC_CLASSES)
 _CLASS_WEIGHTS: Final = (0.3, 0.5, 0.5, 3.0, 6.0, 4.0)
 """Sky and road fill most pictures; what matters is small."""
-_OBJECT_RANGE_WEIGHT: Final = 5.0
+_AGENT_RANGE_WEIGHT: Final = 5.0
+_MOTION_WEIGHT: Final = 2.0
+_FACT_WEIGHT: Final = 6.0
+"""Brings the mean over facts level with the other losses."""
+_FIELD_WEIGHTS: Final = {"speed": 4.0, "gap_log_m": 2.0}
+_SECOND_RANK_WEIGHT: Final = 0.5
+_NEAR: Final = 0.05
+"""Errors below count by their square, above by their size."""
+_PLAN_WEIGHT: Final = 0.3
+_ROUTE_SHARE: Final = 0.75
+_MIRROR_SHARE: Final = 0.5
+_MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
+"""Of poses (x, y, z, heading)."""
+
+QUERY_FIELDS: Final = (
+    *((LEAD_FIELDS,) * (len(LANES) * RANKS)),
+    *((OBSTACLE_FIELDS,) * len(LANES)),
+    *((WALKER_FIELDS,) * WALKERS),
+    tuple(f"road_left_{distance}m" for distance in ROAD_DISTANCES_M),
+)
+"""What each of the first queries tells, in the order of `FACTS`; the others are free."""
 
 
-@dataclass(frozen=True, eq=False)
-class GroundingSample:
-    """One scene's latest pictures and what they show."""
+class GroundingSample(NamedTuple):
+    """One scene: what is seen, and what is known. Shapes as in `Examples`, for one example."""
 
-    patches: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
-    classes: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
-    range_log: np.ndarray[tuple[int, ...], np.dtype[np.float16]]
-    facts: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+    patches: np.ndarray[Any, np.dtype[np.uint8]]
+    classes: np.ndarray[Any, np.dtype[np.uint8]]
+    range_log: np.ndarray[Any, np.dtype[np.float32]]
+    motion: np.ndarray[Any, np.dtype[np.float32]]
+    facts: np.ndarray[Any, np.dtype[np.float32]]
+    history: np.ndarray[Any, np.dtype[np.float32]]
+    route: np.ndarray[Any, np.dtype[np.float32]]
+    has_route: np.ndarray[Any, np.dtype[np.bool_]]
+    futures: np.ndarray[Any, np.dtype[np.float32]]
+
+
+@dataclass(frozen=True)
+class Look:
+    """Which example to look at, and how.
+
+    Attributes:
+        index: of the example.
+        mirror: left and right are swapped.
+        route: the route is given, where the example has one.
+    """
+
+    index: int
+    mirror: bool = False
+    route: bool = True
 
 
 class GroundingDataset(Dataset[GroundingSample]):
-    """The latest pair of frames of every example."""
+    """All examples, each time mirrored or not and with or without its route, by chance."""
 
-    def __init__(self, examples: Examples, inputs: InputBuilder) -> None:
+    def __init__(self, examples: Examples, inputs: InputBuilder, seed: int = 0) -> None:
         self._examples, self._inputs = examples, inputs
+        self._random = np.random.default_rng(seed)
 
     def __len__(self) -> int:
         return len(self._examples)
 
     def __getitem__(self, index: int) -> GroundingSample:
-        examples, settings = self._examples, self._inputs.settings
-        cameras, frames = examples.picture_spans.shape[1:3]
-        pictures = [
-            resize(decode_image(examples.picture(index, camera, frame)), settings)
-            for camera in range(cameras)
-            for frame in range(frames - settings.temporal_patch_size, frames)
-        ]
-        return GroundingSample(
-            patchify(np.stack(pictures), settings),
+        chance = self._random.random(2)
+        return self.look(Look(index, bool(chance[0] < _MIRROR_SHARE), bool(chance[1] < _ROUTE_SHARE)))
+
+    def look(self, look: Look) -> GroundingSample:
+        """One example as it is asked for."""
+        examples, index = self._examples, look.index
+        has_route = look.route and bool(np.isfinite(examples.route[index]).all())
+        frames = self._frames(index)
+        sample = GroundingSample(
+            frames,
             examples.dense_classes[index],
-            examples.dense_range_log[index],
+            examples.dense_range_log[index].astype(np.float32),
+            examples.dense_motion[index].astype(np.float32),
             examples.facts[index],
+            examples.history[index],
+            np.nan_to_num(examples.route[index]),
+            np.array(has_route),
+            examples.future[index],
         )
+        if look.mirror:
+            sample = _mirror(sample)
+        return sample._replace(patches=patchify(sample.patches, self._inputs.settings))
+
+    def _frames(self, index: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
+        """uint8 [cameras x 4, h, w, 3]."""
+        cameras, frames = self._examples.picture_spans.shape[1:3]
+        return np.stack(
+            [
+                resize(decode_image(self._examples.picture(index, camera, frame)), self._inputs.settings)
+                for camera in range(cameras)
+                for frame in range(frames)
+            ]
+        )
+
+
+def _mirror(sample: GroundingSample) -> GroundingSample:
+    motion = sample.motion[..., ::-1].copy()
+    motion[:, 1] *= -1
+    return sample._replace(
+        patches=np.ascontiguousarray(sample.patches[:, :, ::-1]),
+        classes=np.ascontiguousarray(sample.classes[..., ::-1]),
+        range_log=np.ascontiguousarray(sample.range_log[..., ::-1]),
+        motion=motion,
+        facts=mirrored(sample.facts),
+        history=sample.history * _MIRROR,
+        route=sample.route * _MIRROR[:2],
+        futures=sample.futures * _MIRROR,
+    )
 
 
 def collate_grounding(samples: list[GroundingSample]) -> dict[str, Tensor]:
-    """Stack grounding samples."""
-    return {
-        "patches": torch.from_numpy(np.concatenate([sample.patches for sample in samples])),
-        "classes": torch.from_numpy(np.stack([sample.classes for sample in samples])),
-        "range_log": torch.from_numpy(np.stack([sample.range_log for sample in samples]).astype(np.float32)),
-        "facts": torch.from_numpy(np.stack([sample.facts for sample in samples])),
+    """Stack grounding samples; patches of all lie one after the other."""
+    columns = dict(zip(GroundingSample._fields, zip(*samples, strict=True), strict=True))
+    patches = torch.from_numpy(np.concatenate(columns.pop("patches")))
+    return {"patches": patches} | {
+        name: torch.from_numpy(np.stack(values)) for name, values in columns.items()
     }
 
 
-class GroundingLearner(nn.Module):
-    """The vision tower with its heads; outputs the loss and its parts.
+class PerceptionHeads(nn.Module):
+    """What is read from the gathered tokens of a scene: facts, and a trajectory.
 
     Args:
-        vla: its tower is trained in place.
+        hidden: width of the tokens.
+        scene_tokens: how many there are; at least `len(QUERY_FIELDS)`.
+        codec: whose space trajectories are told in.
+    """
+
+    def __init__(self, hidden: int, scene_tokens: int, codec: TrajectoryCodec) -> None:
+        super().__init__()
+        if scene_tokens < len(QUERY_FIELDS):
+            raise ValueError(
+                f"grounding needs a resampler of at least {len(QUERY_FIELDS)} tokens, got {scene_tokens}"
+            )
+        self.facts = nn.ModuleList(nn.Linear(hidden, len(fields)) for fields in QUERY_FIELDS)
+        self.plan = nn.Sequential(
+            nn.Flatten(), nn.Dropout(0.3), nn.Linear(scene_tokens * hidden, 256), nn.SiLU()
+        )
+        self.trajectory = TrajectoryHead(256, codec)
+
+    def read(self, gathered: Tensor) -> Tensor:
+        """Facts [b, len(FACTS)], as logits or values, from gathered tokens [b, scene_tokens, hidden]."""
+        return torch.cat([head(gathered[:, place]) for place, head in enumerate(self.facts)], dim=1).float()
+
+
+class GroundingLearner(nn.Module):
+    """Tower and resampler with their heads; outputs the loss and its parts.
+
+    Args:
+        vla: its tower and its resampler are trained in place.
+        codec: of the checkpoint.
         dense_shape: rows and columns of the dense targets; whole multiples of the vision tokens' grid.
     """
 
-    def __init__(self, vla: LookTwiceVla, dense_shape: tuple[int, int]) -> None:
+    def __init__(self, vla: LookTwiceVla, codec: TrajectoryCodec, dense_shape: tuple[int, int]) -> None:
         super().__init__()
-        self.vla = vla
-        merge = vla.settings.spatial_merge_size
-        self._rows, self._columns = (side // merge for side in vla.settings.grid[1:])
+        settings = vla.settings
+        if vla.resampler is None:
+            raise ValueError("grounding needs a checkpoint with a resampler (scene_tokens > 0)")
+        # Registered by their own names: the decoder is not trained here.
+        self.visual, self.resampler = vla.model.visual, vla.resampler
+        self._vla: list[LookTwiceVla] = [vla]
+        slices, rows, columns = settings.grid
+        merge = settings.spatial_merge_size
+        self._rows, self._columns, self._slices = rows // merge, columns // merge, slices
+        if dense_shape[0] % self._rows or dense_shape[1] % self._columns:
+            raise ValueError(
+                f"{self._rows} x {self._columns} vision tokens do not divide {dense_shape} dense cells"
+            )
         self._cell = (dense_shape[0] // self._rows, dense_shape[1] // self._columns)
         text: Any = vla.config.text_config
         hidden = text.hidden_size
-        cells = self._cell[0] * self._cell[1]
-        self.dense_head = nn.Linear(hidden, cells * (_CLASSES + 1))
-        # One head over everything seen, with places kept: where something stands is what counts.
-        places = len(vla.settings.cameras) * self._rows * self._columns
-        self.squeeze = nn.Linear(hidden, 24)
-        self.fact_head = nn.Sequential(nn.Linear(places * 24, 256), nn.SiLU(), nn.Linear(256, len(FACTS)))
+        self.dense_head = nn.Linear(hidden * slices, self._cell[0] * self._cell[1] * (_CLASSES + 3))
+        self.heads = PerceptionHeads(hidden, settings.scene_tokens, codec)
+        self.register_buffer("fact_weights", torch.tensor([_weight(name) for name in FACTS]))
+
+    fact_weights: Tensor
+
+    def gather(
+        self, patches: Tensor, history: Tensor, route: Tensor, has_route: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Vision tokens [b, v, hidden] and gathered tokens [b, scene_tokens, hidden] of scenes."""
+        vla = self._vla[0]
+        settings = vla.settings
+        clips = len(history) * len(settings.cameras)
+        tokens = vla.vision(patches, torch.tensor([settings.grid] * clips))
+        tokens = tokens.view(len(history), settings.vision_tokens, -1)
+        return tokens, self.resampler(tokens, history, route, has_route)
 
     def forward(
-        self, patches: Tensor, classes: Tensor, range_log: Tensor, facts: Tensor
+        self,
+        patches: Tensor,
+        classes: Tensor,
+        range_log: Tensor,
+        motion: Tensor,
+        facts: Tensor,
+        history: Tensor,
+        route: Tensor,
+        has_route: Tensor,
+        futures: Tensor,
     ) -> dict[str, Tensor]:
         """The loss of a batch from `collate_grounding`, and its parts without gradients."""
-        batch, cameras = classes.shape[:2]
-        grid = torch.tensor([[1, *self.vla.settings.grid[1:]]] * (batch * cameras))
-        tokens = self.vla.vision(patches, grid)
-        dense = self.dense_head(tokens).float()
-        dense = dense.view(batch, cameras, self._rows, self._columns, *self._cell, _CLASSES + 1)
-        dense = dense.permute(0, 1, 2, 4, 3, 5, 6).reshape(*classes.shape, _CLASSES + 1)
+        tokens, gathered = self.gather(patches, history, route, has_route)
+        dense = self._dense(tokens, classes.shape)
         labels = classes.long()
         class_loss = F.cross_entropy(
-            dense[..., :_CLASSES].flatten(0, -2), labels.flatten(), weight=dense.new_tensor(_CLASS_WEIGHTS)
+            dense[..., :_CLASSES].flatten(0, -2),
+            labels.flatten(),
+            weight=dense.new_tensor(_CLASS_WEIGHTS),
+            ignore_index=UNLABELLED,
         )
-        shown = range_log > 0
-        weight = torch.where(labels >= 3, _OBJECT_RANGE_WEIGHT, 1.0)[shown]
-        error = (dense[..., _CLASSES] - range_log).abs()[shown]
-        range_loss = (error * weight).sum() / weight.sum().clamp_min(1)
-        of_facts = fact_loss(self.fact_head(self.squeeze(tokens).reshape(batch, -1)), facts)
-        with torch.no_grad():
-            objects = labels >= 3
-            hit = (dense[..., :_CLASSES].argmax(-1) == labels)[objects].float().mean()
+        agents = (labels >= FIRST_AGENT_CLASS) & (labels != UNLABELLED)
+        weights = torch.where(agents, _AGENT_RANGE_WEIGHT, 1.0) * (range_log > 0)
+        range_error = (dense[..., _CLASSES] - range_log).abs()
+        range_loss = (range_error * weights).sum() / weights.sum().clamp_min(1)
+        moved = (dense[..., _CLASSES + 1 :] - motion.permute(0, 1, 3, 4, 2)).abs().sum(dim=-1)
+        motion_loss = (moved * agents).sum() / agents.sum().clamp_min(1)
+        of_facts = fact_loss(self.heads.read(gathered), facts, self.fact_weights)
+        speeds = -history[:, -4, 0] / (3 * STEP_S)
+        guesses = self.heads.trajectory(self.heads.plan(gathered).float())
+        planned = self.heads.trajectory.loss(guesses, speeds, futures)
+        loss = class_loss + range_loss + _MOTION_WEIGHT * motion_loss + of_facts
         return {
-            "loss": class_loss + range_loss + of_facts,
+            "loss": loss + _PLAN_WEIGHT * planned["loss"],
             "class_loss": class_loss.detach(),
-            "range_error_log": error.mean().detach(),
+            "range_error_log": range_loss.detach(),
+            "motion_error": motion_loss.detach(),
             "fact_loss": of_facts.detach(),
-            "object_recall": hit.nan_to_num(0.0),
+            "plan_ade_m": planned["ade_m"],
         }
+
+    def _dense(self, tokens: Tensor, shape: torch.Size) -> Tensor:
+        """What every cell shows, [b, cameras, rows, columns, classes + 3], from tokens [b, v, hidden]."""
+        batch, cameras = shape[:2]
+        grid = tokens.view(batch, cameras, self._slices, self._rows, self._columns, -1)
+        # The time slices of one place side by side.
+        beside = grid.permute(0, 1, 3, 4, 2, 5).flatten(4)
+        dense = self.dense_head(beside).float().unflatten(-1, (*self._cell, _CLASSES + 3))
+        return dense.permute(0, 1, 2, 4, 3, 5, 6).reshape(*shape, _CLASSES + 3)
+
+
+def _weight(name: str) -> float:
+    weight = next((w for field, w in _FIELD_WEIGHTS.items() if name.endswith(field)), 1.0)
+    return weight * (_SECOND_RANK_WEIGHT if "_1_" in name else 1.0)
+
+
+def fact_loss(predicted: Tensor, facts: Tensor, weights: Tensor) -> Tensor:
+    """How far predictions [b, facts] (logits for what is or is not so) lie from facts; NaN counts nothing."""
+    known = torch.isfinite(facts)
+    targets = torch.where(known, facts, 0.0)
+    yes_or_no = torch.from_numpy(IS_YES_OR_NO).to(facts.device)
+    losses = torch.where(
+        yes_or_no,
+        F.binary_cross_entropy_with_logits(predicted, targets.clamp(0, 1), reduction="none"),
+        2.0 * F.smooth_l1_loss(predicted, targets, reduction="none", beta=_NEAR),
+    )
+    return (losses * known * weights).sum() / (known * weights).sum().clamp_min(1) * _FACT_WEIGHT

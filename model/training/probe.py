@@ -15,10 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model.training.facts import FACTS
+from model.training.grounding import fact_loss
 
-_PRESENT: Final = tuple(index for index, name in enumerate(FACTS) if name.endswith("present"))
-_FACT_WEIGHT: Final = 4.0
-"""Brings the mean over facts, most of them logarithms with small errors, level with the other losses."""
 _NEAR: Final = 0.1
 """Errors below count by their square, above by their size."""
 
@@ -48,25 +46,10 @@ class SceneProbe(nn.Module):
             futures: [batch, dimensions]; the expert's future in the codec's space, of mean square 1.
         """
         named, drawn = self.head(self.norm(states)).split([facts.shape[1], futures.shape[1]], dim=1)
-        of_facts = fact_loss(named, facts)
+        of_facts = fact_loss(named.float(), facts, torch.ones(facts.shape[1], device=facts.device))
         of_futures = F.smooth_l1_loss(drawn.float(), futures, reduction="none", beta=_NEAR).sum(1).mean()
         return {
             "loss": of_facts + of_futures,
             "probe_fact_loss": of_facts.detach(),
             "probe_future_loss": of_futures.detach(),
         }
-
-
-def fact_loss(predicted: Tensor, facts: Tensor) -> Tensor:
-    """How far predictions [batch, facts] (logits for what is or is not there) lie from the facts."""
-    predicted = predicted.float()
-    known = torch.isfinite(facts)
-    targets = torch.where(known, facts, 0.0)
-    present = torch.zeros_like(known)
-    present[:, _PRESENT] = True
-    losses = torch.where(
-        present,
-        F.binary_cross_entropy_with_logits(predicted, targets.clamp(0, 1), reduction="none"),
-        F.smooth_l1_loss(predicted, targets, reduction="none", beta=_NEAR),
-    )
-    return (losses * known).sum() / known.sum().clamp_min(1) * _FACT_WEIGHT

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,10 @@ from model.network.attention import MATMUL_ATTENTION
 from model.network.checkpoint import Loaded, create_nano, load, save
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus
-from model.network.settings import VlaSettings
+from model.network.settings import NANO_SETTINGS
 from model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from model.training.batches import ResponseDataset, TaskSampler, collate
+from model.training.dense import DENSE_SHAPE
 from model.training.examples import Examples, load_examples
 from model.training.grounding import GroundingDataset, GroundingLearner, collate_grounding
 from model.training.learner import ResponseLearner
@@ -60,9 +61,10 @@ def create(
     scenes: Path, cache: Path, target: Path, *, codec_size: int = 512, seed: int = 0
 ) -> dict[str, float]:
     """Write an untrained nano checkpoint whose codec is fitted to ``scenes``; returns the codec's error."""
-    examples = load_examples(scenes, cache, VlaSettings().cameras)
+    examples = load_examples(scenes, cache, NANO_SETTINGS.cameras)
     codec = TrajectoryCodec.fit(examples.history, examples.future, size=codec_size, seed=seed)
-    create_nano(target, codec, Vocabulary(build_nano_tokenizer(nano_corpus(), codec_size)), seed=seed)
+    vocabulary = Vocabulary(build_nano_tokenizer(nano_corpus(), codec_size))
+    create_nano(target, codec, vocabulary, seed, replace(NANO_SETTINGS, codec_size=codec_size))
     return codec.reconstruction_error(examples.history, examples.future)
 
 
@@ -162,9 +164,9 @@ def _prepare(
     recipe: Recipe, loaded: Loaded, examples: Examples, on_examples: OnExamples | None, compiled: bool
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
     if recipe.goal == "ground":
-        shape = examples.dense_classes.shape[2:4]
-        grounding = GroundingLearner(loaded.model, (shape[0], shape[1]))
-        return grounding, GroundingDataset(examples, loaded.inputs), None, collate_grounding
+        grounding = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE)
+        looked_at = GroundingDataset(examples, loaded.inputs, recipe.seed)
+        return grounding, looked_at, None, collate_grounding
     dataset = ResponseDataset(
         examples,
         loaded.codec,

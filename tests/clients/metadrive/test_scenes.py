@@ -11,12 +11,12 @@ import pytest
 import shapely
 from PIL import Image
 
-from clients.cameras import FRONT_CAMERAS, SURROUND_CAMERAS, CameraSpec
 from clients.metadrive.episode import run_episode
 from clients.metadrive.maps import make_map
 from clients.metadrive.rig import Rig
 from clients.metadrive.windows import labelled_scenes
 from clients.metadrive.y_flip import heading_from_metadrive, points_from_metadrive
+from model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS, CameraSpec
 from model.driving.metrics import collides, leaves_road
 from model.driving.scene import CAMERAS, EGO_LENGTH_M, SEMANTIC_CLASSES, LabelledScene
 from tests.clients.metadrive.conftest import DURATION_S, SEED, Filmed

@@ -36,7 +36,7 @@ def test_on_an_arc_places_follow_the_curve(along: float, left: float, radius: fl
     point = centre + (radius - left) * np.array([np.sin(angle), -np.cos(angle)])
     frame = RouteFrame(arc(radius))
     found = frame.places(point[None])[0]
-    # The chord of 4 m stands off the arc by up to 5 cm, its ends meet at an angle, and before it all is straight.
+    # The chord of 4 m stands off the arc by up to 5 cm, and its ends meet at an angle.
     assert found[1] == pytest.approx(left, abs=0.15)
     assert found[0] == pytest.approx(along, abs=0.5)
     assert frame.headings(point[None])[0] == pytest.approx(angle, abs=6.5 / abs(radius))

@@ -99,7 +99,7 @@ def test_missing_tokens_are_named() -> None:
     bare.add_tokens(list(words.OUR_TOKENS))
     with pytest.raises(VocabularyError, match="codes"):
         Vocabulary(bare)
-    assert expand_tokenizer(bare, 4) == 24
+    assert expand_tokenizer(bare, 4) == 24 + len(words.TRACK_TOKENS)
     assert Vocabulary(bare).codec_size == 4
     with pytest.raises(VocabularyError, match="no token"):
         Vocabulary(bare).id_of("<|nothing|>")

@@ -78,3 +78,5 @@ SURROUND_CAMERAS: Final = (
     CameraSpec("back_left", 70.0, 0.35, heading_degrees=110.0, left_m=0.5, forward_m=0.0),
     CameraSpec("back_right", 70.0, 0.35, heading_degrees=-110.0, left_m=-0.5, forward_m=0.0),
 )
+CAMERA_SPECS: Final = {spec.name: spec for spec in (*FRONT_CAMERAS, *SURROUND_CAMERAS)}
+"""All of them by name."""

@@ -1,0 +1,93 @@
+"""Trajectories by regression: one best guess and a few modes with scores, in the codec's space."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from model.driving.trajectory import FUTURE_STEPS, STEP_S
+from model.network.codec import HEADING_WEIGHT_M, TrajectoryCodec
+
+MODES: Final = 6
+_HEADING_WEIGHT: Final = 1.5
+"""Metres that a radian of mean error in heading counts in the loss."""
+_ALL_MODES_WEIGHT: Final = 0.03
+"""Of the modes that are not the nearest: enough to keep them on the road."""
+
+
+class Guesses(NamedTuple):
+    """What a head tells, in the codec's space.
+
+    Attributes:
+        best: [b, d].
+        modes: [b, modes, d].
+        scores: [b, modes], logits.
+    """
+
+    best: Tensor
+    modes: Tensor
+    scores: Tensor
+
+
+class TrajectoryHead(nn.Module):
+    """Linear maps from a state to trajectories.
+
+    Args:
+        width: of the states.
+        codec: whose space is used: the curves are smooth and begin where the ego is.
+    """
+
+    axes: Tensor
+    mean: Tensor
+    spread: Tensor
+
+    def __init__(self, width: int, codec: TrajectoryCodec) -> None:
+        super().__init__()
+        axes = torch.from_numpy(codec.axes.copy())
+        self.register_buffer("axes", axes)
+        self.register_buffer("mean", torch.from_numpy(codec.mean.copy()))
+        # The first codebook spreads as trajectories do.
+        self.register_buffer("spread", torch.from_numpy(codec.books[0].std(axis=0) + 0.01))
+        self.best = nn.Linear(width, len(axes))
+        self.modes = nn.Linear(width, MODES * len(axes))
+        self.scores = nn.Linear(width, MODES)
+
+    def forward(self, states: Tensor) -> Guesses:
+        """Guesses for states [b, width]."""
+        modes = self.modes(states).unflatten(-1, (MODES, -1))
+        return Guesses(self.best(states) * self.spread, modes * self.spread, self.scores(states))
+
+    def curves(self, vectors: Tensor, speeds_ms: Tensor) -> Tensor:
+        """x, y and heading [..., 64, 3] of vectors [..., d], for present speeds [...] or [b]."""
+        curves = (vectors.float() @ self.axes + self.mean).unflatten(-1, (3, FUTURE_STEPS))
+        times = STEP_S * torch.arange(1, FUTURE_STEPS + 1, device=vectors.device)
+        speeds = speeds_ms.reshape(speeds_ms.shape + (1,) * (curves.dim() - 1 - speeds_ms.dim()))
+        return torch.stack(
+            [curves[..., 0, :] + speeds * times, curves[..., 1, :], curves[..., 2, :] / HEADING_WEIGHT_M],
+            dim=-1,
+        )
+
+    def loss(self, guesses: Guesses, speeds_ms: Tensor, futures: Tensor) -> dict[str, Tensor]:
+        """The loss of guesses against futures [b, 64, 4], and the best guess's ADE in metres.
+
+        The best guess is drawn to the expert's trajectory in metres; of the modes only the nearest one is.
+        """
+        poses = futures[..., [0, 1, 3]]
+        ade, turned = _apart(self.curves(guesses.best, speeds_ms), poses)
+        modes, modes_turned = _apart(self.curves(guesses.modes, speeds_ms), poses[:, None])
+        nearest = modes.detach().argmin(dim=1)
+        rows = torch.arange(len(nearest), device=nearest.device)
+        nearest_loss = (modes + _HEADING_WEIGHT * modes_turned)[rows, nearest]
+        others = _ALL_MODES_WEIGHT * modes.mean(dim=1)
+        scored = F.cross_entropy(guesses.scores.float(), nearest)
+        loss = (ade + _HEADING_WEIGHT * turned + nearest_loss + others).mean() + scored
+        return {"loss": loss, "ade_m": ade.detach().mean()}
+
+
+def _apart(curves: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean distance in metres and mean difference of heading in radians, over the last two axes."""
+    distance = (curves[..., :2] - poses[..., :2]).norm(dim=-1).mean(dim=-1)
+    return distance, (curves[..., 2] - poses[..., 2]).abs().mean(dim=-1)
