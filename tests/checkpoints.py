@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from model.driving.scene import CLIP_FRAMES, FRONT_TELE, FRONT_WIDE, Clip, Scene
 from model.network.checkpoint import save, write_code_embeddings
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus
+from model.network.settings import VlaSettings
 from model.network.vla import LookTwiceVla, nano_config
 from model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from tests.model.network.motions import made_up_motions
@@ -20,18 +22,19 @@ from tests.model.network.motions import made_up_motions
 CODEC_SIZE = 16
 
 
-def write_untrained(folder: Path, *, narrow: bool = False) -> Path:
+def write_untrained(folder: Path, *, narrow: bool = False, settings: VlaSettings = VlaSettings()) -> Path:
     """Write the checkpoint and return its folder.
 
     Args:
         folder: to write to.
         narrow: a quarter of the width, and prone to end tracks and texts, for tests of many thousand
             responses.
+        settings: cameras, pictures, and how they reach the decoder.
     """
     histories, futures = made_up_motions(400)
     codec = TrajectoryCodec.fit(histories, futures, size=CODEC_SIZE)
     vocabulary = Vocabulary(build_nano_tokenizer(nano_corpus(), CODEC_SIZE))
-    config = nano_config(vocabulary)
+    config = nano_config(vocabulary, replace(settings, codec_size=CODEC_SIZE))
     config.text_config.num_hidden_layers = 2
     config.text_config.layer_types = config.text_config.layer_types[:2]
     config.vision_config.depth = 1

@@ -15,3 +15,13 @@ def untrained_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tests.checkpoints import write_untrained
 
     return write_untrained(tmp_path_factory.mktemp("checkpoint") / "untrained")
+
+
+@pytest.fixture(scope="session")
+def resampling_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As `untrained_checkpoint`, but with a resampler and tracks, as the shipped model's recipe makes it."""
+    from model.network.settings import NANO_SETTINGS
+    from tests.checkpoints import write_untrained
+
+    folder = tmp_path_factory.mktemp("checkpoint") / "resampling"
+    return write_untrained(folder, settings=NANO_SETTINGS)

@@ -16,6 +16,7 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
+from model.driving.facts import scene_facts
 from model.driving.hashing import hash_of
 from model.driving.labeller import expert_plan
 from model.driving.plan import Plan, plan_from_bins
@@ -25,7 +26,6 @@ from model.driving.tracks import tracks_of
 from model.driving.trajectory import FloatArray
 from model.network.track_features import track_features
 from model.training.dense import coarse, no_target, relative_motion
-from model.training.facts import scene_facts
 
 CACHE_VERSION: Final = 3
 DENSE_FAR_M: Final = 200.0

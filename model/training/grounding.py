@@ -2,7 +2,7 @@
 
 All frames of each camera go through the tower; small heads predict for every vision token what the cells
 it covers show, how far that is and how it moves (dense, so one picture teaches thousands of things). From
-what the resampler gathers, other heads tell the facts of `model.training.facts`, by which perception is
+what the resampler gathers, other heads tell the facts of `model.driving.facts`, by which perception is
 judged, and the expert's trajectory, so that what a plan needs is gathered. The heads are kept beside the
 checkpoint: `looktwice evaluate --perception` reads with them.
 """
@@ -18,28 +18,21 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
+from model.driving.facts import (
+    FACTS,
+    IS_YES_OR_NO,
+    mirrored,
+)
 from model.driving.images import decode_image
 from model.driving.scene import SEMANTIC_CLASSES
 from model.driving.trajectory import STEP_S
 from model.network.codec import TrajectoryCodec
 from model.network.inputs import InputBuilder
 from model.network.patches import patchify, resize
-from model.network.trajectory_head import TrajectoryHead
+from model.network.perception import PerceptionHeads
 from model.network.vla import LookTwiceVla
 from model.training.dense import FIRST_AGENT_CLASS, UNLABELLED
 from model.training.examples import Examples
-from model.training.facts import (
-    FACTS,
-    IS_YES_OR_NO,
-    LANES,
-    LEAD_FIELDS,
-    OBSTACLE_FIELDS,
-    RANKS,
-    ROAD_DISTANCES_M,
-    WALKER_FIELDS,
-    WALKERS,
-    mirrored,
-)
 
 _CLASSES: Final = len(SEMANTIC_CLASSES)
 _CLASS_WEIGHTS: Final = (0.3, 0.5, 0.5, 3.0, 6.0, 4.0)
@@ -57,14 +50,6 @@ _ROUTE_SHARE: Final = 0.75
 _MIRROR_SHARE: Final = 0.5
 _MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
 """Of poses (x, y, z, heading)."""
-
-QUERY_FIELDS: Final = (
-    *((LEAD_FIELDS,) * (len(LANES) * RANKS)),
-    *((OBSTACLE_FIELDS,) * len(LANES)),
-    *((WALKER_FIELDS,) * WALKERS),
-    tuple(f"road_left_{distance}m" for distance in ROAD_DISTANCES_M),
-)
-"""What each of the first queries tells, in the order of `FACTS`; the others are free."""
 
 
 class GroundingSample(NamedTuple):
@@ -164,32 +149,6 @@ def collate_grounding(samples: list[GroundingSample]) -> dict[str, Tensor]:
     return {"patches": patches} | {
         name: torch.from_numpy(np.stack(values)) for name, values in columns.items()
     }
-
-
-class PerceptionHeads(nn.Module):
-    """What is read from the gathered tokens of a scene: facts, and a trajectory.
-
-    Args:
-        hidden: width of the tokens.
-        scene_tokens: how many there are; at least `len(QUERY_FIELDS)`.
-        codec: whose space trajectories are told in.
-    """
-
-    def __init__(self, hidden: int, scene_tokens: int, codec: TrajectoryCodec) -> None:
-        super().__init__()
-        if scene_tokens < len(QUERY_FIELDS):
-            raise ValueError(
-                f"grounding needs a resampler of at least {len(QUERY_FIELDS)} tokens, got {scene_tokens}"
-            )
-        self.facts = nn.ModuleList(nn.Linear(hidden, len(fields)) for fields in QUERY_FIELDS)
-        self.plan = nn.Sequential(
-            nn.Flatten(), nn.Dropout(0.3), nn.Linear(scene_tokens * hidden, 256), nn.SiLU()
-        )
-        self.trajectory = TrajectoryHead(256, codec)
-
-    def read(self, gathered: Tensor) -> Tensor:
-        """Facts [b, len(FACTS)], as logits or values, from gathered tokens [b, scene_tokens, hidden]."""
-        return torch.cat([head(gathered[:, place]) for place, head in enumerate(self.facts)], dim=1).float()
 
 
 class GroundingLearner(nn.Module):

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.training.facts import FACTS
+from model.driving.facts import FACTS
 from model.training.grounding import fact_loss
 
 _NEAR: Final = 0.1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -21,7 +22,9 @@ from model.network.attention import MATMUL_ATTENTION
 from model.network.checkpoint import Loaded, create_nano, load, save
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus
+from model.network.perception import PERCEPTION_FILE
 from model.network.settings import NANO_SETTINGS
+from model.network.vla import LookTwiceVla
 from model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from model.training.batches import ResponseDataset, TaskSampler, collate
 from model.training.dense import DENSE_SHAPE
@@ -105,7 +108,8 @@ def run(
     stages = list(loaded.card.details.get("stages", []))
     if vision_source is not None:
         vision = load(vision_source)
-        loaded.model.model.visual.load_state_dict(vision.model.model.visual.state_dict())
+        for mine, theirs in zip(vision_parts(loaded.model), vision_parts(vision.model), strict=True):
+            mine.load_state_dict(theirs.state_dict())
         stages += [stage for stage in vision.card.details.get("stages", []) if stage not in stages]
     loaded.model.train()
     loaded.model.set_attn_implementation(MATMUL_ATTENTION)
@@ -144,6 +148,20 @@ def run(
         dtype=torch.bfloat16,
         details={"stages": [*stages, _about(recipe, examples, on_examples)]},
     )
+    _save_heads(recipe, learner, source if vision_source is None else vision_source, target)
+
+
+def _save_heads(recipe: Recipe, learner: nn.Module, source: Path, target: Path) -> None:
+    """Keep the heads that read the pictures, as long as tower and resampler are those they belong to."""
+    if isinstance(learner, GroundingLearner):
+        learner.heads.save(target)
+    elif (source / PERCEPTION_FILE).exists() and (recipe.vision_rate == 0 or not recipe.pictures):
+        shutil.copyfile(source / PERCEPTION_FILE, target / PERCEPTION_FILE)
+
+
+def vision_parts(vla: LookTwiceVla) -> list[nn.Module]:
+    """What stands between pictures and the decoder: the tower and, where there is one, the resampler."""
+    return [vla.model.visual, *([vla.resampler] if vla.resampler is not None else [])]
 
 
 def last_whole_state(folder: Path) -> str | None:
@@ -188,7 +206,8 @@ def _prepare(
         reflected=np.zeros(0, np.int64) if on_examples is None else on_examples.examples,
         reasoning=recipe.reflections == "learned",
     )
-    loaded.model.model.visual.requires_grad_(recipe.vision_rate > 0)
+    for part in vision_parts(loaded.model):
+        part.requires_grad_(recipe.vision_rate > 0)
     text: Any = loaded.model.config.text_config
     probe = SceneProbe(text.hidden_size, loaded.codec.books.shape[2]) if recipe.probe else None
     first_code_id = loaded.vocabulary.code_ids(0).start

@@ -104,7 +104,7 @@ class LearnerTrainer(Trainer):
             groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
             for name, parameter in self._learner.named_parameters():
                 if parameter.requires_grad:
-                    groups.setdefault((".visual." in name, parameter.ndim > 1), []).append(parameter)
+                    groups.setdefault((is_vision(name), parameter.ndim > 1), []).append(parameter)
             arguments = self.args
             self.optimizer = torch.optim.AdamW(
                 [
@@ -129,6 +129,11 @@ class LearnerTrainer(Trainer):
     def _load_from_checkpoint(self, resume_from_checkpoint: str, model: nn.Module | None = None) -> None:
         state = torch.load(Path(resume_from_checkpoint) / _STATE_FILE, map_location="cpu", weights_only=True)
         (model or self._learner).load_state_dict(state)
+
+
+def is_vision(name: str) -> bool:
+    """Whether a weight of a response learner belongs to the tower or the resampler."""
+    return ".visual." in name or ".resampler." in name
 
 
 class _Frugal(TrainerCallback):

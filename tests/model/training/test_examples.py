@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from model.driving.images import decode_image
 from model.driving.labeller import expert_plan
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.driving.scene_store import write_scenes
+from model.training.dense import UNLABELLED, coarse
 from model.training.examples import Examples, load_examples
 from tests.model.training.scenes import training_scene
 
@@ -26,9 +27,25 @@ def test_examples_hold_what_the_scenes_hold() -> None:
         assert examples.plan(index) == expert_plan(labelled)
         assert np.array_equal(examples.future[index], labelled.future)
         assert np.isnan(examples.route[index]).all() == (labelled.scene.route is None)
-        assert np.array_equal(examples.dense_classes[index, 0], labelled.dense[0].classes)
+        assert np.array_equal(examples.dense_classes[index, 0], coarse(labelled.dense[0]).classes)
         metres = np.expm1(examples.dense_range_log[index, 1].astype(np.float32))
-        assert np.allclose(metres, labelled.dense[1].range_m, atol=0.2)
+        assert np.allclose(metres, coarse(labelled.dense[1]).range_m, atol=0.2)
+
+
+def test_scenes_without_dense_targets_are_examples_too() -> None:
+    examples = Examples.from_scenes([replace(SCENES[0], dense=()), SCENES[1]], CAMERAS)
+    assert (examples.dense_classes[0] == UNLABELLED).all()
+    assert not (examples.dense_classes[1] == UNLABELLED).any()
+    assert not examples.dense_range_log[0].any()
+
+
+def test_each_folder_and_each_choice_of_cameras_has_a_cache_of_its_own(tmp_path: Path) -> None:
+    for name, scenes in (("one", SCENES[:2]), ("two", SCENES[2:5])):
+        write_scenes(tmp_path / name / "scenes" / "a.parquet", scenes)
+    cache = tmp_path / "cache"
+    assert len(load_examples(tmp_path / "one" / "scenes", cache, CAMERAS)) == 2
+    assert len(load_examples(tmp_path / "two" / "scenes", cache, CAMERAS)) == 3
+    assert load_examples(tmp_path / "one" / "scenes", cache, CAMERAS[:1]).picture_spans.shape[1] == 1
 
 
 def test_pictures_are_kept_once() -> None:

@@ -11,9 +11,8 @@ from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.network.checkpoint import Loaded, load
 from model.training.batches import Item, ResponseDataset, collate
 from model.training.examples import Examples
-from model.training.facts import FACTS
 from model.training.learner import ResponseLearner
-from model.training.probe import SceneProbe, fact_loss
+from model.training.probe import SceneProbe
 from model.training.targets import PAPER_WEIGHTS
 from tests.model.training.scenes import training_scene
 
@@ -21,15 +20,6 @@ from tests.model.training.scenes import training_scene
 @pytest.fixture(scope="module")
 def loaded(untrained_checkpoint: Path) -> Loaded:
     return load(untrained_checkpoint)
-
-
-def test_facts_that_do_not_apply_cost_nothing() -> None:
-    facts = torch.full((1, len(FACTS)), float("nan"))
-    facts[0, FACTS.index("lead_gap_log_m")] = 2.0
-    right = torch.full((1, len(FACTS)), 7.0)
-    right[0, FACTS.index("lead_gap_log_m")] = 2.0
-    assert float(fact_loss(right, facts)) == 0.0
-    assert float(fact_loss(right + 1, facts)) > 1.0
 
 
 def test_the_probe_reads_the_prompts_last_token_and_teaches_the_lower_half_alone(loaded: Loaded) -> None:

@@ -36,20 +36,20 @@ def short(name: str, steps: int = 4) -> Recipe:
 
 
 def test_the_stages_lead_to_a_checkpoint_that_tells_its_history(
-    untrained_checkpoint: Path, scenes: Path, tmp_path: Path
+    resampling_checkpoint: Path, scenes: Path, tmp_path: Path
 ) -> None:
     settings = RunSettings(tmp_path / "cache", validate_every=2, save_every=2, draws=1, bf16=False)
-    before = load(untrained_checkpoint).model.bfloat16().state_dict()
-    run(short("ground"), scenes, untrained_checkpoint, tmp_path / "ground", settings)
+    before = load(resampling_checkpoint).model.bfloat16().state_dict()
+    run(short("ground"), scenes, resampling_checkpoint, tmp_path / "ground", settings)
     grounded = load(tmp_path / "ground", dtype=torch.bfloat16).model.state_dict()
     moved = {name for name in before if not torch.equal(before[name], grounded[name])}
     assert moved
-    assert all(name.startswith("model.visual.") for name in moved)
+    assert all(name.startswith(("model.visual.", "resampler.")) for name in moved)
 
     run(short("meta-act"), scenes, tmp_path / "ground", tmp_path / "plan", settings, SCENES[:1])
     done = load(tmp_path / "plan")
     assert [stage["name"] for stage in done.card.details["stages"]] == ["ground", "meta-act"]
-    assert done.card.revision != load(untrained_checkpoint).card.revision
+    assert done.card.revision != load(resampling_checkpoint).card.revision
     rows = [json.loads(line) for line in (tmp_path / "plan" / "log.jsonl").read_text().splitlines()]
     assert {row["stage"] for row in rows} == {"1 ground", "2 meta-act"}
     validated = [row for row in rows if "min_ade_m/cf_vla+route" in row]
@@ -58,21 +58,23 @@ def test_the_stages_lead_to_a_checkpoint_that_tells_its_history(
 
 
 def test_a_vision_tower_can_be_taken_from_elsewhere(
-    untrained_checkpoint: Path, scenes: Path, tmp_path: Path
+    resampling_checkpoint: Path, scenes: Path, tmp_path: Path
 ) -> None:
     settings = RunSettings(tmp_path / "cache", bf16=False)
-    run(short("ground", 1), scenes, untrained_checkpoint, tmp_path / "ground", settings)
+    run(short("ground", 1), scenes, resampling_checkpoint, tmp_path / "ground", settings)
     run(
         short("language", 1),
         scenes,
-        untrained_checkpoint,
+        resampling_checkpoint,
         tmp_path / "both",
         settings,
         vision_source=tmp_path / "ground",
     )
-    name = "model.visual.merger.mlp.0.weight"
     both, grounded = load(tmp_path / "both"), load(tmp_path / "ground")
-    assert torch.equal(both.model.state_dict()[name], grounded.model.state_dict()[name])
+    for name in ("model.visual.merger.mlp.0.weight", "resampler.queries"):
+        assert torch.equal(both.model.state_dict()[name], grounded.model.state_dict()[name])
+    heads = "perception.safetensors"
+    assert (tmp_path / "both" / heads).read_bytes() == (tmp_path / "ground" / heads).read_bytes()
 
 
 def test_a_state_cut_off_by_a_kill_is_passed_over(tmp_path: Path) -> None:

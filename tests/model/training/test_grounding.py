@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from model.driving.facts import FACTS, mirrored
+from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from model.network.checkpoint import Loaded, load
+from model.network.perception import PerceptionError, PerceptionHeads, load_heads
+from model.training.dense import DENSE_SHAPE
+from model.training.examples import Examples
+from model.training.grounding import (
+    GroundingDataset,
+    GroundingLearner,
+    Look,
+    collate_grounding,
+    fact_loss,
+)
+from tests.model.training.scenes import training_scene
+
+SCENES = [training_scene(index) for index in range(6)]
+
+
+@pytest.fixture(scope="module")
+def loaded(resampling_checkpoint: Path) -> Loaded:
+    return load(resampling_checkpoint)
+
+
+@pytest.fixture(scope="module")
+def data(loaded: Loaded) -> GroundingDataset:
+    return GroundingDataset(Examples.from_scenes(SCENES, (FRONT_WIDE, FRONT_TELE)), loaded.inputs)
+
+
+def test_a_mirrored_look_swaps_everything_and_twice_is_as_before(data: GroundingDataset) -> None:
+    plain, swapped = data.look(Look(1)), data.look(Look(1, mirror=True))
+    np.testing.assert_array_equal(swapped.facts, mirrored(plain.facts))
+    np.testing.assert_array_equal(swapped.classes, plain.classes[..., ::-1])
+    np.testing.assert_array_equal(swapped.motion[:, 1], -plain.motion[:, 1, :, ::-1])
+    np.testing.assert_array_equal(swapped.futures[:, 1], -plain.futures[:, 1])
+    assert not np.array_equal(swapped.patches, plain.patches)
+
+
+def test_a_route_is_given_only_where_there_is_one(data: GroundingDataset) -> None:
+    assert not data.look(Look(0)).has_route
+    assert data.look(Look(1)).has_route
+    assert not data.look(Look(1, route=False)).has_route
+
+
+def test_facts_that_do_not_apply_cost_nothing() -> None:
+    facts = torch.full((1, len(FACTS)), float("nan"))
+    facts[0, FACTS.index("own_0_gap_log_m")] = 2.0
+    right = torch.full((1, len(FACTS)), 7.0)
+    right[0, FACTS.index("own_0_gap_log_m")] = 2.0
+    weights = torch.ones(len(FACTS))
+    assert float(fact_loss(right, facts, weights)) == 0.0
+    assert float(fact_loss(right + 1, facts, weights)) > 1.0
+
+
+def test_tower_and_resampler_learn_what_is_seen(loaded: Loaded, data: GroundingDataset) -> None:
+    learner = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE)
+    learner.eval()  # without dropout the loss can only fall
+    batch = collate_grounding([data.look(Look(index)) for index in range(4)])
+    optimizer = torch.optim.AdamW(learner.parameters(), lr=3e-4)
+    losses = []
+    for _ in range(12):
+        parts = learner(**batch)
+        optimizer.zero_grad()
+        parts["loss"].backward()
+        optimizer.step()
+        losses.append({name: float(value.detach()) for name, value in parts.items()})
+    for name in ("class_loss", "range_error_log", "motion_error", "fact_loss", "plan_ade_m"):
+        assert losses[-1][name] < losses[0][name], name
+
+
+def test_what_is_gathered_depends_on_pictures_history_and_route(
+    loaded: Loaded, data: GroundingDataset
+) -> None:
+    learner = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE).eval()
+    batch = collate_grounding([data.look(Look(1))])
+    names = ("patches", "history", "route", "has_route")
+    _, as_it_is = learner.gather(**{name: batch[name] for name in names})
+    for name, change in (
+        ("patches", batch["patches"].flip(0)),
+        ("history", batch["history"] * 1.5),
+        ("route", batch["route"] * torch.tensor([1.0, -2.0]) + 1.0),
+        ("has_route", ~batch["has_route"]),
+    ):
+        _, other = learner.gather(**{key: batch[key] for key in names} | {name: change})
+        assert not torch.allclose(as_it_is, other, atol=1e-4), name
+
+
+def test_heads_are_read_back_and_foreign_ones_refused(loaded: Loaded, tmp_path: Path) -> None:
+    heads = PerceptionHeads(256, 16, loaded.codec).eval()
+    heads.save(tmp_path)
+    again = load_heads(tmp_path, 256, 16, loaded.codec)
+    gathered = torch.randn(2, 16, 256)
+    assert torch.equal(heads.read(gathered), again.read(gathered))
+    with pytest.raises(PerceptionError, match="does not fit this checkpoint"):
+        load_heads(tmp_path, 128, 16, loaded.codec)
+    (tmp_path / "perception.safetensors").write_bytes(b"no heads")
+    with pytest.raises(PerceptionError, match="does not fit"):
+        load_heads(tmp_path, 256, 16, loaded.codec)
+    with pytest.raises(PerceptionError, match="was not grounded"):
+        load_heads(tmp_path / "nowhere", 256, 16, loaded.codec)
+
+
+def test_too_few_gathered_tokens_are_refused(loaded: Loaded) -> None:
+    with pytest.raises(ValueError, match="at least 12 tokens, got 4"):
+        PerceptionHeads(256, 4, loaded.codec)
