@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from model.driving.images import encode_jpeg
-from model.driving.scene import CLIP_FRAMES, FRONT_TELE, FRONT_WIDE, Clip, Scene
+from model.driving.scene import CLIP_FRAMES, FRONT_TELE, FRONT_WIDE, Clip, Scene, Track
 from model.network.checkpoint import save, write_code_embeddings
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus
@@ -70,3 +70,12 @@ def noisy_scene(seed: int = 0, *, route: bool = False) -> Scene:
     )
     way = np.stack([np.arange(4.0, 84.0, 4.0), random.normal(0, 1, 20)], axis=1) if route else None
     return Scene(f"noisy-{seed}", clips, histories[0], None if way is None else way.astype(np.float32))
+
+
+def made_up_tracks(count: int, seed: int = 0) -> tuple[Track, ...]:
+    """Tracked vehicles somewhere around."""
+    random = np.random.default_rng(seed)
+    return tuple(
+        Track(float(x), float(y), float(heading), float(speed), 4.5, 1.9, "vehicle")
+        for x, y, heading, speed in random.normal(size=(count, 4)) * [30, 4, 0.2, 8]
+    )

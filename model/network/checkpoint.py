@@ -160,7 +160,7 @@ def read_parts(folder: Path) -> Parts:
             cameras=settings.cameras,
             image_size=(settings.image_width, settings.image_height),
             parameters=card["parameters"],
-            prompt_tokens=len(inputs.prompt(settings.formats[0], route=settings.with_route).ids),
+            prompt_tokens=len(inputs.longest_prompt(settings.formats[0]).ids),
             details=card["details"],
         ),
     )

@@ -139,6 +139,10 @@ class InputBuilder:
             self._prompts[key] = Prompt(ids, positions, int(positions.max()) + 1 - len(ids))
         return self._prompts[key]
 
+    def longest_prompt(self, format: str) -> Prompt:
+        """The prompt of a scene that has all that the network can be given."""
+        return self.prompt(format, route=self.settings.with_route, tracks=self.settings.with_tracks)
+
 
 def rotary_positions(is_video: npt.NDArray[np.bool_], settings: VlaSettings) -> IntArray:
     """Rotary positions int64 [3, t] of a sequence whose video placeholders are marked.

@@ -241,7 +241,7 @@ def _rooflines(rows: list[Row], checkpoint: Path, device: str) -> list[Roofline]
 
     dtype = fast_dtype(device)
     machine, parts, config = measure(device, dtype), read_parts(checkpoint), read_config(checkpoint)
-    prompt = len(parts.inputs.prompt("cf_vla", route=parts.settings.with_route).ids)
+    prompt = len(parts.inputs.longest_prompt("cf_vla").ids)
     slices, grid_rows, columns = parts.settings.grid
     patches = len(parts.settings.cameras) * slices * grid_rows * columns
     found = []

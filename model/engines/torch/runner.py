@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from model.driving.scene import Scene
+from model.driving.trajectory import FloatArray
 from model.engines.torch.attention import DrawPass, PromptPart, PromptPass
 from model.engines.torch.clips import ClipCache, digest
 from model.engines.torch.frames import Frames
@@ -44,6 +45,8 @@ class Prompt:
         last_token: still to be fed.
         position_offset: see `model.network.inputs.Prompt`.
         shown: tells its format and pictures from others.
+        pictures: tells apart what stands in the prompt for its pictures: with a resampler that depends on
+            history and route as well.
         pictured: tokens up to the end of the pictures.
         end: of the places that draws have written to behind it.
     """
@@ -55,6 +58,7 @@ class Prompt:
     last_token: int
     position_offset: int
     shown: bytes
+    pictures: bytes
     pictured: int
     end: int = 0
 
@@ -140,11 +144,7 @@ class Runner:
         self._frames = frames or Frames(loaded.inputs)
         tower = model.model.visual
         self._tower = tower if products is None else copy.deepcopy(tower).to(products)
-        kept = [
-            len(loaded.inputs.prompt(format, route=route).ids) - 1
-            for format in loaded.card.formats
-            for route in {False, loaded.settings.with_route}
-        ]
+        kept = [len(loaded.inputs.longest_prompt(format).ids) - 1 for format in loaded.card.formats]
         sizes = {
             "layers": text.num_hidden_layers,
             "heads": text.num_key_value_heads,
@@ -217,7 +217,7 @@ class Runner:
         for prompt, span in spans:
             prompt.held = span.stop
             if span.start < prompt.pictured <= span.stop:
-                self._pictures.keep(prompt.shown, self._held(prompt, prompt.pictured).clone())
+                self._pictures.keep(prompt.pictures, self._held(prompt, prompt.pictured).clone())
 
     def copy_row(self, source: int, target: int) -> None:
         """Make a draw's row hold what another holds, behind the same prompt."""
@@ -332,9 +332,9 @@ class Runner:
         self, scene: Scene, format: str, row: int, vision_tokens: Tensor, shown: bytes
     ) -> Prompt:
         loaded = self.loaded
-        route = scene.route if loaded.settings.with_route else None
-        prompt = loaded.inputs.prompt(format, route=route is not None)
-        embedded = loaded.model.embed_prompt(prompt, vision_tokens, scene.history, route)
+        route, tracks = loaded.inputs.way(scene), loaded.inputs.tracks(scene)
+        prompt = loaded.inputs.prompt(format, route=route is not None, tracks=tracks is not None)
+        embedded = loaded.model.embed_prompt(prompt, vision_tokens, scene.history, route, tracks)
         rotation = self._decoder.rotation(embedded.position_ids)
         kept = len(prompt.ids) - 1
         clips = np.flatnonzero(prompt.ids == loaded.model.config.video_token_id)
@@ -346,6 +346,7 @@ class Runner:
             int(prompt.ids[-1]),
             prompt.position_offset,
             shown,
+            shown + _gathered_with(scene.history, route) if loaded.settings.scene_tokens else shown,
             int(clips[-1]) + 1,
         )
         if self._reuse:
@@ -358,7 +359,7 @@ class Runner:
         That is all up to the end of its pictures where these were seen lately, or else the ``count`` tokens
         that all prompts of a format begin with.
         """
-        kept = self._pictures.find(prompt.shown)
+        kept = self._pictures.find(prompt.pictures)
         if kept is None:
             kept = self._heads.get(format)
         if kept is None:
@@ -371,3 +372,8 @@ class Runner:
     def _held(self, prompt: Prompt, count: int) -> Tensor:
         """A prompt's first keys and values, [2, layers, heads, count, head_dim]."""
         return self._memory.row(prompt.row, count)
+
+
+def _gathered_with(history: FloatArray, route: FloatArray | None) -> bytes:
+    """What else decides what a resampler gathers from pictures."""
+    return history.tobytes() + (b"" if route is None else route.tobytes())

@@ -182,11 +182,7 @@ class VllmEngine:
         from vllm.v1.engine.async_llm import AsyncLLM
 
         settings = self._parts.settings
-        prompts = [
-            len(self._parts.inputs.prompt(format, route=route).ids)
-            for format in self._card.formats
-            for route in {False, settings.with_route}
-        ]
+        prompts = [len(self._parts.inputs.longest_prompt(format).ids) for format in self._card.formats]
         limits = {"video": len(settings.cameras), "history": 1} | (
             {"route": 1} if settings.with_route else {}
         )

@@ -35,7 +35,8 @@ from model.engines.torch.shortcuts import Shortcuts
 from model.formats.cf_vla import FORMATS
 from model.formats.pieces import Format
 from model.network.checkpoint import Loaded, load
-from tests.checkpoints import noisy_scene, write_untrained
+from model.network.settings import NANO_SETTINGS, VlaSettings
+from tests.checkpoints import made_up_tracks, noisy_scene, write_untrained
 from tests.model.engines.decoding import Again
 from tests.model.engines.reference import Shares, exactly, reference
 from tests.model.formats.strategies import branching_formats
@@ -58,6 +59,11 @@ VARIATIONS: list[dict[str, Any]] = [
     {"prefill": plan_from_bins(np.zeros((3, 64), np.int8)), "temperature": 0.0},
 ]
 SCENES = [noisy_scene(index, route=index % 2 == 1) for index in range(4)]
+# The same pictures, seen while the car moves otherwise and with tracked objects around.
+SCENES += [
+    replace(scene, history=other.history, tracks=tracks)
+    for scene, other, tracks in zip(SCENES[:2], SCENES[2:], ((), made_up_tracks(5)), strict=True)
+]
 
 
 @dataclass(frozen=True)
@@ -142,9 +148,12 @@ made_up: st.SearchStrategy[Formats] = st.one_of(
 """Those that there are, or one that nobody thought of in the place of `cf_vla`."""
 
 
-@pytest.fixture(scope="module")
-def exact(tmp_path_factory: pytest.TempPathFactory) -> Loaded:
-    folder = CHECKPOINT or write_untrained(tmp_path_factory.mktemp("narrow") / "untrained", narrow=True)
+@pytest.fixture(scope="module", params=["every vision token", "resampled"])
+def exact(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Loaded:
+    settings = NANO_SETTINGS if request.param == "resampled" else VlaSettings()
+    folder = CHECKPOINT or write_untrained(
+        tmp_path_factory.mktemp("narrow") / "untrained", narrow=True, settings=settings
+    )
     return exactly(load(Path(folder), dtype=torch.float64))
 
 
