@@ -108,8 +108,8 @@ def facts_of(tracks: Sequence[Track], route: FloatArray) -> FloatArray:
         if track.kind == "pedestrian" and 0 < along < WALKER_RANGE_M and abs(left) < WALKER_BESIDE_M
     )
     for rank, (along, left, speed) in enumerate(walkers[:WALKERS]):
-        values = (1.0, math.log1p(along), left / WALKER_LEFT_SCALE_M, speed / WALKER_SPEED_SCALE_MS)
-        facts |= _named(f"walker_{rank}", WALKER_FIELDS, values)
+        place = math.log1p(along), left / WALKER_LEFT_SCALE_M
+        facts |= _named(f"walker_{rank}", WALKER_FIELDS, (1.0, *place, speed / WALKER_SPEED_SCALE_MS))
     for distance in ROAD_DISTANCES_M:
         facts[f"road_left_{distance}m"] = float(route[distance // 4 - 1, 1]) / ROAD_SCALE_M
     return np.array([facts[name] for name in FACTS], np.float32)

@@ -57,12 +57,13 @@ class TrajectoryHead(nn.Module):
 
     def forward(self, states: Tensor) -> Guesses:
         """Guesses for states [b, width]."""
-        modes = self.modes(states).unflatten(-1, (MODES, -1))
+        modes = self.modes(states).view(len(states), MODES, -1)
         return Guesses(self.best(states) * self.spread, modes * self.spread, self.scores(states))
 
     def curves(self, vectors: Tensor, speeds_ms: Tensor) -> Tensor:
         """x, y and heading [..., 64, 3] of vectors [..., d], for present speeds [...] or [b]."""
-        curves = (vectors.float() @ self.axes + self.mean).unflatten(-1, (3, FUTURE_STEPS))
+        flat = vectors.float() @ self.axes + self.mean
+        curves = flat.view(*flat.shape[:-1], 3, FUTURE_STEPS)
         times = STEP_S * torch.arange(1, FUTURE_STEPS + 1, device=vectors.device)
         speeds = speeds_ms.reshape(speeds_ms.shape + (1,) * (curves.dim() - 1 - speeds_ms.dim()))
         return torch.stack(

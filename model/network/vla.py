@@ -130,10 +130,9 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
                 here = (input_ids == token_id)[..., None]
                 embeddings = torch.where(here, encoder(values)[:, None].to(embeddings.dtype), embeddings)
         if tracks is not None and self.track_encoder is not None:
-            here = input_ids == self.track_token_id
-            given = here.any(dim=1)
-            tokens = self.track_encoder(tracks[given]).to(embeddings.dtype)
-            embeddings = embeddings.masked_scatter(here[..., None], tokens)
+            places = torch.eq(input_ids, self.track_token_id or 0)
+            tokens = self.track_encoder(tracks[places.any(dim=1)]).to(embeddings.dtype)
+            embeddings = embeddings.masked_scatter(places[..., None], tokens)
         return embeddings
 
     def resample(

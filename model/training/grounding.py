@@ -243,7 +243,8 @@ class GroundingLearner(nn.Module):
         grid = tokens.view(batch, cameras, self._slices, self._rows, self._columns, -1)
         # The time slices of one place side by side.
         beside = grid.permute(0, 1, 3, 4, 2, 5).flatten(4)
-        dense = self.dense_head(beside).float().unflatten(-1, (*self._cell, _CLASSES + 3))
+        dense: Tensor = self.dense_head(beside).float()
+        dense = dense.view(*dense.shape[:-1], *self._cell, _CLASSES + 3)
         return dense.permute(0, 1, 2, 4, 3, 5, 6).reshape(*shape, _CLASSES + 3)
 
 

@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from model.bundled import CHECKPOINT as BUNDLED_CHECKPOINT
 from service.cli.options import told
+
+if TYPE_CHECKING:
+    from model.network.small_planner import SmallKind
 
 
 def train(
@@ -18,7 +22,8 @@ def train(
         str,
         typer.Argument(
             help="create, language, ground, traj-only, meta-act, counterfactual, multi-round; "
-            "ladder: all of it, then rollouts, labels and training round by round, and the table."
+            "ladder: all of it, then rollouts, labels and training round by round, and the table; "
+            "blind, teacher: the small planners of the tables, without pictures."
         ),
     ],
     scenes: Annotated[Path, typer.Option(help="Training scenes: a file or a folder.")],
@@ -65,6 +70,7 @@ def train(
     from model.evaluation.curves import training_curves
     from model.network.allocator import keep_freed_memory
     from model.network.precision import bfloat16_is_fast
+    from model.network.small_planner import SMALL_KINDS
     from model.training.recipes import NANO, PAPER
     from model.training.run import RunSettings, create, run
     from model.training.trainer import LOG_FILE
@@ -76,6 +82,9 @@ def train(
         if recipe == "create":
             for name, value in create(scenes, cache, target, seed=seed).items():
                 typer.echo(f"codec {name} {value:.3f}")
+            return
+        if recipe in SMALL_KINDS:
+            _train_small(recipe, scenes, source or BUNDLED_CHECKPOINT, target, validation, steps, seed)
             return
         if recipe == "ladder":
             if test is None:
@@ -91,7 +100,8 @@ def train(
             return
         recipes = PAPER if paper else NANO
         if recipe not in recipes:
-            raise ValueError(f"unknown recipe {recipe!r}; known are create, ladder, {', '.join(recipes)}")
+            known = ", ".join(["create", "ladder", *SMALL_KINDS, *recipes])
+            raise ValueError(f"unknown recipe {recipe!r}; known are {known}")
         if source is None:
             raise ValueError("give the checkpoint to start from: --from FOLDER")
         chosen = recipes[recipe]
@@ -120,6 +130,36 @@ def train(
             reflections,
         )
         training_curves(target / LOG_FILE, target / "curves.png")
+
+
+def _train_small(
+    kind: SmallKind,
+    scenes: Path,
+    codec_from: Path,
+    target: Path,
+    validation: Path | None,
+    steps: int | None,
+    seed: int,
+) -> None:
+    from rich.progress import Progress, TextColumn
+
+    from model.network.codec import TrajectoryCodec
+    from model.training.small import SmallSettings, train_small
+
+    settings = SmallSettings(seed=seed) if steps is None else SmallSettings(seed=seed, steps=steps)
+    with Progress(*Progress.get_default_columns(), TextColumn("{task.fields[ade]}")) as progress:
+        task = progress.add_task(kind, total=settings.steps, ade="")
+        figures = train_small(
+            kind,
+            [scenes],
+            TrajectoryCodec.load(codec_from),
+            target,
+            settings,
+            validation,
+            lambda step, ade: progress.update(task, completed=step, ade=f"ADE {ade:.2f} m"),
+        )
+    for name, value in figures.items():
+        typer.echo(f"{kind} {name} {value:.3f}")
 
 
 def _options(context: typer.Context, but: Sequence[str]) -> list[str]:

@@ -22,9 +22,8 @@ def test_a_mirrored_scene_has_mirrored_features() -> None:
     mirrored_car = replace(CAR, y_m=-CAR.y_m, heading_rad=-CAR.heading_rad, lights=frozenset({"right"}))
     expected = track_features((CAR,), ROUTE)
     expected[:, list(MIRRORED)] *= -1
-    np.testing.assert_allclose(
-        track_features((mirrored_car,), ROUTE * np.float32([1, -1])), expected, atol=1e-6
-    )
+    found = track_features((mirrored_car,), (ROUTE * [1, -1]).astype(np.float32))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_without_a_route_what_is_relative_to_it_is_zero() -> None:
