@@ -58,8 +58,7 @@ def prompt_text(format: str, settings: VlaSettings, *, route: bool, tracks: bool
         f"{IM_START}system\n{_SYSTEM}{IM_END}\n"
         f"{IM_START}user\n{TASKS[format]}\n"
         f"{_seen(settings)}"
-        f"{motion_text(route=route)}"
-        f"{_tracks() if tracks else ''}"
+        f"{motion_text(route=route, tracks=tracks)}"
         f"{IM_END}\n{IM_START}assistant\n"
     )
 
@@ -71,11 +70,8 @@ def _seen(settings: VlaSettings) -> str:
     return "".join(f"{camera}:{clip}\n" for camera in settings.cameras)
 
 
-def _tracks() -> str:
-    return f"tracks:{TRACKS_START}{TRACK * MAX_TRACKS}{TRACKS_END}\n"
-
-
-def motion_text(*, route: bool) -> str:
-    """The prompt's lines about the ego's own motion: all that training without pictures gives."""
+def motion_text(*, route: bool, tracks: bool = False) -> str:
+    """The prompt's lines about the ego's motion and that of tracks: all there is without pictures."""
     way = f"route:{ROUTE_START}{ROUTE}{ROUTE_END}\n" if route else ""
-    return f"history:{HISTORY_START}{HISTORY}{HISTORY_END}\n{way}"
+    around = f"tracks:{TRACKS_START}{TRACK * MAX_TRACKS}{TRACKS_END}\n" if tracks else ""
+    return f"history:{HISTORY_START}{HISTORY}{HISTORY_END}\n{way}{around}"

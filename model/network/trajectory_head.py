@@ -54,6 +54,11 @@ class TrajectoryHead(nn.Module):
         self.best = nn.Linear(width, len(axes))
         self.modes = nn.Linear(width, MODES * len(axes))
         self.scores = nn.Linear(width, MODES)
+        # Begin at the mean trajectory, modes around it: a head at random would bend the network to its whims.
+        for layer in (self.best, self.modes, self.scores):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+        nn.init.normal_(self.modes.bias)
 
     def forward(self, states: Tensor) -> Guesses:
         """Guesses for states [b, width]."""

@@ -12,19 +12,25 @@ import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
-from model.driving.images import decode_image
+from model.driving.trajectory import HISTORY_STEPS, STEP_S, present_speed
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat
 from model.network.codec import TrajectoryCodec
 from model.network.inputs import InputBuilder
-from model.network.patches import patchify, resize
+from model.network.patches import patchify
 from model.network.prompts import motion_text
+from model.network.track_features import MIRRORED
 from model.network.vocabulary import Vocabulary
-from model.training.examples import Examples
+from model.training.examples import Examples, example_frames
 from model.training.soft_codes import SoftCodes
 from model.training.targets import Reflection, SectionWeights, Target, Task, make_target
+from model.training.vision_cache import VisionCache
 
 Batch = dict[str, Tensor]
+
+_CHANCES: Final = ("tracks", "mirror", "blur")
+_MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
+"""Of poses (x, y, z, heading)."""
 
 WIDTH_STEP: Final = 16
 """Batches are padded to multiples of this: few shapes, so kernels made for a shape are made few times and
@@ -39,6 +45,9 @@ class Item:
         index: of the example.
         task: the response format.
         route: whether the prompt has the example's route.
+        tracks: whether it has its tracks.
+        mirror: left and right are swapped.
+        blur: of the history only the present speed is left.
         reflections: places of reflections on it, whose responses all follow the same prompt; without any,
             the response is the expert's own.
     """
@@ -47,24 +56,50 @@ class Item:
     task: Task
     route: bool
     reflections: tuple[int, ...] = ()
+    tracks: bool = False
+    mirror: bool = False
+    blur: bool = False
+
+
+Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One prompt and its responses, rendered for the network; ``code_shares`` has a row for each response."""
+    """One prompt and its responses, rendered for the network.
+
+    Attributes:
+        prompt: token ids.
+        responses: their ids and weights.
+        seen: float16 [v, hidden] vision tokens; None without pictures.
+        patches: uint8 [p, n], where the tower learns too; else None.
+        history, route, tracks, future: of the example, as its `Item` asks for them.
+        code_shares, code_errors_m: [responses, stages, size], see `SoftTarget`.
+    """
 
     prompt: list[int]
     responses: list[Target]
+    seen: np.ndarray[tuple[int, ...], np.dtype[np.float16]] | None
     patches: np.ndarray[tuple[int, ...], np.dtype[np.uint8]] | None
-    history: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
-    route: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
-    code_shares: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
-    facts: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
-    future: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+    history: Array
+    route: Array
+    tracks: Array
+    future: Array
+    code_shares: Array
+    code_errors_m: Array
 
 
 class ResponseDataset(Dataset[Sample]):
-    """Renders `Item`s; the items of an epoch come from `TaskSampler`."""
+    """Renders `Item`s; the items of an epoch come from `TaskSampler`.
+
+    Args:
+        examples, codec, inputs, vocabulary: of the checkpoint.
+        weights: of sections.
+        pictures: whether prompts have them.
+        vision: what the tower sees in all examples, where it does not learn; else their patches are given.
+        reflections: to be asked for by items.
+        seed: of the codes that are drawn.
+    """
 
     def __init__(
         self,
@@ -75,13 +110,13 @@ class ResponseDataset(Dataset[Sample]):
         weights: SectionWeights,
         *,
         pictures: bool,
+        vision: VisionCache | None = None,
         reflections: Sequence[Reflection] = (),
         seed: int = 0,
     ) -> None:
         self._examples, self._inputs, self._reflections = examples, inputs, reflections
-        self._vectors = codec.vectors(examples.history, examples.future)
-        self._soft = SoftCodes(codec, self._vectors)
-        self._size = np.float32(np.sqrt((self._vectors**2).sum(axis=1).mean()))
+        self._codec, self._vision = codec, vision
+        self._soft = SoftCodes(codec, codec.vectors(examples.history, examples.future))
         self._random = np.random.default_rng(seed)
         self._weights, self._pictures, self._vocabulary = weights, pictures, vocabulary
         self._formats = {name: CompiledFormat(FORMATS[name], vocabulary) for name in ("cf_vla", "traj_only")}
@@ -91,45 +126,54 @@ class ResponseDataset(Dataset[Sample]):
 
     def __getitem__(self, item: Item) -> Sample:
         examples, index = self._examples, item.index
+        history, future = examples.history[index], examples.future[index]
+        route, tracks = np.nan_to_num(examples.route[index]), examples.tracks[index]
+        plan = examples.plan(index)
+        if item.mirror:
+            history, future, route = history * _MIRROR, future * _MIRROR, route * _MIRROR[:2]
+            tracks = tracks.copy()
+            tracks[:, MIRRORED] *= -1
+            plan = plan.mirrored()
+        if item.blur:
+            history = steady_history(present_speed(history))
+        vector = self._codec.vectors(history[None], future[None])[0]
         reflections: Sequence[Reflection | None] = [self._reflections[place] for place in item.reflections]
         reflections = reflections or [None]
-        soft = [self._soft.draw(self._vectors[index], self._random) for _ in reflections]
+        soft = [self._soft.draw(vector, self._random) for _ in reflections]
         return Sample(
             prompt=self._prompt(item),
             responses=[
-                make_target(
-                    self._formats[item.task],
-                    examples.plan(index),
-                    drawn.codes.tolist(),
-                    self._weights,
-                    reflection,
-                )
+                make_target(self._formats[item.task], plan, drawn.codes.tolist(), self._weights, reflection)
                 for drawn, reflection in zip(soft, reflections, strict=True)
             ],
-            patches=patchify(self.frames(index), self._inputs.settings) if self._pictures else None,
-            history=examples.history[index],
-            route=np.nan_to_num(examples.route[index]),
+            seen=self._vision.tokens(index, item.mirror) if self._vision is not None else None,
+            patches=self._patches(item) if self._pictures and self._vision is None else None,
+            history=history,
+            route=route,
+            tracks=tracks,
+            future=future,
             code_shares=np.stack([drawn.shares for drawn in soft]),
-            facts=examples.facts[index],
-            future=self._vectors[index] / self._size,
+            code_errors_m=np.stack([drawn.errors_m for drawn in soft]),
         )
 
     def _prompt(self, item: Item) -> list[int]:
         if self._pictures:
-            return cast("list[int]", self._inputs.prompt(item.task, route=item.route).ids.tolist())
+            prompt = self._inputs.prompt(item.task, route=item.route, tracks=item.tracks)
+            return cast("list[int]", prompt.ids.tolist())
         # Without pictures nothing but speed counts, and a trajectory's whole example has thirty tokens.
-        return list(self._vocabulary.encode(motion_text(route=item.route)))
+        return list(self._vocabulary.encode(motion_text(route=item.route, tracks=item.tracks)))
 
-    def frames(self, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-        """The pictures of an example, uint8 [cameras x 4, h, w, 3]."""
-        cameras, frames = self._examples.picture_spans.shape[1:3]
-        return np.stack(
-            [
-                resize(decode_image(self._examples.picture(index, camera, frame)), self._inputs.settings)
-                for camera in range(cameras)
-                for frame in range(frames)
-            ]
+    def _patches(self, item: Item) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+        return patchify(
+            example_frames(self._examples, item.index, item.mirror, self._inputs), self._inputs.settings
         )
+
+
+def steady_history(speed_ms: float) -> Array:
+    """The history float32 [16, 4] of an ego that came straight on at its present speed."""
+    history = np.zeros((HISTORY_STEPS, 4), np.float32)
+    history[:, 0] = speed_ms * STEP_S * np.arange(1 - HISTORY_STEPS, 1)
+    return history
 
 
 class TaskSampler(BatchSampler):
@@ -143,6 +187,8 @@ class TaskSampler(BatchSampler):
         batch_size: responses per batch; with reflections, about so many.
         tasks: share of the examples for each task.
         route_share: share of the examples, among those that have one, that are given their route.
+        tracks_share, mirror_share, blur_share: shares of the examples that are given their tracks, mirrored,
+            and given no history but the present speed; see `Item`. Reflections are never mirrored.
         seed: of the order; every epoch has another one.
         processes: so many batches in a row are alike, as those who share the work wait for the slowest.
         reflected: int64 [r], the example that each reflection is on.
@@ -160,7 +206,12 @@ class TaskSampler(BatchSampler):
         processes: int = 1,
         reflected: npt.NDArray[np.int64] = np.zeros(0, np.int64),
         reasoning: bool = True,
+        *,
+        tracks_share: float = 0.0,
+        mirror_share: float = 0.0,
+        blur_share: float = 0.0,
     ) -> None:
+        self._shares = {"tracks": tracks_share, "mirror": mirror_share, "blur": blur_share}
         self._processes, self._has_route, self._tasks = processes, has_route, tasks
         self._route_share, self._seed, self._epoch = route_share, seed, 0
         self._again = np.zeros(0, np.int64) if reasoning else reflected
@@ -199,19 +250,40 @@ class TaskSampler(BatchSampler):
         names = list(self._tasks)
         drawn = random.choice(len(names), len(example), p=list(self._tasks.values()))
         given = self._given(example, random)
+        tracks, mirror, blur = (self._drawn(name, len(example), random) for name in _CHANCES)
         return [
-            Item(int(example[place]), names[drawn[place]] if place < count else "cf_vla", bool(given[place]))
+            Item(
+                int(example[place]),
+                names[drawn[place]] if place < count else "cf_vla",
+                bool(given[place]),
+                tracks=bool(tracks[place]),
+                mirror=bool(mirror[place]),
+                blur=bool(blur[place]),
+            )
             for place in random.permutation(len(example))
         ]
 
     def _reflected(self, random: np.random.Generator) -> list[Item]:
         example = np.array(list(self._reflections), np.int64)
         given = self._given(example, random)
+        tracks, _, blur = (self._drawn(name, len(example), random) for name in _CHANCES)
         return [
-            Item(index, "cf_vla", bool(given[place]), tuple(self._reflections[index]))
+            Item(
+                index,
+                "cf_vla",
+                bool(given[place]),
+                tuple(self._reflections[index]),
+                tracks=bool(tracks[place]),
+                blur=bool(blur[place]),
+            )
             for place in random.permutation(len(example))
             for index in [int(example[place])]
         ]
+
+    def _drawn(self, name: str, count: int, random: np.random.Generator) -> npt.NDArray[np.bool_]:
+        share = self._shares[name]
+        # No share, no draw: orders stay what they were before there were such shares.
+        return random.random(count) < share if share else np.zeros(count, np.bool_)
 
     def _given(self, example: npt.NDArray[np.int64], random: np.random.Generator) -> npt.NDArray[np.bool_]:
         chosen: npt.NDArray[np.bool_] = random.random(len(example)) < self._route_share
@@ -220,9 +292,9 @@ class TaskSampler(BatchSampler):
     def _rounds(self, items: list[Item], size: int) -> tuple[list[list[list[Item]]], list[list[Item]]]:
         """Batches of like items, as many in a round as there are processes; and batches of the rest."""
         rounds: list[list[list[Item]]] = []
-        buckets: dict[tuple[Task, bool, int], list[Item]] = {}
+        buckets: dict[tuple[Task, bool, bool, int], list[Item]] = {}
         for item in items:
-            key = (item.task, item.route, len(item.reflections))
+            key = (item.task, item.route, item.tracks, len(item.reflections))
             bucket = buckets.setdefault(key, [])
             bucket.append(item)
             if len(bucket) == size * self._processes:
@@ -260,10 +332,13 @@ def collate(samples: list[Sample]) -> Batch:
         "loss_weights": torch.from_numpy(weights),
         "history": torch.from_numpy(np.stack([sample.history for sample in samples])),
         "route": torch.from_numpy(np.stack([sample.route for sample in samples])),
-        "code_shares": torch.from_numpy(np.concatenate([sample.code_shares for sample in samples])),
-        "facts": torch.from_numpy(np.stack([sample.facts for sample in samples])),
+        "tracks": torch.from_numpy(np.stack([sample.tracks for sample in samples])),
         "futures": torch.from_numpy(np.stack([sample.future for sample in samples])),
+        "code_shares": torch.from_numpy(np.concatenate([sample.code_shares for sample in samples])),
+        "code_errors_m": torch.from_numpy(np.concatenate([sample.code_errors_m for sample in samples])),
     }
+    if samples[0].seen is not None:
+        batch["seen"] = torch.from_numpy(np.stack([np.asarray(sample.seen) for sample in samples]))
     if samples[0].patches is not None:
         batch["patches"] = torch.from_numpy(np.concatenate([sample.patches for sample in samples]))
     return batch

@@ -24,6 +24,7 @@ from model.driving.scene import CLIP_FRAMES, LabelledScene
 from model.driving.scene_store import read_scenes, scene_files
 from model.driving.tracks import tracks_of
 from model.driving.trajectory import FloatArray
+from model.network.inputs import InputBuilder
 from model.network.track_features import track_features
 from model.training.dense import coarse, no_target, relative_motion
 
@@ -169,3 +170,18 @@ def _fill_cache(file: Path, cached: Path, cameras: tuple[str, ...]) -> None:
     temporary = cached.with_name(f".{cached.name}.{os.getpid()}.npz")
     np.savez(temporary, **{field.name: getattr(examples, field.name) for field in fields(Examples)})
     os.replace(temporary, cached)
+
+
+def example_frames(
+    examples: Examples, index: int, mirror: bool, inputs: InputBuilder
+) -> npt.NDArray[np.uint8]:
+    """An example's pictures in the network's size, uint8 [cameras x 4, h, w, 3], or their mirror images."""
+    cameras, count = examples.picture_spans.shape[1:3]
+    frames = np.stack(
+        [
+            inputs.frame(examples.picture(index, camera, number))
+            for camera in range(cameras)
+            for number in range(count)
+        ]
+    )
+    return np.ascontiguousarray(frames[:, :, ::-1]) if mirror else frames

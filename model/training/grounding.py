@@ -23,16 +23,15 @@ from model.driving.facts import (
     IS_YES_OR_NO,
     mirrored,
 )
-from model.driving.images import decode_image
 from model.driving.scene import SEMANTIC_CLASSES
 from model.driving.trajectory import STEP_S
 from model.network.codec import TrajectoryCodec
 from model.network.inputs import InputBuilder
-from model.network.patches import patchify, resize
+from model.network.patches import patchify
 from model.network.perception import PerceptionHeads
 from model.network.vla import LookTwiceVla
 from model.training.dense import FIRST_AGENT_CLASS, UNLABELLED
-from model.training.examples import Examples
+from model.training.examples import Examples, example_frames
 
 _CLASSES: Final = len(SEMANTIC_CLASSES)
 _CLASS_WEIGHTS: Final = (0.3, 0.5, 0.5, 3.0, 6.0, 4.0)
@@ -99,9 +98,9 @@ class GroundingDataset(Dataset[GroundingSample]):
         """One example as it is asked for."""
         examples, index = self._examples, look.index
         has_route = look.route and bool(np.isfinite(examples.route[index]).all())
-        frames = self._frames(index)
+        frames = example_frames(examples, index, look.mirror, self._inputs)
         sample = GroundingSample(
-            frames,
+            patchify(frames, self._inputs.settings),
             examples.dense_classes[index],
             examples.dense_range_log[index].astype(np.float32),
             examples.dense_motion[index].astype(np.float32),
@@ -111,27 +110,14 @@ class GroundingDataset(Dataset[GroundingSample]):
             np.array(has_route),
             examples.future[index],
         )
-        if look.mirror:
-            sample = _mirror(sample)
-        return sample._replace(patches=patchify(sample.patches, self._inputs.settings))
-
-    def _frames(self, index: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
-        """uint8 [cameras x 4, h, w, 3]."""
-        cameras, frames = self._examples.picture_spans.shape[1:3]
-        return np.stack(
-            [
-                resize(decode_image(self._examples.picture(index, camera, frame)), self._inputs.settings)
-                for camera in range(cameras)
-                for frame in range(frames)
-            ]
-        )
+        return _mirror(sample) if look.mirror else sample
 
 
 def _mirror(sample: GroundingSample) -> GroundingSample:
+    """What is known, for pictures that are mirrored already."""
     motion = sample.motion[..., ::-1].copy()
     motion[:, 1] *= -1
     return sample._replace(
-        patches=np.ascontiguousarray(sample.patches[:, :, ::-1]),
         classes=np.ascontiguousarray(sample.classes[..., ::-1]),
         range_log=np.ascontiguousarray(sample.range_log[..., ::-1]),
         motion=motion,

@@ -8,9 +8,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.driving.trajectory import STEP_S
+from model.network.codec import TrajectoryCodec
+from model.network.trajectory_head import TrajectoryHead
 from model.network.vla import LookTwiceVla
+from model.network.vocabulary import FUTURE_START, Vocabulary
 from model.training.loss import response_loss
-from model.training.probe import SceneProbe
 
 _PLACES_STEP: Final = 256
 """Predicted places are filled up to multiples of this, for the reason that `WIDTH_STEP` gives."""
@@ -63,22 +66,30 @@ class ResponseLearner(nn.Module):
 
     Args:
         vla: trained in place.
-        first_code_id: the id of stage 0's code 0.
-        probe: its loss is added; trained along.
+        vocabulary: its codes and markers.
+        codec: in whose space the head beside the codes draws trajectories.
+        error_weight: see `response_loss`.
+        head_weight: of the head's loss; 0 leaves it out.
         compiled: compile the decoder.
     """
 
     def __init__(
         self,
         vla: LookTwiceVla,
-        first_code_id: int,
+        vocabulary: Vocabulary,
+        codec: TrajectoryCodec,
         *,
-        probe: SceneProbe | None = None,
+        error_weight: float = 0.0,
+        head_weight: float = 0.0,
         compiled: bool = False,
     ) -> None:
         super().__init__()
-        self.vla, self.probe = vla, probe
-        self._first_code_id = first_code_id
+        self.vla = vla
+        text: Any = vla.config.text_config
+        self.head = TrajectoryHead(text.hidden_size, codec) if head_weight else None
+        self._error_weight, self._head_weight = error_weight, head_weight
+        self._first_code_id = vocabulary.code_ids(0).start
+        self._future_start_id = vocabulary.id_of(FUTURE_START)
         decoder = vla.model.language_model
         # Kept out of the registered modules: it is the same module, and must not be saved twice.
         self._decoder: list[Any] = [torch.compile(decoder) if compiled else decoder]
@@ -90,26 +101,27 @@ class ResponseLearner(nn.Module):
         loss_weights: Tensor,
         history: Tensor,
         route: Tensor,
-        code_shares: Tensor,
-        facts: Tensor,
+        tracks: Tensor,
         futures: Tensor,
+        code_shares: Tensor,
+        code_errors_m: Tensor,
+        seen: Tensor | None = None,
         patches: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """The loss of a batch from `collate`, and its parts: `ResponseLoss` and the probe's."""
+        """The loss of a batch from `collate`, and its parts: `ResponseLoss` and the head's ADE."""
         vla = self.vla
-        vision_tokens = None
+        vision_tokens = None if seen is None else seen.float().flatten(0, 1)
         if patches is not None:
             grid = vla.settings.grid
             clips = len(patches) // (grid[0] * grid[1] * grid[2])
             vision_tokens = vla.vision(patches, torch.tensor([grid] * clips))
-        embeddings = vla.embed(input_ids, vision_tokens, history, route)
+        embeddings = vla.embed(input_ids, vision_tokens, history, route, tracks)
         lie = _Lie.of(parts)
         outputs = self._decoder[0](
             inputs_embeds=embeddings,
             attention_mask=lie.mask,
             position_ids=vla.position_ids(input_ids, parts >= 0) - lie.moved,
             use_cache=False,
-            output_hidden_states=self.probe is not None,
         )
         hidden = outputs.last_hidden_state
         labels, weights = input_ids.flatten(), loss_weights.flatten()
@@ -118,10 +130,21 @@ class ResponseLearner(nn.Module):
         filling = -len(places) % _PLACES_STEP
         logits = vla.lm_head(hidden.flatten(0, 1)[F.pad(lie.before[places], (0, filling))])
         labels, weights = F.pad(labels[places], (0, filling)), F.pad(weights[places], (0, filling))
-        losses = response_loss(logits, labels, weights, self._first_code_id, code_shares)._asdict()
-        if self.probe is not None:
-            halfway = outputs.hidden_states[len(outputs.hidden_states) // 2]
-            states = halfway[torch.arange(len(halfway), device=halfway.device), lie.prompts - 1]
-            probed = self.probe(states, facts, futures)
-            losses |= probed | {"loss": losses["loss"] + probed["loss"]}
+        losses = response_loss(
+            logits,
+            labels,
+            weights,
+            self._first_code_id,
+            code_shares,
+            code_errors_m,
+            self._error_weight,
+        )._asdict()
+        if self.head is not None:
+            # Where the first code is written, a trajectory is drawn at once: metres teach faster than codes.
+            row, place = ((input_ids == self._future_start_id) & (parts > 0)).nonzero(as_tuple=True)
+            guesses = self.head(hidden[row, place].float())
+            speeds = -history[:, -4, 0] / (3 * STEP_S)
+            drawn = self.head.loss(guesses, speeds[row], futures[row])
+            losses["loss"] = losses["loss"] + self._head_weight * drawn["loss"]
+            losses["head_ade_m"] = drawn["ade_m"]
         return losses

@@ -21,16 +21,24 @@ class ResponseLoss(NamedTuple):
     Attributes:
         loss: scalar.
         code_loss: nats per trajectory code; a uniform guess has log(codebook size).
+        code_error_m: how far off the first code is expected to leave the trajectory, in metres.
         word_loss: nats per other token, forced ones included.
     """
 
     loss: Tensor
     code_loss: Tensor
+    code_error_m: Tensor
     word_loss: Tensor
 
 
 def response_loss(
-    logits: Tensor, labels: Tensor, weights: Tensor, first_code_id: int, code_shares: Tensor
+    logits: Tensor,
+    labels: Tensor,
+    weights: Tensor,
+    first_code_id: int,
+    code_shares: Tensor,
+    code_errors_m: Tensor,
+    error_weight: float = 0.0,
 ) -> ResponseLoss:
     """Cross-entropy, each token with its weight, summed over a response and averaged over responses.
 
@@ -38,7 +46,9 @@ def response_loss(
     teach tens of times less behind a plan than without one. Divided by `LOSS_UNIT`: a trajectory of weight 10
     adds the mean of its codes' losses, weighted by stage.
 
-    A code is not compared with one winner but with a distribution over its stage's codebook.
+    A code is not compared with one winner but with a distribution over its stage's codebook. Cross-entropy
+    alone spreads over all that may happen; ``error_weight`` also charges the error that a draw is expected to
+    have, which draws it together where that costs metres.
 
     Args:
         logits: [tokens, vocabulary] at the positions that predict ``labels`` (already shifted); tokens of
@@ -47,6 +57,8 @@ def response_loss(
         weights: float [tokens]; 0 leaves a token out.
         first_code_id: the id of stage 0's code 0; codes of all stages lie behind it, stage by stage.
         code_shares: float [responses >= 1, stages, size], each response's distributions, in order.
+        code_errors_m: float, of the same shape, see `SoftTarget`.
+        error_weight: nats that an expected metre counts.
 
     Raises:
         RuntimeError: other numbers of codes among ``labels`` and in ``code_shares``.
@@ -58,11 +70,16 @@ def response_loss(
     is_code = (place >= 0) & (place < stages * size)
     stage = place[is_code] // size
     ids = (first_code_id + stage * size)[:, None] + torch.arange(size, device=labels.device)
-    soft = -(code_shares.flatten(0, 1) * log_shares[is_code].gather(1, ids)).sum(dim=1)
-    losses = losses.masked_scatter(is_code, soft)
-    parts = losses.detach()
+    of_codes = log_shares[is_code].gather(1, ids)
+    soft = -(code_shares.flatten(0, 1) * of_codes).sum(dim=1)
+    expected_m = (of_codes.exp() * code_errors_m.flatten(0, 1)).sum(dim=1)
+    parts = losses.masked_scatter(is_code, soft).detach()
+    losses = losses.masked_scatter(is_code, soft + error_weight * expected_m)
+    first_error_m = expected_m.detach()[stage == 0].mean()
     is_word = ~is_code & (weights > 0)
     code_loss, word_loss = (parts[which].sum() / which.sum().clamp_min(1) for which in (is_code, is_word))
     by_stage = torch.tensor(STAGE_WEIGHTS, device=labels.device)[stage]
     weights = weights.float().masked_scatter(is_code, weights[is_code].float() * by_stage)
-    return ResponseLoss((losses * weights).sum() / (LOSS_UNIT * len(code_shares)), code_loss, word_loss)
+    return ResponseLoss(
+        (losses * weights).sum() / (LOSS_UNIT * len(code_shares)), code_loss, first_error_m, word_loss
+    )

@@ -31,7 +31,10 @@ class Recipe:
         steps, batch_size: how long.
         learning_rate, warmup_steps: cosine decay to zero behind a linear warm-up.
         vision_rate: the tower's learning rate, relative to the rest; 0 leaves the tower as it is.
-        probe: whether a `SceneProbe` is trained along.
+        tracks_share, mirror_share, blur_share: shares of the examples with tracks, mirrored, and with no
+            history but the present speed; see `Item`.
+        error_weight: nats that a metre of a code's expected error counts.
+        head_weight: of a regression of the trajectory where its first code is written.
         reflections: what becomes of the reflections of a build: ``learned`` as counterfactual examples, or
             their ``scenes`` learned once more without them; None where there are none.
         seed: of order and initialisation.
@@ -48,7 +51,11 @@ class Recipe:
     route_share: float = 0.5
     weights: SectionWeights = field(default_factory=lambda: PAPER_WEIGHTS)
     vision_rate: float = 1.0
-    probe: bool = False
+    tracks_share: float = 0.0
+    mirror_share: float = 0.0
+    blur_share: float = 0.0
+    error_weight: float = 0.0
+    head_weight: float = 0.0
     reflections: Literal["learned", "scenes"] | None = None
     seed: int = 0
 
@@ -65,55 +72,40 @@ def _with_control(*recipes: Recipe) -> tuple[Recipe, ...]:
     return (*recipes, replace(recipes[-1], name="multi-round", reflections="scenes"))
 
 
+_NANO: Final = Recipe(
+    "nano",
+    "respond",
+    steps=6000,
+    batch_size=32,
+    learning_rate=5e-4,
+    warmup_steps=200,
+    tasks={"traj_only": 0.25, "cf_vla": 0.75},
+    route_share=0.85,
+    weights=NANO_WEIGHTS,
+    # The tower sees well once it is grounded; frozen, it is asked once for all epochs.
+    vision_rate=0.0,
+    tracks_share=0.5,
+    mirror_share=0.5,
+    blur_share=0.15,
+    error_weight=0.5,
+    head_weight=0.25,
+)
+
 NANO: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe
     for recipe in _with_control(
-        Recipe(
-            "language",
-            "respond",
-            steps=6000,
+        replace(
+            _NANO,
+            name="language",
             batch_size=64,
             learning_rate=1e-3,
-            warmup_steps=200,
             pictures=False,
             tasks={"traj_only": 0.65, "cf_vla": 0.35},
-            weights=NANO_WEIGHTS,
         ),
         Recipe("ground", "ground", steps=6000, batch_size=24, learning_rate=1e-3, warmup_steps=200),
-        Recipe(
-            "traj-only",
-            "respond",
-            steps=3000,
-            batch_size=16,
-            learning_rate=5e-4,
-            warmup_steps=200,
-            tasks={"traj_only": 1.0},
-            weights=NANO_WEIGHTS,
-            probe=True,
-        ),
-        Recipe(
-            "meta-act",
-            "respond",
-            steps=6000,
-            batch_size=16,
-            learning_rate=5e-4,
-            warmup_steps=200,
-            tasks={"traj_only": 0.25, "cf_vla": 0.75},
-            weights=NANO_WEIGHTS,
-            probe=True,
-        ),
-        Recipe(
-            "counterfactual",
-            "respond",
-            steps=3000,
-            batch_size=16,
-            learning_rate=2.5e-4,
-            warmup_steps=200,
-            tasks={"traj_only": 0.25, "cf_vla": 0.75},
-            weights=NANO_WEIGHTS,
-            probe=True,
-            reflections="learned",
-        ),
+        replace(_NANO, name="traj-only", steps=3000, tasks={"traj_only": 1.0}),
+        replace(_NANO, name="meta-act"),
+        replace(_NANO, name="counterfactual", steps=3000, learning_rate=2.5e-4, reflections="learned"),
     )
 }
 """The stages of the shipped checkpoint, and the control of its last one."""

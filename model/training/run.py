@@ -31,11 +31,11 @@ from model.training.dense import DENSE_SHAPE
 from model.training.examples import Examples, load_examples
 from model.training.grounding import GroundingDataset, GroundingLearner, collate_grounding
 from model.training.learner import ResponseLearner
-from model.training.probe import SceneProbe
 from model.training.recipes import Recipe
 from model.training.reflections import OnExamples, reflections_on
 from model.training.trainer import LOG_FILE, LearnerTrainer, Validate
 from model.training.validation import open_loop
+from model.training.vision_cache import open_vision
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def run(
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
     on_examples = None if reflections is None else reflections_on(examples, read_reflections(reflections))
-    learner, dataset, sampler, collator = _prepare(recipe, loaded, examples, on_examples, settings.compiled)
+    learner, dataset, sampler, collator = _prepare(recipe, loaded, examples, on_examples, settings)
     trainer = LearnerTrainer(
         learner,
         recipe,
@@ -179,19 +179,23 @@ def last_whole_state(folder: Path) -> str | None:
 
 
 def _prepare(
-    recipe: Recipe, loaded: Loaded, examples: Examples, on_examples: OnExamples | None, compiled: bool
+    recipe: Recipe, loaded: Loaded, examples: Examples, on_examples: OnExamples | None, settings: RunSettings
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
     if recipe.goal == "ground":
         grounding = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE)
         looked_at = GroundingDataset(examples, loaded.inputs, recipe.seed)
         return grounding, looked_at, None, collate_grounding
-    dataset = ResponseDataset(
+    vision = None
+    if recipe.pictures and recipe.vision_rate == 0:
+        vision = open_vision(loaded, examples, settings.cache, mirrored=recipe.mirror_share > 0)
+    responses = ResponseDataset(
         examples,
         loaded.codec,
         loaded.inputs,
         loaded.vocabulary,
         recipe.weights,
         pictures=recipe.pictures,
+        vision=vision,
         reflections=() if on_examples is None else on_examples.reflections,
         seed=recipe.seed,
     )
@@ -205,14 +209,21 @@ def _prepare(
         processes=int(os.environ.get("WORLD_SIZE", 1)),
         reflected=np.zeros(0, np.int64) if on_examples is None else on_examples.examples,
         reasoning=recipe.reflections == "learned",
+        tracks_share=recipe.tracks_share if loaded.settings.with_tracks else 0.0,
+        mirror_share=recipe.mirror_share,
+        blur_share=recipe.blur_share,
     )
     for part in vision_parts(loaded.model):
         part.requires_grad_(recipe.vision_rate > 0)
-    text: Any = loaded.model.config.text_config
-    probe = SceneProbe(text.hidden_size, loaded.codec.books.shape[2]) if recipe.probe else None
-    first_code_id = loaded.vocabulary.code_ids(0).start
-    learner = ResponseLearner(loaded.model, first_code_id, probe=probe, compiled=compiled)
-    return learner, dataset, sampler, collate
+    learner = ResponseLearner(
+        loaded.model,
+        loaded.vocabulary,
+        loaded.codec,
+        error_weight=recipe.error_weight,
+        head_weight=recipe.head_weight,
+        compiled=settings.compiled,
+    )
+    return learner, responses, sampler, collate
 
 
 def _inherit_log(log: Path, sources: Sequence[Path]) -> None:

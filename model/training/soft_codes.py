@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.trajectory import FloatArray
+from model.driving.trajectory import FUTURE_STEPS, FloatArray
 from model.network.codec import TrajectoryCodec
 
 _SOFTNESS: Final = 0.5
@@ -20,10 +20,18 @@ _SOFTNESS: Final = 0.5
 
 
 class SoftTarget(NamedTuple):
-    """Codes int64 [6] drawn for one trajectory, and the distributions float32 [6, K] they came from."""
+    """What the codes of one trajectory should be.
+
+    Attributes:
+        codes: int64 [6], drawn.
+        shares: float32 [6, K], the distributions they were drawn from.
+        errors_m: float32 [6, K], how far off, behind the codes before it, a codeword leaves the trajectory:
+            root mean square metres over the horizon.
+    """
 
     codes: npt.NDArray[np.int64]
     shares: FloatArray
+    errors_m: FloatArray
 
 
 class SoftCodes:
@@ -45,12 +53,15 @@ class SoftCodes:
         """A target for one vector [d]."""
         stages, size = self._squares.shape
         codes, shares = np.empty(stages, np.int64), np.empty((stages, size), np.float32)
+        errors = np.empty((stages, size), np.float32)
         rest = vector.astype(np.float32)
         for stage, book in enumerate(self._books):
-            cost = (self._squares[stage] - 2 * book @ rest) / self._widths[stage]
+            squares = self._squares[stage] - 2 * book @ rest
+            errors[stage] = np.sqrt(np.maximum(squares + rest @ rest, 0.0) / FUTURE_STEPS)
+            cost = squares / self._widths[stage]
             weights = np.exp(cost.min() - cost)
             shares[stage] = weights / weights.sum()
             codes[stage] = np.searchsorted(np.cumsum(shares[stage]), random.random() * shares[stage].sum())
             codes[stage] = min(codes[stage], size - 1)
             rest = rest - book[codes[stage]]
-        return SoftTarget(codes, shares)
+        return SoftTarget(codes, shares, errors)

@@ -11,7 +11,9 @@ from accelerate.data_loader import BatchSamplerShard
 
 from model.driving.plan import parse_plan
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from model.driving.trajectory import present_speed
 from model.network.checkpoint import Loaded, load
+from model.network.vocabulary import FUTURE_START
 from model.training.batches import Item, ResponseDataset, Sample, TaskSampler, collate
 from model.training.examples import Examples
 from model.training.learner import ResponseLearner
@@ -90,7 +92,7 @@ def test_only_the_response_weighs(loaded: Loaded) -> None:
 def test_padding_changes_no_loss(loaded: Loaded) -> None:
     """A batch's loss is the mean of its responses' losses: padding and neighbours do not matter."""
     data = dataset(loaded)
-    learner = ResponseLearner(loaded.model, loaded.vocabulary.code_ids(0).start)
+    learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec)
     samples = [data[Item(1, "cf_vla", True)], data[Item(2, "traj_only", False)]]
     with torch.no_grad():
         alone = [float(learner(**collate([sample]))["loss"]) for sample in samples]
@@ -100,7 +102,7 @@ def test_padding_changes_no_loss(loaded: Loaded) -> None:
 
 def test_learning_without_pictures_leaves_the_tower_alone(loaded: Loaded) -> None:
     data = dataset(loaded, pictures=False)
-    learner = ResponseLearner(loaded.model, loaded.vocabulary.code_ids(0).start)
+    learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec)
     loss = learner(**collate([data[Item(1, "cf_vla", False)]]))["loss"]
     loss.backward()
     assert all(parameter.grad is None for parameter in loaded.model.model.visual.parameters())
@@ -157,11 +159,15 @@ def test_responses_that_share_a_prompt_do_not_see_each_other(loaded: Loaded) -> 
     data = dataset(loaded, *texts)
     samples = [data[Item(2, "cf_vla", True, (0, 1, 2))], data[Item(4, "cf_vla", False, (1,))]]
     alone = [
-        replace(sample, responses=[response], code_shares=shares[None])
+        replace(sample, responses=[response], code_shares=shares[None], code_errors_m=errors_m[None])
         for sample in samples
-        for response, shares in zip(sample.responses, sample.code_shares, strict=True)
+        for response, shares, errors_m in zip(
+            sample.responses, sample.code_shares, sample.code_errors_m, strict=True
+        )
     ]
-    learner = ResponseLearner(loaded.model, loaded.vocabulary.code_ids(0).start)
+    learner = ResponseLearner(
+        loaded.model, loaded.vocabulary, loaded.codec, error_weight=0.5, head_weight=0.25
+    )
 
     def learned(batch: list[Sample]) -> tuple[float, torch.Tensor]:
         loaded.model.zero_grad()
@@ -199,3 +205,72 @@ def test_a_counterfactual_example_learns_everything_but_the_wrong_plan(loaded: L
     assert loaded.vocabulary.decode(weighed).startswith("Thinking:")
     assert "Wait" not in loaded.vocabulary.decode(weighed)
     assert "Thinking:" not in loaded.vocabulary.decode(plain.ids)
+
+
+def test_each_chance_is_taken_as_often_as_asked() -> None:
+    sampler = TaskSampler(
+        np.ones(4000, np.bool_),
+        16,
+        {"cf_vla": 1.0},
+        0.8,
+        seed=0,
+        reflected=np.arange(0, 4000, 8),
+        tracks_share=0.5,
+        mirror_share=0.3,
+        blur_share=0.1,
+    )
+    batches = list(sampler)
+    items = [item for batch in batches for item in batch]
+    for name, share in (("tracks", 0.5), ("mirror", 0.3), ("blur", 0.1)):
+        plain = [getattr(item, name) for item in items if not item.reflections]
+        assert np.mean(plain) == pytest.approx(share, abs=0.03), name
+    reflected = [item for item in items if item.reflections]
+    assert not any(item.mirror for item in reflected), "what was said of it names left and right"
+    assert 0.3 < np.mean([item.tracks for item in reflected]) < 0.7
+    mixed = [batch for batch in batches if len({(item.route, item.tracks) for item in batch}) > 1]
+    assert len(mixed) <= 8
+
+
+def test_a_mirrored_example_is_the_example_of_the_mirrored_scene(resampling_checkpoint: Path) -> None:
+    loaded = load(resampling_checkpoint)
+    data = ResponseDataset(
+        EXAMPLES, loaded.codec, loaded.inputs, loaded.vocabulary, PAPER_WEIGHTS, pictures=True
+    )
+    plain = data[Item(1, "cf_vla", True, tracks=True)]
+    swapped = data[Item(1, "cf_vla", True, tracks=True, mirror=True)]
+    np.testing.assert_array_equal(swapped.history, plain.history * [1, -1, 1, -1])
+    np.testing.assert_array_equal(swapped.future, plain.future * [1, -1, 1, -1])
+    np.testing.assert_array_equal(swapped.route, plain.route * [1, -1])
+    assert swapped.prompt == plain.prompt
+    assert swapped.patches is not None
+    assert plain.patches is not None
+    assert not np.array_equal(swapped.patches, plain.patches)
+
+
+def test_a_blurred_history_keeps_nothing_but_the_speed(loaded: Loaded) -> None:
+    data = dataset(loaded)
+    plain, blurred = data[Item(1, "cf_vla", True)], data[Item(1, "cf_vla", True, blur=True)]
+    assert present_speed(blurred.history) == pytest.approx(present_speed(plain.history), rel=1e-4)
+    assert not blurred.history[:, 1:].any()
+    np.testing.assert_array_equal(blurred.future, plain.future)
+
+
+def test_the_head_draws_where_the_first_code_is_written(loaded: Loaded) -> None:
+    data = dataset(loaded, "The car ahead has stopped: slow down.")
+    batch = collate([data[Item(2, "cf_vla", True, (0,))], data[Item(4, "cf_vla", False)]])
+    learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec, head_weight=1.0)
+    assert learner.head is not None
+    with torch.no_grad():
+        learner.head.best.weight.normal_(std=0.1)  # it begins at the same trajectory for everybody
+    parts = learner(**batch)
+    plain = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec)(**batch)
+    assert float(parts["loss"].detach()) > float(plain["loss"].detach())
+    # What follows the first code is not seen; another word of the plan is.
+    ids = batch["input_ids"]
+    start = loaded.vocabulary.id_of(FUTURE_START)
+    for row in range(2):
+        place = int((ids[row] == start).nonzero()[-1])
+        ids[row, place + 1] = loaded.vocabulary.code_ids(0).start
+    torch.testing.assert_close(learner(**batch)["head_ade_m"], parts["head_ade_m"])
+    ids[0, int((batch["loss_weights"][0] > 0).int().argmax())] = 7
+    assert learner(**batch)["head_ade_m"] != parts["head_ade_m"]

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from model.network.checkpoint import Loaded, load
+from model.network.patches import patchify
+from model.training.batches import Item, ResponseDataset, collate
+from model.training.examples import Examples, example_frames
+from model.training.learner import ResponseLearner
+from model.training.targets import PAPER_WEIGHTS
+from model.training.vision_cache import VisionCache, open_vision
+from tests.model.training.scenes import training_scene
+
+EXAMPLES = Examples.from_scenes((training_scene(k) for k in range(20)), (FRONT_WIDE, FRONT_TELE))
+
+
+@pytest.fixture(scope="module")
+def loaded(resampling_checkpoint: Path) -> Loaded:
+    return load(resampling_checkpoint)
+
+
+def seen_now(loaded: Loaded, index: int, mirror: bool) -> torch.Tensor:
+    settings = loaded.settings
+    patches = patchify(example_frames(EXAMPLES, index, mirror, loaded.inputs), settings)
+    with torch.inference_mode():
+        return loaded.model.vision(torch.from_numpy(patches), torch.tensor([settings.grid] * 2))
+
+
+def test_the_cache_holds_what_the_tower_sees(loaded: Loaded, tmp_path: Path) -> None:
+    cache = open_vision(loaded, EXAMPLES, tmp_path, mirrored=True)
+    for index, mirror in ((0, False), (3, True), (19, True)):
+        kept = torch.from_numpy(cache.tokens(index, mirror).astype(np.float32))
+        # Worked out in bfloat16, and kept in float16.
+        torch.testing.assert_close(kept, seen_now(loaded, index, mirror), rtol=0.1, atol=0.05)
+
+
+def test_a_killed_cache_goes_on_where_it_was(loaded: Loaded, tmp_path: Path) -> None:
+    done: list[int] = []
+
+    def killed(so_far: int, total: int) -> None:
+        done.append(so_far)
+        if so_far >= 16:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        open_vision(loaded, EXAMPLES, tmp_path, mirrored=False, on_done=killed)
+    open_vision(loaded, EXAMPLES, tmp_path, mirrored=False, on_done=lambda so_far, total: done.append(so_far))
+    assert done == [16, 20]
+    open_vision(loaded, EXAMPLES, tmp_path, mirrored=False, on_done=lambda so_far, total: done.append(so_far))
+    assert done == [16, 20], "what is there is not worked out again"
+
+
+def test_another_tower_has_another_cache(loaded: Loaded, resampling_checkpoint: Path, tmp_path: Path) -> None:
+    other = load(resampling_checkpoint)
+    with torch.no_grad():
+        other.model.model.visual.merger.mlp[0].weight.add_(0.1)
+    first = open_vision(loaded, EXAMPLES, tmp_path, mirrored=False)
+    second = open_vision(other, EXAMPLES, tmp_path, mirrored=False)
+    assert not np.array_equal(first.tokens(0, False), second.tokens(0, False))
+
+
+def test_mirror_images_that_nobody_asked_for_are_not_there(loaded: Loaded, tmp_path: Path) -> None:
+    cache = open_vision(loaded, EXAMPLES, tmp_path, mirrored=False)
+    assert not cache.mirrored
+    with pytest.raises(IndexError):
+        cache.tokens(0, True)
+
+
+def test_learning_from_the_cache_is_learning_from_the_pictures(loaded: Loaded) -> None:
+    tokens = np.stack([seen_now(loaded, index, False).numpy() for index in range(2)])[None]
+
+    def loss(vision: VisionCache | None) -> float:
+        data = ResponseDataset(
+            EXAMPLES,
+            loaded.codec,
+            loaded.inputs,
+            loaded.vocabulary,
+            PAPER_WEIGHTS,
+            pictures=True,
+            vision=vision,
+        )
+        items = [Item(0, "cf_vla", False, tracks=True), Item(1, "cf_vla", False, tracks=True)]
+        torch.manual_seed(0)
+        learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec, head_weight=0.5)
+        with torch.no_grad():
+            return float(learner(**collate([data[item] for item in items]))["loss"])
+
+    assert loss(VisionCache(tokens.astype(np.float16))) == pytest.approx(loss(None), rel=1e-3)
