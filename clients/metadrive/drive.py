@@ -7,26 +7,31 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 import numpy as np
-import shapely
 
 from clients.metadrive.actors import STEP_S, Body
 from clients.metadrive.annotate import route_ahead
 from clients.metadrive.episode import World, make_world
 from clients.metadrive.episode_log import EpisodeLog
+from clients.metadrive.fork import kind_of
 from clients.metadrive.pilots import Pilot, Planned
 from clients.metadrive.rig import Picture, Rig
 from clients.metadrive.roads import Array
 from clients.metadrive.stage import Stage
 from clients.metadrive.tracking import FreeVehicle, world_trajectory
+from clients.metadrive.tracks import tracks_at
 from clients.metadrive.windows import PICTURE_STEPS, history_at
-from model.driving.metrics import box_corners
-from model.driving.scene import CLIP_FRAMES, EGO_LENGTH_M, EGO_WIDTH_M, Clip, Scene
+from model.driving.cameras import FRONT_CAMERAS, CameraSpec
+from model.driving.images import encode_jpeg
+from model.driving.scene import CLIP_FRAMES, Clip, Scene
 
 TAKE_OVER: Final = PICTURE_STEPS * (CLIP_FRAMES - 1)
 """The expert drives so many steps, until there are clips and a history."""
 EXPERT: Final = "expert"
 LOST_STEPS: Final = 20
 """Off the road for two seconds, an episode ends."""
+
+BLANK: Final = encode_jpeg(np.zeros((14, 28, 3), np.uint8))
+"""The picture that is given to pilots who do not look: rendering is what takes the time."""
 
 Ended = Literal["time", "route_end", "collision", "off_road"]
 
@@ -52,6 +57,7 @@ class Drive:
         seed: of the episode.
         ended: how it ended.
         driven_m: along the route, from where the driver took over.
+        hit: what it collided with, if it did.
         off_road: whether it ever left the road.
         jerk_ms3: 95th percentile of the absolute jerk along the way.
         lateral_ms2: 95th percentile of the absolute sideways acceleration.
@@ -70,6 +76,7 @@ class Drive:
     thought: float | None = None
     late: int = 0
     milliseconds: float | None = None
+    hit: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,25 +109,31 @@ class _Plans:
 def drive(
     seed: int,
     pilot: Pilot | None,
-    rig: Rig,
+    rig: Rig | None,
     config: DriveConfig = DriveConfig(),
     on_shot: Callable[[Shot], None] | None = None,
+    on_plan: Callable[[World, Scene], None] | None = None,
 ) -> Drive:
     """Drive one episode; the world around is the same for every driver until it has to react to it.
 
     Args:
         seed: of the episode.
         pilot: who plans; None for the expert.
-        rig: of cameras.
+        rig: of cameras; None where nobody looks.
         config: see there.
         on_shot: told every moment with pictures.
+        on_plan: told every moment at which the pilot plans, and what it sees then.
 
     Raises:
         MapError: no map fits the seed.
         PlannerError: the pilot's service does not answer.
     """
     world = make_world(seed, config.duration_s)
-    stage = Stage(world.live, rig)
+    stage = None
+    if on_shot is not None or (pilot is not None and pilot.needs_pictures):
+        if rig is None:
+            raise ValueError("pictures are wanted, and there is no rig to take them")
+        stage = Stage(world.live, rig)
     plans, shots = _Plans(), dict[int, list[Picture]]()
     way: Array | None = None
     planned_at, outside, left_road = 0, 0, False
@@ -130,18 +143,20 @@ def drive(
         began_m = world.ego.progress
         while not world.ended and outside < LOST_STEPS:
             step = world.now
-            if step % PICTURE_STEPS == 0 and (pilot is not None or on_shot is not None):
+            if step % PICTURE_STEPS == 0 and stage is not None:
                 shots[step] = stage.shoot(step)
             if step == TAKE_OVER:
                 began_m = world.ego.progress
                 if pilot is not None:
                     world.ego = FreeVehicle.from_rails(world.ego)
             if pilot is not None and step >= TAKE_OVER and (step - TAKE_OVER) % every == 0:
-                scene = _scene(world, step, shots, rig)
+                scene = _scene(world, step, shots, FRONT_CAMERAS if rig is None else rig.specs)
+                if on_plan is not None:
+                    on_plan(world, scene)
                 plans.made.append(pilot.plan(scene))
                 way = world_trajectory(world.live.ego[step], plans.made[-1].trajectory)
                 planned_at = step
-            if step >= TAKE_OVER and _is_outside(world):
+            if step >= TAKE_OVER and world.is_off_road:
                 left_road = True
                 # The expert is on rails: it finds back.
                 outside += pilot is not None
@@ -154,7 +169,8 @@ def drive(
             world.move(near, _driver(world, way, (step - planned_at) * STEP_S))
             near = world.remember()
     finally:
-        stage.close()
+        if stage is not None:
+            stage.close()
     ended: Ended = "off_road" if outside >= LOST_STEPS else world.outcome
     return Drive(
         seed,
@@ -163,6 +179,7 @@ def drive(
         left_road,
         *_comfort(world.log().ego[TAKE_OVER:]),
         **plans.told(),
+        hit=None if world.hit is None else kind_of(world.hit),
     )
 
 
@@ -173,21 +190,16 @@ def _driver(world: World, way: Array | None, age_s: float) -> Callable[[list[Bod
     return lambda _: ego.follow(way, age_s, world.live.road_map)
 
 
-def _scene(world: World, step: int, shots: dict[int, list[Picture]], rig: Rig) -> Scene:
+def _scene(world: World, step: int, shots: dict[int, list[Picture]], cameras: Sequence[CameraSpec]) -> Scene:
     """What the car sees now; nothing of the world but through its cameras, its motion and its way."""
     times = [step - PICTURE_STEPS * k for k in reversed(range(CLIP_FRAMES))]
     clips = tuple(
-        Clip(spec.name, tuple(shots[at][index].jpeg for at in times)) for index, spec in enumerate(rig.specs)
+        Clip(spec.name, tuple(shots[at][index].jpeg if shots else BLANK for at in times))
+        for index, spec in enumerate(cameras)
     )
-    name = f"{world.live.seed:06d}-{step:04d}"
-    return Scene(name, clips, history_at(world.live, step), route_ahead(world.live, step))
-
-
-def _is_outside(world: World) -> bool:
-    """Whether a corner of the car is off the road."""
-    ego = world.ego
-    corners = box_corners(np.array([ego.x, ego.y, ego.heading]), EGO_LENGTH_M, EGO_WIDTH_M)
-    return not bool(shapely.contains_xy(world.live.road_map.drivable, corners[:, 0], corners[:, 1]).all())
+    log = world.live
+    name = f"{log.seed:06d}-{step:04d}"
+    return Scene(name, clips, history_at(log, step), route_ahead(log, step), tracks_at(log, step))
 
 
 def _comfort(ego: Array) -> tuple[float, float]:

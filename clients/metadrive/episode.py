@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -9,6 +10,7 @@ from itertools import count
 from typing import Final
 
 import numpy as np
+import shapely
 
 from clients.metadrive.actors import STEP_S, VEHICLE_MODELS, Body, Pedestrian, Vehicle
 from clients.metadrive.drifts import Drifter
@@ -19,6 +21,7 @@ from clients.metadrive.hazards import Director
 from clients.metadrive.lapses import Lapses
 from clients.metadrive.maps import make_map
 from clients.metadrive.roads import Array, RoadMap
+from clients.metadrive.tracking import FreeVehicle
 from model.driving.metrics import box_corners
 from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
 
@@ -77,6 +80,7 @@ class World:
         ego: the vehicle whose episode it is; whoever drives it may put another one in its place.
         outcome: how it ended; ``time`` while it runs.
         ended: whether it did.
+        hit: whom the ego collided with, if it did.
     """
 
     def __init__(
@@ -93,6 +97,7 @@ class World:
         self._steps = steps
         self.outcome: Outcome = "time"
         self.ended = False
+        self.hit: Body | None = None
         self._ids = count(1)
         self._limits = SpeedLimits(road_map.rails, style.lateral)
         self._oncoming_limits = SpeedLimits(road_map.oncoming_rails, 2.0)
@@ -195,9 +200,10 @@ class World:
 
     def remember(self) -> list[Body]:
         """Write this moment into the log, and see whether it is the last; returns who is near."""
-        ego, near = self.ego, self._near()
+        ego, near = self.ego, self.nearby()
         self._recorder.add(ego, *self._lane(), near)
-        if self._hits(near):
+        self.hit = self._hit(near)
+        if self.hit is not None:
             self.outcome, self.ended = "collision", True
         elif ego.progress > self._map.length - 25:
             self.outcome, self.ended = "route_end", True
@@ -221,7 +227,8 @@ class World:
         """Move the ego as the expert does."""
         self._expert.step(self.ego, near)
 
-    def _near(self) -> list[Body]:
+    def nearby(self) -> list[Body]:
+        """Who is near the ego now."""
         ego = self.ego
         near: list[Body] = []
         for body in self._bodies:
@@ -267,7 +274,7 @@ class World:
                 return other.lane_at(other.s_at(ego.progress)), offset - side * lane.width
         return lane.lane_id, offset
 
-    def _hits(self, near: list[Body]) -> bool:
+    def _hit(self, near: list[Body]) -> Body | None:
         ego = self.ego
         for body in near:
             if math.hypot(body.x - ego.x, body.y - ego.y) > 6.0:
@@ -275,8 +282,28 @@ class World:
             mine = box_corners(np.array([ego.x, ego.y, ego.heading]), EGO_LENGTH_M, EGO_WIDTH_M)
             theirs = box_corners(np.array([body.x, body.y, body.heading]), *body.size[:2])
             if _overlap(mine, theirs):
-                return True
-        return False
+                return body
+        return None
+
+    @property
+    def is_off_road(self) -> bool:
+        """Whether a corner of the ego is beside the road now."""
+        ego = self.ego
+        corners = box_corners(np.array([ego.x, ego.y, ego.heading]), EGO_LENGTH_M, EGO_WIDTH_M)
+        return not bool(shapely.contains_xy(self._map.drivable, corners[:, 0], corners[:, 1]).all())
+
+    def copied(self, steps: int) -> World:
+        """This world once more, with ``steps`` more to go from now on; the map is shared.
+
+        What happens in the copy does not happen here. Its expert begins with a fresh memory where somebody
+        else has driven: it was not there when what it would remember happened.
+        """
+        world = copy.deepcopy(self, {id(self._map): self._map})
+        world._steps = world._recorder.steps + steps
+        world._recorder.make_room(world._steps)
+        if isinstance(world.ego, FreeVehicle):
+            world._expert.forget()
+        return world
 
 
 def _overlap(first: Array, second: Array) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -106,6 +106,24 @@ class Recorder:
             ),
         )
 
+    def make_room(self, steps: int) -> None:
+        """Let there be room for at least so many steps in all."""
+        more = steps - len(self.live.ego)
+        if more <= 0:
+            return
+        live = self.live
+        grown = {
+            name: _longer(getattr(live, name), more)
+            for name in ("ego", "lanes", "lane_offsets", "rails", "progress", "strays")
+        }
+        actors = tuple(
+            replace(
+                actor, **{name: _longer(getattr(actor, name), more) for name in ("poses", "lights", "phase")}
+            )
+            for actor in live.actors
+        )
+        self.live = replace(live, actors=actors, **grown)
+
     def add(self, ego: Vehicle, lane: int, lane_offset: float, near: Sequence[Body]) -> None:
         """Remember a moment."""
         log, step = self.live, self.steps
@@ -139,6 +157,12 @@ class Recorder:
             live.strays[past],
             actors,
         )
+
+
+def _longer(track: Any, steps: int) -> Any:
+    """``track`` with ``steps`` more rows of what has not happened yet."""
+    empty = np.nan if track.dtype.kind == "f" and track.ndim > 1 else 0
+    return np.concatenate([track, np.full((steps, *track.shape[1:]), empty, track.dtype)])
 
 
 def lights_on(bits: int) -> frozenset[Light]:

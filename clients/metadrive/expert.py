@@ -66,6 +66,10 @@ class Expert:
         """Whether it is backing out."""
         return self._memory.reversing
 
+    def forget(self) -> None:
+        """Begin anew: what it has in mind is of another time."""
+        self._memory = _Memory()
+
     def step(self, me: Vehicle, bodies: list[Body]) -> None:
         """Decide and move one step."""
         rails = self._map.rails if me.on_route else self._map.oncoming_rails

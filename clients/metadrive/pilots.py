@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -45,6 +45,11 @@ class Pilot(Protocol):
         """Of its row in the table."""
         ...
 
+    @property
+    def needs_pictures(self) -> bool:
+        """Whether it looks at the scene's pictures; if not, nothing is rendered."""
+        ...
+
     def plan(self, scene: Scene) -> Planned:
         """What to do in ``scene``."""
         ...
@@ -54,6 +59,7 @@ class ConstantVelocity:
     """Goes straight on at its present speed: the floor."""
 
     name = "constant velocity"
+    needs_pictures = False
 
     def plan(self, scene: Scene) -> Planned:
         """See `Pilot.plan`."""
@@ -70,6 +76,8 @@ class ServicePilot:
         route: whether the model is told the route.
     """
 
+    needs_pictures = True
+
     def __init__(
         self, planner: PlannerClient, name: str, controls: wire.Controls, *, route: bool = True
     ) -> None:
@@ -80,7 +88,7 @@ class ServicePilot:
         """See `Pilot.plan`; raises `PlannerError`."""
         controls = self._controls.model_copy(update={"seed": self._controls.seed + self._asked})
         self._asked += 1
-        asked = scene if self._route else Scene(scene.scene_id, scene.clips, scene.history)
+        asked = replace(scene, route=scene.route if self._route else None, tracks=None)
         began_s = time.perf_counter()
         result = self._planner.plan(asked, controls)
         milliseconds = 1000 * (time.perf_counter() - began_s)

@@ -26,7 +26,7 @@ _AHEAD_BONUS_M: Final = 15.0
 """What is ahead counts as nearer by this: it decides more."""
 _MAX_SPEED_MS: Final = 150.0
 _MAX_SIZE_M: Final = 50.0
-_SPEED_STEPS: Final = 2
+SPEED_STEPS: Final = 2
 
 
 @dataclass(frozen=True)
@@ -99,14 +99,14 @@ def track_of(agent: Agent) -> Track | None:
     here = agent.poses[now]
     if not np.isfinite(here).all():
         return None
-    other, sign = agent.poses[now - _SPEED_STEPS], 1.0
+    other, sign = agent.poses[now - SPEED_STEPS], 1.0
     if not np.isfinite(other).all():
-        other, sign = agent.poses[now + _SPEED_STEPS], -1.0
+        other, sign = agent.poses[now + SPEED_STEPS], -1.0
     speed = 0.0
     if np.isfinite(other).all():
         moved = sign * (here[:2] - other[:2])
         along = math.cos(here[2]) * moved[0] + math.sin(here[2]) * moved[1]
-        speed = float(along) / (_SPEED_STEPS * STEP_S)
+        speed = float(along) / (SPEED_STEPS * STEP_S)
     heading = math.remainder(float(here[2]), 2 * math.pi)
     size = agent.length_m, agent.width_m
     return Track(float(here[0]), float(here[1]), heading, speed, *size, agent.kind, agent.lights)

@@ -8,19 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from model.driving.intervals import Array, Interval, episode_weights, interval_of
 from model.evaluation.open_loop import SceneResult
-
-Array = npt.NDArray[np.float64]
-Interval = tuple[float, float]
-
-RESAMPLES: Final = 2000
-"""Enough that a 95 % bound moves by about a hundredth of the interval's width from seed to seed."""
-_SEED: Final = 20_240_601
 
 
 def mean_interval(results: Sequence[SceneResult], measure: str) -> tuple[float | None, Interval | None]:
@@ -28,7 +20,7 @@ def mean_interval(results: Sequence[SceneResult], measure: str) -> tuple[float |
     sums, counts = _per_episode([results], measure)
     if not counts.any():
         return None, None
-    return float(sums[0].sum() / counts.sum()), _percentiles(_resampled(sums, counts)[0])
+    return float(sums[0].sum() / counts.sum()), interval_of(_resampled(sums, counts)[0])
 
 
 @dataclass(frozen=True)
@@ -84,9 +76,9 @@ def compare(
         value=value,
         against=base,
         difference=value - base,
-        difference_interval=_percentiles(resampled[0] - resampled[1]),
+        difference_interval=interval_of(resampled[0] - resampled[1]),
         ratio=value / base if base else None,
-        ratio_interval=_percentiles(resampled[0] / resampled[1]) if has_ratio else None,
+        ratio_interval=interval_of(resampled[0] / resampled[1]) if has_ratio else None,
     )
 
 
@@ -109,11 +101,6 @@ def _resampled(sums: Array, counts: Array) -> Array:
     present = counts > 0
     sums, counts = sums[:, present], counts[present]
     episodes = len(counts)
-    weights = np.random.default_rng(_SEED).multinomial(episodes, np.full(episodes, 1 / episodes), RESAMPLES)
+    weights = episode_weights(episodes)
     means: Array = (sums @ weights.T) / (counts @ weights.T)
     return means
-
-
-def _percentiles(values: Array) -> Interval:
-    low, high = np.percentile(values, [2.5, 97.5])
-    return float(low), float(high)

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+from model.driving.intervals import Interval
 from model.engines.engine import Thinking
-from model.evaluation.bootstrap import Comparison, Interval, mean_interval
+from model.evaluation.bootstrap import Comparison, mean_interval
 from model.evaluation.open_loop import MEASURES, SceneResult
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ class SmallSettings:
         steps, batch_size: how long.
         learning_rate, weight_decay: of AdamW; cosine decay to zero behind a short warm-up.
         dropout: of the trunk.
+        own_share: of a batch that is of the planner's own states, where there are any.
         seed: of order and weights.
     """
 
@@ -37,6 +39,7 @@ class SmallSettings:
     learning_rate: float = 1e-3
     weight_decay: float = 0.03
     dropout: float = 0.2
+    own_share: float = 0.4
     seed: int = 0
 
 
@@ -92,6 +95,41 @@ class SmallExamples:
         inputs = SmallInputs(*(torch.from_numpy(part) for part in (history, route, tracks)))
         return cls(inputs, torch.from_numpy(future), torch.from_numpy(episode))
 
+    def joined(self, other: SmallExamples) -> SmallExamples:
+        """These examples and others."""
+        mine, theirs = self.inputs, other.inputs
+        inputs = SmallInputs(
+            torch.cat([mine.history, theirs.history]),
+            torch.cat([mine.route, theirs.route]),
+            torch.cat([mine.tracks, theirs.tracks]),
+        )
+        return SmallExamples(
+            inputs, torch.cat([self.futures, other.futures]), torch.cat([self.episodes, other.episodes])
+        )
+
+    def save(self, path: Path) -> None:
+        """Keep the examples in one file, whole or not at all."""
+        inputs = self.inputs
+        temporary = path.with_name(f".{path.name}.tmp.npz")
+        np.savez(
+            temporary,
+            history=inputs.history.numpy(),
+            route=inputs.route.numpy(),
+            tracks=inputs.tracks.numpy(),
+            future=self.futures.numpy(),
+            episode=self.episodes.numpy(),
+        )
+        temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> SmallExamples:
+        """What `save` kept; raises ValueError for a file that holds something else."""
+        try:
+            with np.load(path) as arrays:
+                return cls.of_arrays(**{name: arrays[name] for name in arrays.files})
+        except (OSError, TypeError, BadZipFile) as error:
+            raise ValueError(f"{path} holds no examples of small planners: {error}") from error
+
     def mirrored(self) -> SmallExamples:
         """The same scenes with left and right swapped."""
         inputs = self.inputs
@@ -106,6 +144,7 @@ def fit_small(
     examples: SmallExamples,
     codec: TrajectoryCodec,
     settings: SmallSettings = SmallSettings(),
+    own: SmallExamples | None = None,
     on_step: Callable[[int, float], None] | None = None,
 ) -> SmallPlanner:
     """Train a small planner on scenes and their mirror images.
@@ -115,12 +154,15 @@ def fit_small(
         examples: to learn from.
         codec: whose space it plans in.
         settings: see there.
+        own: examples of the planner's own states; `SmallSettings.own_share` of each batch is of them.
         on_step: told each step and the running mean of the training ADE in metres.
     """
     with torch.random.fork_rng():
         torch.manual_seed(settings.seed)
         planner = SmallPlanner(kind, codec, settings.dropout).train()
         sides = (examples, examples.mirrored())
+        own_sides = None if own is None else (own, own.mirrored())
+        own_count = 0 if own is None else round(settings.own_share * settings.batch_size)
         optimizer = torch.optim.AdamW(
             planner.parameters(),
             settings.learning_rate,
@@ -132,10 +174,10 @@ def fit_small(
             rate = settings.learning_rate * min(1.0, (step + 1) / warm)
             for group in optimizer.param_groups:
                 group["lr"] = rate * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
-            side = sides[step % 2]
-            rows = torch.randint(len(side), (settings.batch_size,))
-            inputs = side.inputs[rows]
-            losses = planner.head.loss(planner(inputs), inputs.speeds_ms, side.futures[rows])
+            batch = _some(sides[step % 2], settings.batch_size - own_count)
+            if own_sides is not None:
+                batch = batch.joined(_some(own_sides[step % 2], own_count))
+            losses = planner.head.loss(planner(batch.inputs), batch.inputs.speeds_ms, batch.futures)
             optimizer.zero_grad()
             losses["loss"].backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(planner.parameters(), 1.0)
@@ -144,6 +186,11 @@ def fit_small(
             if on_step is not None:
                 on_step(step + 1, running)
     return planner.eval()
+
+
+def _some(examples: SmallExamples, count: int) -> SmallExamples:
+    rows = torch.randint(len(examples), (count,))
+    return SmallExamples(examples.inputs[rows], examples.futures[rows], examples.episodes[rows])
 
 
 @torch.inference_mode()
@@ -166,11 +213,24 @@ def train_small(
     target: Path,
     settings: SmallSettings = SmallSettings(),
     validation: Path | None = None,
+    own: Sequence[Path] = (),
     on_step: Callable[[int, float], None] | None = None,
 ) -> dict[str, float]:
-    """Train a small planner on scene folders and write it; returns its errors on validation scenes."""
+    """Train a small planner and write it; returns its errors on validation scenes.
+
+    Args:
+        kind, codec, settings, on_step: see `fit_small`.
+        scenes: files or folders of labelled scenes.
+        target: folder to write.
+        validation: scenes to measure it on.
+        own: files of its own states (`SmallExamples.save`).
+    """
     examples = SmallExamples.read(scenes)
-    planner = fit_small(kind, examples, codec, settings, on_step)
+    states = None
+    for path in own:
+        loaded = SmallExamples.load(path)
+        states = loaded if states is None else states.joined(loaded)
+    planner = fit_small(kind, examples, codec, settings, states, on_step)
     figures: dict[str, float] = {}
     if validation is not None:
         errors = small_errors(planner, SmallExamples.read([validation]))
@@ -178,6 +238,7 @@ def train_small(
     about: dict[str, object] = {
         "settings": asdict(settings),
         "scenes": len(examples),
+        "own_states": 0 if states is None else len(states),
         "episodes": len(set(examples.episodes.tolist())),
     }
     planner.save(target, about | figures)

@@ -31,6 +31,10 @@ def drive(
     ] = None,
     deadline_ms: Annotated[int | None, typer.Option(help="That each plan has.", min=1)] = None,
     route: Annotated[bool, typer.Option(help="Tell the model the route.")] = True,
+    small: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of a small planner (`train blind`, `train teacher`) that drives too."),
+    ] = None,
     keep: Annotated[
         Path | None, typer.Option(help="File that keeps every drive: started again, it goes on behind them.")
     ] = None,
@@ -55,12 +59,15 @@ def drive(
     from clients.planner import Access, Patience, PlannerClient
     from model.driving.hashing import hash_of
     from model.driving.scene import split_of_seed
+    from service.cli.small_pilot import SmallPilot
 
     def pilot_of(driver: str, planner: PlannerClient) -> Pilot | None:
         if driver == "expert":
             return None
         if driver == "constant-velocity":
             return ConstantVelocity()
+        if driver in small_pilots:
+            return small_pilots[driver]
         return ServicePilot(planner, driver, controls_of(driver), route=route)
 
     def controls_of(driver: str) -> wire.Controls:
@@ -73,12 +80,17 @@ def drive(
         )
 
     def key_of(driver: str, seed: int, models: list[str]) -> str:
+        if driver in small_pilots:
+            return hash_of(driver, seed, seconds, small_pilots[driver].revision)
         if driver in ("expert", "constant-velocity"):
             return hash_of(driver, seed, seconds)
         return hash_of(driver, seed, seconds, controls_of(driver).model_dump_json(), route, models)
 
-    wanted = drivers or list(DRIVERS[:-1])
-    if unknown := set(wanted) - set(DRIVERS):
+    with told():
+        small_pilots = {pilot.name: pilot for pilot in map(SmallPilot, small or ())}
+    wanted = [*(drivers or ([] if small else DRIVERS[:-1])), *small_pilots]
+    asks = any(driver in ("adaptive", "never", "always") for driver in wanted)
+    if unknown := set(drivers or ()) - set(DRIVERS):
         raise typer.BadParameter(f"unknown drivers: {', '.join(sorted(unknown))}")
     with (
         told(),
@@ -90,7 +102,7 @@ def drive(
             split_of_seed(seed)
         rig, film, config = Rig(), Film(), DriveConfig(seconds)
         kept = KeptDrives(keep) if keep is not None else None
-        models = [card.revision for card in planner.models()]
+        models = [card.revision for card in planner.models()] if asks else []
         found: dict[str, list[Drive]] = {}
         # Progress goes to stderr, so that stdout holds nothing but the table.
         with Progress(console=Console(stderr=True, quiet=as_json)) as progress:

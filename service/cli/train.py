@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from model.bundled import CHECKPOINT as BUNDLED_CHECKPOINT
 from service.cli.options import told
-
-if TYPE_CHECKING:
-    from model.network.small_planner import SmallKind
 
 
 def train(
@@ -57,6 +54,10 @@ def train(
     ] = None,
     compiled: Annotated[bool, typer.Option(help="Compile the decoder; pays on long runs.")] = False,
     gpu: Annotated[bool, typer.Option(help="Use the accelerators that are there.")] = False,
+    rounds: Annotated[
+        int, typer.Option(help="teacher: rounds of driving by itself and learning from it.", min=0)
+    ] = 0,
+    round_episodes: Annotated[int, typer.Option(help="teacher: episodes of a round.", min=1)] = 200,
     test: Annotated[Path | None, typer.Option(help="ladder: scenes for its table.")] = None,
     every: Annotated[int, typer.Option(help="ladder: roll out every so many-th scene.", min=1)] = 6,
     processes: Annotated[int, typer.Option(help="ladder: that train together.", min=1)] = 1,
@@ -73,8 +74,10 @@ def train(
     from model.network.small_planner import SMALL_KINDS
     from model.training.recipes import NANO, PAPER
     from model.training.run import RunSettings, create, run
+    from model.training.small import SmallSettings
     from model.training.trainer import LOG_FILE
     from service.cli.ladder import climb
+    from service.cli.small_rounds import train_small_in_rounds
 
     if threads is not None:
         torch.set_num_threads(threads)
@@ -84,7 +87,11 @@ def train(
                 typer.echo(f"codec {name} {value:.3f}")
             return
         if recipe in SMALL_KINDS:
-            _train_small(recipe, scenes, source or BUNDLED_CHECKPOINT, target, validation, steps, seed)
+            codec_from = source or BUNDLED_CHECKPOINT
+            settings = SmallSettings(seed=seed, steps=steps or SmallSettings.steps)
+            train_small_in_rounds(
+                recipe, scenes, codec_from, target, settings, validation, rounds, round_episodes
+            )
             return
         if recipe == "ladder":
             if test is None:
@@ -130,36 +137,6 @@ def train(
             reflections,
         )
         training_curves(target / LOG_FILE, target / "curves.png")
-
-
-def _train_small(
-    kind: SmallKind,
-    scenes: Path,
-    codec_from: Path,
-    target: Path,
-    validation: Path | None,
-    steps: int | None,
-    seed: int,
-) -> None:
-    from rich.progress import Progress, TextColumn
-
-    from model.network.codec import TrajectoryCodec
-    from model.training.small import SmallSettings, train_small
-
-    settings = SmallSettings(seed=seed) if steps is None else SmallSettings(seed=seed, steps=steps)
-    with Progress(*Progress.get_default_columns(), TextColumn("{task.fields[ade]}")) as progress:
-        task = progress.add_task(kind, total=settings.steps, ade="")
-        figures = train_small(
-            kind,
-            [scenes],
-            TrajectoryCodec.load(codec_from),
-            target,
-            settings,
-            validation,
-            lambda step, ade: progress.update(task, completed=step, ade=f"ADE {ade:.2f} m"),
-        )
-    for name, value in figures.items():
-        typer.echo(f"{kind} {name} {value:.3f}")
 
 
 def _options(context: typer.Context, but: Sequence[str]) -> list[str]:

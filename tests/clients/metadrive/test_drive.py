@@ -35,6 +35,7 @@ class Oracle:
     """Plans what the expert did in the same episode, from wherever the car is."""
 
     name = "oracle"
+    needs_pictures = True
 
     def __init__(self, log: EpisodeLog) -> None:
         self._log, self.scenes = log, list[Scene]()
@@ -162,7 +163,7 @@ def test_drivers_are_compared_over_the_same_episodes() -> None:
     whole = Drive(1, "time", 200.0, False, 3.0, 1.0)
     half = Drive(1, "collision", 100.0, True, 5.0, 2.0, 10, 0.2, 1, 250.0)
     expert, mine = driver_rows({EXPERT: [whole, whole], "adaptive": [half, whole]})
-    assert (expert.route_completion, mine.route_completion) == (1.0, 0.75)
+    assert (expert.route_completion, mine.route_completion) == pytest.approx((1.0, 0.75))
     assert (mine.collisions, mine.off_road, mine.deadline_misses, mine.think_rate) == (1, 1, 1, 0.2)
     assert "adaptive" in format_table([expert, mine])
     told = to_json({EXPERT: [whole], "adaptive": [half]})["drivers"]

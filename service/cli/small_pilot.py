@@ -1,0 +1,35 @@
+"""A small planner in the closed loop."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from pathlib import Path
+
+import numpy as np
+
+from clients.metadrive.pilots import Planned
+from model.driving.scene import Scene
+from model.network.small_planner import WEIGHTS_FILE, load_small
+
+
+class SmallPilot:
+    """Drives by a small planner's best guess; it looks at no picture.
+
+    Args:
+        folder: of the planner.
+    """
+
+    needs_pictures = False
+
+    def __init__(self, folder: Path) -> None:
+        self._planner = load_small(folder)
+        self.name = self._planner.kind
+        self.revision = hashlib.sha256((folder / WEIGHTS_FILE).read_bytes()).hexdigest()[:12]
+
+    def plan(self, scene: Scene) -> Planned:
+        """See `Pilot.plan`."""
+        began_s = time.perf_counter()
+        trajectory = self._planner.plan([scene])[0]
+        milliseconds = 1000 * (time.perf_counter() - began_s)
+        return Planned(trajectory, np.zeros((0, 64, 4), np.float32), milliseconds=milliseconds)
