@@ -43,7 +43,7 @@ def seed_of(seed: int, draw: int, written: int) -> int:
 
 
 class VllmPrompt(NamedTuple):
-    """A scene as vLLM takes it: token ids with one placeholder a clip, and what stands for them."""
+    """A scene as vLLM takes it: token ids with one placeholder an item, and the items."""
 
     ids: list[int]
     data: dict[str, Any]

@@ -18,12 +18,12 @@ from model.driving.scene import Scene
 from model.engines.engine import EngineError, Event, Load, ModelCard, PlanRequest, RequestError
 from model.engines.requests import begin
 from model.engines.vllm.decoding import Decoding, VllmPrompt
+from model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
 from model.engines.warm_up import warm_up
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import Active, CompiledFormat, Cursor, Rest
 from model.formats.grammar_export import to_lark
 from model.network.checkpoint import read_parts
-from model.network.vocabulary import VIDEO_PAD
 
 _ENVIRONMENT: Final = {"VLLM_NO_USAGE_STATS": "1", "HF_HUB_OFFLINE": "1", "VLLM_CPU_KVCACHE_SPACE": "2"}
 """Unless set otherwise: nothing is sent or fetched; 2 GiB of keys and values where there is no GPU."""
@@ -161,16 +161,11 @@ class VllmEngine:
             inputs = self._parts.inputs.build(scene, format)
         except ValueError as error:
             raise RequestError(str(error)) from error
-        ids, placeholder = inputs.prompt.ids, self._parts.vocabulary.id_of(VIDEO_PAD)
-        # vLLM wants one placeholder a clip and repeats it by itself.
-        kept = (ids != placeholder) | (np.roll(ids, 1) != placeholder)
-        data = {
-            "video": inputs.patches.reshape(len(inputs.video_grid_thw), -1, inputs.patches.shape[1]),
-            "history": inputs.history[None],
-        }
-        if inputs.route is not None:
-            data["route"] = inputs.route[None]
-        return VllmPrompt(ids[kept].tolist(), data)
+        ids, items = inputs.prompt.ids, items_of(inputs, self._parts.settings)
+        # vLLM wants one placeholder an item and repeats it by itself.
+        repeated = np.isin(ids, [self._parts.vocabulary.id_of(PLACEHOLDERS[kind]) for kind in items])
+        kept = ~repeated | (np.roll(ids, 1) != ids)
+        return VllmPrompt(ids[kept].tolist(), items)
 
     def _grammar_of(self, cursor: Cursor) -> str:
         assert cursor.active is not None
@@ -183,9 +178,7 @@ class VllmEngine:
 
         settings = self._parts.settings
         prompts = [len(self._parts.inputs.longest_prompt(format).ids) for format in self._card.formats]
-        limits = {"video": len(settings.cameras), "history": 1} | (
-            {"route": 1} if settings.with_route else {}
-        )
+        limits = {name: kind.items for name, kind in kinds_of(settings).items()}
         arguments = {
             "model": str(self._checkpoint),
             "dtype": self._settings.dtype,

@@ -1,6 +1,6 @@
-"""Our network as vLLM runs it: its own Qwen2.5-VL, with our encoders of history and route.
+"""Our network as vLLM runs it: its own Qwen2.5-VL, with our encoders and resampler.
 
-Prompts come as token ids with one placeholder a clip, pictures as the patches that `InputBuilder` makes: no
+Prompts come as token ids with one placeholder an item, pictures as the patches that `InputBuilder` makes: no
 processor of `transformers` takes part, and pictures are prepared alike for every engine.
 """
 
@@ -24,16 +24,14 @@ from vllm.multimodal.processing import (
     PromptReplacement,
 )
 
-from model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS
-from model.network.encoders import HistoryEncoder, RouteEncoder
+from model.engines.vllm.items import CLIPS, PLACEHOLDERS, kinds_of
+from model.network.encoders import HistoryEncoder, RouteEncoder, TrackEncoder
+from model.network.resampler import SceneResampler
 from model.network.settings import VlaSettings
 from model.network.vision import normalised
-from model.network.vocabulary import HISTORY, ROUTE, VIDEO_PAD
 
-CLIPS: Final = "video"
-"""Clips go by vLLM's own name for moving pictures: its rotary positions know that."""
-PLACEHOLDERS: Final = {CLIPS: VIDEO_PAD, "history": HISTORY, "route": ROUTE}
-"""The token that stands in a prompt for an item of each kind."""
+_ON_CPU: Final = frozenset({"video_grid_thw", "second_per_grid_ts"})
+"""Arrays that no kernel reads."""
 
 
 class _Items(ModalityDataItems[Mapping[str, Tensor], Mapping[str, Tensor]]):
@@ -58,23 +56,13 @@ class _Parser(MultiModalDataParser):
         self._settings = settings
 
     def _get_subparsers(self) -> Mapping[str, Any]:
+        # Copies: a scene's arrays are read-only, which torch warns about.
         return {
-            CLIPS: self._clips,
-            # Copies: a scene's arrays are read-only, which torch warns about.
-            "history": lambda values: _Items({"history": torch.tensor(values)}, "history"),
-            "route": lambda values: _Items({"route": torch.tensor(values)}, "route"),
+            kind: lambda arrays, kind=kind: _Items(
+                {name: torch.tensor(values) for name, values in arrays.items()}, kind
+            )
+            for kind in kinds_of(self._settings)
         }
-
-    def _clips(self, patches: Any) -> _Items:
-        count = len(patches)
-        return _Items(
-            {
-                "pixel_values_videos": torch.as_tensor(patches),
-                "video_grid_thw": torch.tensor([self._settings.grid] * count),
-                "second_per_grid_ts": torch.full((count,), self._settings.seconds_per_slice),
-            },
-            CLIPS,
-        )
 
 
 class _Info(BaseProcessingInfo):
@@ -86,62 +74,58 @@ class _Info(BaseProcessingInfo):
         return _Parser(self.settings)
 
     def get_supported_mm_limits(self) -> Mapping[str, int | None]:
-        limits: dict[str, int | None] = {CLIPS: len(self.settings.cameras), "history": 1}
-        return limits | ({"route": 1} if self.settings.with_route else {})
+        return {name: kind.items for name, kind in kinds_of(self.settings).items()}
 
     def get_mm_max_tokens_per_item(self, seq_len: int, mm_counts: Mapping[str, int]) -> Mapping[str, int]:
-        return {kind: self.settings.clip_tokens if kind == CLIPS else 1 for kind in mm_counts}
+        return {name: kinds_of(self.settings)[name].tokens for name in mm_counts}
 
 
 class _Dummies(BaseDummyInputsBuilder[_Info]):
     def get_dummy_text(self, mm_counts: Mapping[str, int]) -> str:
-        return "".join(PLACEHOLDERS[kind] * count for kind, count in mm_counts.items())
+        return "".join(PLACEHOLDERS[name] * count for name, count in mm_counts.items())
 
     def get_dummy_mm_data(
         self, seq_len: int, mm_counts: Mapping[str, int], mm_options: Mapping[str, Any]
     ) -> dict[str, Any]:
         settings = self.info.settings
-        slices, rows, columns = settings.grid
-        width = 3 * settings.temporal_patch_size * settings.patch_size**2
-        shapes: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
-            CLIPS: ((slices * rows * columns, width), np.uint8),
-            "history": ((HISTORY_STEPS, 4), np.float32),
-            "route": ((ROUTE_POINTS, 2), np.float32),
+        empty = {
+            name: {
+                array: np.zeros((mm_counts[name], *shape), type)
+                for array, (shape, type) in kind.arrays.items()
+            }
+            for name, kind in kinds_of(settings).items()
+            if mm_counts.get(name)
         }
-        return {
-            kind: np.zeros((count, *shapes[kind][0]), shapes[kind][1])
-            for kind, count in mm_counts.items()
-            if count
-        }
+        if CLIPS in empty:
+            # The tower walks along the grid, and a grid of zeros has no patch.
+            empty[CLIPS]["video_grid_thw"][:] = settings.grid
+        return empty
 
 
 class _Processor(BaseMultiModalProcessor[_Info]):
     def _get_mm_fields_config(
         self, hf_inputs: Mapping[str, Any], hf_processor_mm_kwargs: Mapping[str, object]
     ) -> Mapping[str, MultiModalFieldConfig]:
-        fields = {
-            "pixel_values_videos": MultiModalFieldConfig.batched(CLIPS),
-            "video_grid_thw": MultiModalFieldConfig.batched(CLIPS, keep_on_cpu=True),
-            "second_per_grid_ts": MultiModalFieldConfig.batched(CLIPS, keep_on_cpu=True),
-            "history": MultiModalFieldConfig.batched("history"),
-            "route": MultiModalFieldConfig.batched("route"),
+        return {
+            array: MultiModalFieldConfig.batched(name, keep_on_cpu=array in _ON_CPU)
+            for name, kind in kinds_of(self.info.settings).items()
+            for array in kind.arrays
+            if array in hf_inputs
         }
-        return {name: field for name, field in fields.items() if name in hf_inputs}
 
     def _get_prompt_updates(
         self, mm_items: Any, hf_processor_mm_kwargs: Mapping[str, object], out_mm_kwargs: Any
     ) -> Sequence[PromptReplacement]:
         words = self.info.get_tokenizer().get_vocab()
-        counts = {CLIPS: self.info.settings.clip_tokens, "history": 1, "route": 1}
         return [
-            PromptReplacement(kind, [words[token]], [words[token]] * counts[kind])
-            for kind, token in PLACEHOLDERS.items()
+            PromptReplacement(name, [words[PLACEHOLDERS[name]]], [words[PLACEHOLDERS[name]]] * kind.tokens)
+            for name, kind in kinds_of(self.info.settings).items()
         ]
 
 
 @MULTIMODAL_REGISTRY.register_processor(_Processor, info=_Info, dummy_inputs=_Dummies)
 class LookTwiceForVllm(Qwen2_5_VLForConditionalGeneration):
-    """vLLM's Qwen2.5-VL with encoders whose outputs stand at the history's and the route's token."""
+    """vLLM's Qwen2.5-VL with our encoders, and our resampler where the checkpoint has one."""
 
     # The trajectory codec lies beside the weights.
     allow_patterns_overrides: ClassVar = ["model*.safetensors"]
@@ -149,33 +133,46 @@ class LookTwiceForVllm(Qwen2_5_VLForConditionalGeneration):
     def __init__(self, *, vllm_config: VllmConfig, prefix: str = "") -> None:
         super().__init__(vllm_config=vllm_config, prefix=prefix)
         hidden_size = self.config.text_config.hidden_size
-        with self._mark_tower_model(vllm_config, {"history", "route"}):
+        self.settings = settings = VlaSettings.of_config(self.config)
+        with self._mark_tower_model(vllm_config, {*kinds_of(settings)} - {CLIPS}):
             self.history_encoder = HistoryEncoder(hidden_size)
-            if VlaSettings.of_config(self.config).with_route:
+            if settings.with_route:
                 self.route_encoder = RouteEncoder(hidden_size)
+            if settings.with_tracks:
+                self.track_encoder = TrackEncoder(hidden_size)
+            if settings.scene_tokens:
+                self.resampler = SceneResampler(hidden_size, settings.vision_tokens, settings.scene_tokens)
 
     @classmethod
     def get_placeholder_str(cls, modality: str, i: int) -> str | None:
-        """The text that stands for an item."""
+        """The text that stands for an item; vLLM's chat layout asks for it, ours does not use it."""
         return PLACEHOLDERS[modality]
 
     def iter_mm_grid_thw(self, mm_features: Iterable[Any]) -> Any:
-        """Clips take rotary positions of their own; history and route count as text."""
+        """Clips take rotary positions of their own; all else counts as text."""
         return super().iter_mm_grid_thw([each for each in mm_features if each.modality == CLIPS])
 
     def embed_multimodal(self, **kwargs: Any) -> tuple[Tensor, ...]:
         """Embeddings [tokens, hidden] of every item in order, each kind by itself."""
         embeddings: tuple[Tensor, ...] = ()
+        device = self.visual.device
         if (patches := kwargs.get("pixel_values_videos")) is not None:
-            embeddings += self._clip_tokens(patches, kwargs["video_grid_thw"])
+            embeddings += tuple(self._vision(patches.flatten(0, 1), len(patches)))
+        if (patches := kwargs.get("scene_patches")) is not None:
+            cameras = len(self.settings.cameras)
+            tokens = self._vision(patches.flatten(0, 1), len(patches) * cameras)
+            looks_along = (kwargs[f"scene_{name}"].to(device) for name in ("history", "route", "has_route"))
+            embeddings += tuple(self.resampler(tokens.view(len(patches), -1, tokens.shape[-1]), *looks_along))
         for kind in ("history", "route"):
             if (values := kwargs.get(kind)) is not None:
                 encoder = getattr(self, f"{kind}_encoder")
-                embeddings += tuple(encoder(values.to(self.visual.device))[:, None])
+                embeddings += tuple(encoder(values.to(device))[:, None])
+        if (values := kwargs.get("tracks")) is not None:
+            embeddings += tuple(self.track_encoder(values.to(device)))
         return embeddings
 
-    def _clip_tokens(self, patches: Tensor, grids: Tensor) -> tuple[Tensor, ...]:
-        """Vision tokens of clips, from uint8 patches [clips, p, 1176]."""
-        values = normalised(patches.flatten(0, 1).to(self.visual.device))
-        tokens = self.visual(values.to(self.visual.dtype), grid_thw=grids.tolist())
-        return tuple(tokens.view(len(patches), -1, tokens.shape[-1]))
+    def _vision(self, patches: Tensor, clips: int) -> Tensor:
+        """Vision tokens [clips, tokens, hidden] from uint8 patches [clips x p, width]."""
+        values = normalised(patches.to(self.visual.device)).to(self.visual.dtype)
+        tokens: Tensor = self.visual(values, grid_thw=[list(self.settings.grid)] * clips)
+        return tokens.view(clips, -1, tokens.shape[-1])

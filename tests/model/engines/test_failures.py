@@ -40,8 +40,8 @@ def test_a_scene_without_numbers_fails_alone_and_nobody_reads_what_it_wrote(
     )
     embed = exact.model.embed_prompt
 
-    def embedding(prompt: Any, vision_tokens: Any, history: Any, route: Any) -> Any:
-        embedded = embed(prompt, vision_tokens, history, route)
+    def embedding(prompt: Any, vision_tokens: Any, history: Any, *others: Any) -> Any:
+        embedded = embed(prompt, vision_tokens, history, *others)
         if history is bad.scene.history:
             embedded.embeddings[-3:] = float("nan")
         return embedded
@@ -64,10 +64,10 @@ def test_a_scene_that_cannot_be_embedded_fails_alone(exact: Loaded, monkeypatch:
     bad, good = request(BAD, 7, n=2, seed=7), request("good", 2, n=2, seed=2)
     embed = exact.model.embed_prompt
 
-    def embedding(prompt: Any, vision_tokens: Any, history: Any, route: Any) -> Any:
+    def embedding(prompt: Any, vision_tokens: Any, history: Any, *others: Any) -> Any:
         if history is bad.scene.history:
             raise ArithmeticError("no")
-        return embed(prompt, vision_tokens, history, route)
+        return embed(prompt, vision_tokens, history, *others)
 
     monkeypatch.setattr(exact.model, "embed_prompt", embedding)
     draws, failed = decode_some(Decoder(Runner(exact, 8)), bad, good)

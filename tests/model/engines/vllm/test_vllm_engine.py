@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from model.bundled import CHECKPOINT, SCENES
 from model.driving.plan import parse_plan
 from model.driving.scene import Clip, Scene
 from model.driving.scene_store import read_scenes
+from model.driving.tracks import Track
 from model.engines.engine import (
     Controls,
     Draw,
@@ -94,6 +96,15 @@ def mixed_scenes(count: int) -> list[Scene]:
     ]
 
 
+def some_tracks(seed: int) -> tuple[Track, ...]:
+    """Up to four cars."""
+    numbers = np.random.default_rng(seed)
+    return tuple(
+        Track(float(x), float(y), 0.0, float(speed), 4.5, 1.9, kind="vehicle")
+        for x, y, speed in numbers.uniform((-20, -8, 0), (60, 8, 15), (seed % 5, 3))
+    )
+
+
 def test_both_engines_write_the_same_at_temperature_0(
     loop: asyncio.AbstractEventLoop, vllm: VllmEngine, torch_engine: TorchEngine
 ) -> None:
@@ -112,6 +123,32 @@ def test_both_engines_write_the_same_at_temperature_0(
         assert mine.think_probability is not None
         assert other.think_probability == pytest.approx(mine.think_probability, rel=1e-2, abs=1e-6)
         np.testing.assert_array_equal(mine.trajectory, other.trajectory)
+
+
+def test_both_engines_write_the_same_with_a_resampler_and_tracks(
+    loop: asyncio.AbstractEventLoop, resampling_checkpoint: Path
+) -> None:
+    """With and without tracks and a route; the vLLM engine of its own ends before others use the cores."""
+    arguments = {"enforce_eager": True, "block_size": 32}
+    settings = VllmSettings(rows=8, dtype="float32", arguments=arguments)
+    theirs = VllmEngine(resampling_checkpoint, settings)
+    mine = TorchEngine(resampling_checkpoint, TorchSettings(products=None))
+    scenes = [
+        replace(scene, tracks=None if k % 3 == 1 else some_tracks(k))
+        for k, scene in enumerate(mixed_scenes(24))
+    ]
+    requests = [greedy(scene.scene_id, scene) for scene in scenes]
+
+    async def texts(engine: Engine) -> list[str]:
+        await engine.start()
+        try:
+            return [draw.text for [draw] in await plans(engine, requests)]
+        finally:
+            await engine.stop()
+
+    written = loop.run_until_complete(texts(theirs))
+    assert written == loop.run_until_complete(texts(mine))
+    assert len(set(written)) > 12
 
 
 @pytest.mark.parametrize("thinking", ["always", "never"])

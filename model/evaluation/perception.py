@@ -1,0 +1,190 @@
+"""How well a checkpoint's pictures are read: every fact that decides a plan, against what is true."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from model.driving.facts import (
+    FACTS,
+    IS_YES_OR_NO,
+    LANES,
+    ROAD_DISTANCES_M,
+    ROAD_SCALE_M,
+    SPEED_SCALE_MS,
+    WALKERS,
+    scene_facts,
+)
+from model.driving.scene import LabelledScene
+from model.network.checkpoint import Loaded
+from model.network.perception import PerceptionHeads
+
+_BATCH: Final = 16
+_NEAR_M: Final = 60.0
+_DISTANCES_M: Final = ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0))
+
+Array = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Facts [n, len(FACTS)] of n scenes with a route.
+
+    Attributes:
+        read: from pictures; probabilities for what is or is not so.
+        true: NaN where a fact does not apply.
+        episodes: the episode of each scene.
+    """
+
+    read: Array
+    true: Array
+    episodes: list[str]
+
+
+def read_facts(
+    loaded: Loaded,
+    heads: PerceptionHeads,
+    scenes: Iterable[LabelledScene],
+    on_done: Callable[[int], None] | None = None,
+) -> Reading:
+    """Look at scenes through a checkpoint; those without a route are left out.
+
+    Args:
+        loaded: with a resampler.
+        heads: that were grounded with it.
+        scenes: labelled.
+        on_done: told how many scenes are done.
+
+    Raises:
+        ValueError: the checkpoint has no resampler, or no scene has a route.
+    """
+    if loaded.model.resampler is None:
+        raise ValueError(f"{loaded.card.name} has no resampler: its perception cannot be read")
+    read, true, episodes = list[Array](), list[Array](), list[str]()
+    for batch in _batches(labelled for labelled in scenes if labelled.scene.route is not None):
+        read.append(_read(loaded, heads, batch))
+        true += [scene_facts(labelled) for labelled in batch]
+        episodes += [labelled.episode_id for labelled in batch]
+        if on_done is not None:
+            on_done(len(episodes))
+    if not read:
+        raise ValueError("no scene has a route: facts are relative to one")
+    return Reading(np.concatenate(read), np.stack(true), episodes)
+
+
+def _batches(scenes: Iterator[LabelledScene]) -> Iterator[list[LabelledScene]]:
+    while batch := list(islice(scenes, _BATCH)):
+        yield batch
+
+
+@torch.inference_mode()
+def _read(loaded: Loaded, heads: PerceptionHeads, batch: list[LabelledScene]) -> Array:
+    model, builder = loaded.model, loaded.inputs
+    assert model.resampler is not None
+    patches = np.concatenate(
+        [builder.patches(pictures) for each in batch for pictures in builder.slices(each.scene)]
+    )
+    clips = len(batch) * len(loaded.settings.cameras)
+    tokens = model.vision(torch.from_numpy(patches), torch.tensor([loaded.settings.grid] * clips))
+    gathered = model.resampler(
+        tokens.view(len(batch), loaded.settings.vision_tokens, -1),
+        torch.from_numpy(np.stack([each.scene.history for each in batch])),
+        torch.from_numpy(np.stack([np.asarray(each.scene.route) for each in batch])),
+        torch.ones(len(batch), dtype=torch.bool),
+    )
+    facts = heads.read(gathered)
+    likely = torch.where(torch.from_numpy(IS_YES_OR_NO), facts.sigmoid(), facts)
+    values: Array = likely.numpy()
+    return values
+
+
+def perception_rows(reading: Reading) -> list[dict[str, Any]]:
+    """What a table of perception tells, a row for each fact: ``fact``, ``scenes``, and its measures.
+
+    ``auc`` is for facts that are or are not so, ``error`` the median in the fact's unit, ``r2`` the share of
+    the variance that is explained.
+    """
+    rows: list[dict[str, Any]] = []
+    for name, lanes in (("own lane", LANES[:1]), ("lanes beside", LANES[1:])):
+        leads = _stacked(reading, [f"{lane}_0" for lane in lanes])
+        rows.append({"fact": f"{name}: lead present"} | _yes_or_no(*leads["present"]))
+        for low, high in ((0.0, _NEAR_M), *_DISTANCES_M):
+            within = f"{name}, {low:.0f} to {high:.0f} m"
+            gap = np.expm1(leads["gap_log_m"][1])
+            here = (gap >= low) & (gap < high)  # False where there is nobody (NaN)
+            chosen = {field: (read[here], true[here]) for field, (read, true) in leads.items()}
+            read_gap, true_gap = (np.expm1(side) for side in chosen["gap_log_m"])
+            rows.append({"fact": f"{within}: gap, m"} | _amount(read_gap, true_gap))
+            rows.append(
+                {"fact": f"{within}: speed along the lane, m/s"}
+                | _amount(*(SPEED_SCALE_MS * side for side in chosen["speed"]))
+            )
+            for field in ("standing", "braking", "fixed"):
+                rows.append({"fact": f"{within}: {field}"} | _yes_or_no(*chosen[field]))
+        obstacles = _stacked(reading, [f"{lane}_obstacle" for lane in lanes])
+        rows.append({"fact": f"{name}: obstacle present"} | _yes_or_no(*obstacles["present"]))
+    walkers = _stacked(reading, [f"walker_{rank}" for rank in range(WALKERS)])
+    rows.append({"fact": "walker present"} | _yes_or_no(*walkers["present"]))
+    rows.append({"fact": "walker: along, m"} | _amount(*(np.expm1(s) for s in walkers["along_log_m"])))
+    for distance in (ROAD_DISTANCES_M[2], ROAD_DISTANCES_M[-1]):
+        place = FACTS.index(f"road_left_{distance}m")
+        sides = (ROAD_SCALE_M * side[:, place] for side in (reading.read, reading.true))
+        rows.append({"fact": f"road to the left after {distance} m, m"} | _amount(*sides))
+    return rows
+
+
+def _stacked(reading: Reading, prefixes: list[str]) -> dict[str, tuple[Array, Array]]:
+    """Fields of facts with any of the prefixes, (read, true), one prefix after the other."""
+    fields = [name.removeprefix(f"{prefixes[0]}_") for name in FACTS if name.startswith(f"{prefixes[0]}_")]
+    places = {field: [FACTS.index(f"{prefix}_{field}") for prefix in prefixes] for field in fields}
+    return {
+        field: (reading.read[:, where].T.ravel(), reading.true[:, where].T.ravel())
+        for field, where in places.items()
+    }
+
+
+def _yes_or_no(read: Array, true: Array) -> dict[str, Any]:
+    known = np.isfinite(true)
+    return {"scenes": int(known.sum()), "auc": auc(read[known], true[known] > 0.5)}
+
+
+def _amount(read: Array, true: Array) -> dict[str, Any]:
+    known = np.isfinite(true)
+    read, true = read[known], true[known]
+    if not len(true):
+        return {"scenes": 0, "error": None, "r2": None}
+    spread = float(true.var())
+    r2 = 1 - float(((read - true) ** 2).mean()) / spread if spread > 0 else None
+    return {"scenes": len(true), "error": float(np.median(np.abs(read - true))), "r2": r2}
+
+
+def auc(scores: npt.NDArray[np.floating], positive: npt.NDArray[np.bool_]) -> float | None:
+    """The chance that a positive has a higher score than a negative; ties count half, None without both."""
+    positives, negatives = int(positive.sum()), int((~positive).sum())
+    if not positives or not negatives:
+        return None
+    _, place, counts = np.unique(scores, return_inverse=True, return_counts=True)
+    middle_rank = np.cumsum(counts) - (counts - 1) / 2
+    ranks = middle_rank[place]
+    return float((ranks[positive].sum() - positives * (positives + 1) / 2) / (positives * negatives))
+
+
+def format_perception(rows: list[dict[str, Any]]) -> str:
+    """The rows as plain text."""
+    lines = [f"{'':48} {'scenes':>7} {'AUC':>6} {'error':>7} {'R2':>6}"]
+    for row in rows:
+        cells = [
+            _cell(row.get(name), form) for name, form in (("auc", ".3f"), ("error", ".2f"), ("r2", ".2f"))
+        ]
+        lines.append(f"{row['fact']:48} {row['scenes']:7d} {cells[0]:>6} {cells[1]:>7} {cells[2]:>6}")
+    return "\n".join(lines)
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
