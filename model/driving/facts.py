@@ -66,6 +66,18 @@ _SIGNED: Final[npt.NDArray[np.bool_]] = np.array(
 )
 
 
+_HAS_OBJECT: Final[npt.NDArray[np.bool_]] = np.array(
+    [not name.endswith("present") and not name.startswith("road_") for name in FACTS]
+)
+_PRESENCE: Final[npt.NDArray[np.int64]] = np.array(
+    [
+        max(place for place in range(index + 1) if FACTS[place].endswith("present")) if tells else index
+        for index, tells in enumerate(_HAS_OBJECT)
+    ]
+)
+"""Where the presence of each fact's object is told: at the beginning of its fields."""
+
+
 def scene_facts(labelled: LabelledScene) -> FloatArray:
     """float32 [len(FACTS)] of one scene; NaN where a fact does not apply, all NaN without a route.
 
@@ -119,6 +131,13 @@ def mirrored(facts: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Facts [..., len(FACTS)] of a scene whose left and right are swapped."""
     swapped: npt.NDArray[np.float32] = np.where(_SIGNED, -facts[..., _MIRROR], facts[..., _MIRROR])
     return swapped
+
+
+def weighed(facts: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Facts [..., len(FACTS)] as inputs: each counts as much as its object is present, and none is NaN."""
+    known = np.nan_to_num(facts)
+    values: npt.NDArray[np.float32] = np.where(_HAS_OBJECT, known * known[..., _PRESENCE], known)
+    return values
 
 
 def _states(track: Track) -> tuple[float, float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import islice
 from typing import Any, Final
 
@@ -39,12 +39,16 @@ class Reading:
     Attributes:
         read: from pictures; probabilities for what is or is not so.
         true: NaN where a fact does not apply.
-        episodes: the episode of each scene.
+        history, route, future: float32 [n, 16, 4], [n, 20, 2], [n, 64, 4].
+        episodes: int64 [n], the seed of each scene's episode.
     """
 
     read: Array
     true: Array
-    episodes: list[str]
+    history: Array
+    route: Array
+    future: Array
+    episodes: npt.NDArray[np.int64]
 
 
 def read_facts(
@@ -66,16 +70,28 @@ def read_facts(
     """
     if loaded.model.resampler is None:
         raise ValueError(f"{loaded.card.name} has no resampler: its perception cannot be read")
-    read, true, episodes = list[Array](), list[Array](), list[str]()
+    parts: list[Reading] = []
+    done = 0
     for batch in _batches(labelled for labelled in scenes if labelled.scene.route is not None):
-        read.append(_read(loaded, heads, batch))
-        true += [scene_facts(labelled) for labelled in batch]
-        episodes += [labelled.episode_id for labelled in batch]
+        parts.append(_reading(loaded, heads, batch))
+        done += len(batch)
         if on_done is not None:
-            on_done(len(episodes))
-    if not read:
+            on_done(done)
+    if not parts:
         raise ValueError("no scene has a route: facts are relative to one")
-    return Reading(np.concatenate(read), np.stack(true), episodes)
+    columns = [[getattr(part, field.name) for part in parts] for field in fields(Reading)]
+    return Reading(*(np.concatenate(column) for column in columns))
+
+
+def _reading(loaded: Loaded, heads: PerceptionHeads, batch: list[LabelledScene]) -> Reading:
+    return Reading(
+        read=_read(loaded, heads, batch),
+        true=np.stack([scene_facts(labelled) for labelled in batch]),
+        history=np.stack([labelled.scene.history for labelled in batch]),
+        route=np.stack([np.asarray(labelled.scene.route) for labelled in batch]),
+        future=np.stack([labelled.future for labelled in batch]),
+        episodes=np.array([labelled.seed for labelled in batch]),
+    )
 
 
 def _batches(scenes: Iterator[LabelledScene]) -> Iterator[list[LabelledScene]]:
@@ -141,8 +157,8 @@ def perception_rows(reading: Reading) -> list[dict[str, Any]]:
 
 def _stacked(reading: Reading, prefixes: list[str]) -> dict[str, tuple[Array, Array]]:
     """Fields of facts with any of the prefixes, (read, true), one prefix after the other."""
-    fields = [name.removeprefix(f"{prefixes[0]}_") for name in FACTS if name.startswith(f"{prefixes[0]}_")]
-    places = {field: [FACTS.index(f"{prefix}_{field}") for prefix in prefixes] for field in fields}
+    told = [name.removeprefix(f"{prefixes[0]}_") for name in FACTS if name.startswith(f"{prefixes[0]}_")]
+    places = {field: [FACTS.index(f"{prefix}_{field}") for prefix in prefixes] for field in told}
     return {
         field: (reading.read[:, where].T.ravel(), reading.true[:, where].T.ravel())
         for field, where in places.items()

@@ -2,6 +2,8 @@
 
 The blind planner sees history and route alone: who claims to see must beat it. The teacher sees the tracks
 of everybody around as well: it tells what seeing is worth. Both plan in microseconds and train in minutes.
+A third kind is given facts, true ones or those that were read from pictures: it tells what perception is
+worth to a plan, and drives nowhere.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from model.driving.facts import FACTS
 from model.driving.scene import Scene, SceneError
 from model.driving.tracks import MAX_TRACKS
 from model.driving.trajectory import (
@@ -32,8 +35,8 @@ from model.network.codec import CodecError, TrajectoryCodec
 from model.network.track_features import TRACK_FEATURES, track_features
 from model.network.trajectory_head import Guesses, TrajectoryHead
 
-SmallKind = Literal["blind", "teacher"]
-SMALL_KINDS: Final[tuple[SmallKind, ...]] = ("blind", "teacher")
+SmallKind = Literal["blind", "teacher", "facts"]
+DRIVING_KINDS: Final[tuple[SmallKind, ...]] = ("blind", "teacher")
 WEIGHTS_FILE: Final = "planner.safetensors"
 _VERSION: Final = 1
 _TRACK_WIDTH: Final = 96
@@ -53,15 +56,18 @@ class SmallInputs:
     Attributes:
         history: float32 [b, 16, 4].
         route: float32 [b, 20, 2].
-        tracks: float32 [b, 16, features].
+        tracks: float32 [b, 16, features]; nobody anywhere where they are not known.
+        facts: float32 [b, len(FACTS)], or None.
     """
 
     history: Tensor
     route: Tensor
     tracks: Tensor
+    facts: Tensor | None = None
 
     def __getitem__(self, rows: Tensor | slice) -> SmallInputs:
-        return SmallInputs(self.history[rows], self.route[rows], self.tracks[rows])
+        facts = None if self.facts is None else self.facts[rows]
+        return SmallInputs(self.history[rows], self.route[rows], self.tracks[rows], facts)
 
     @property
     def speeds_ms(self) -> Tensor:
@@ -73,7 +79,7 @@ class SmallPlanner(nn.Module):
     """A multilayer perceptron over history and route and, for the teacher, a pooled set of tracks.
 
     Args:
-        kind: the blind one ignores tracks.
+        kind: the blind one ignores tracks and facts.
         codec: whose space it plans in.
         dropout: in training.
     """
@@ -92,6 +98,8 @@ class SmallPlanner(nn.Module):
                 nn.Linear(_TRACK_WIDTH, _TRACK_WIDTH),
             )
             inputs += 2 * _TRACK_WIDTH
+        if kind == "facts":
+            inputs += len(FACTS)
         layers: list[nn.Module] = []
         for width in (inputs, _WIDTH, _WIDTH):
             layers += [nn.Linear(width, _WIDTH), nn.LayerNorm(_WIDTH), nn.SiLU(), nn.Dropout(dropout)]
@@ -112,6 +120,9 @@ class SmallPlanner(nn.Module):
             there = inputs.tracks[..., :1]
             most = each.masked_fill(there == 0, -5.0).amax(dim=1)
             features = torch.cat([features, most, (each * there).sum(dim=1) / 4], dim=1)
+        if self.kind == "facts":
+            assert inputs.facts is not None, "this planner needs facts"
+            features = torch.cat([features, inputs.facts], dim=1)
         guesses: Guesses = self.head(self.trunk(features))
         return guesses
 
@@ -160,7 +171,7 @@ def load_small(folder: Path) -> SmallPlanner:
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {}).get("looktwice", "{}"))
-        if about.get("version") != _VERSION or about.get("kind") not in SMALL_KINDS:
+        if about.get("version") != _VERSION or about.get("kind") not in DRIVING_KINDS:
             found = about.get("version")
             raise SmallPlannerError(f"{path} has version {found}; this LookTwice reads {_VERSION}")
         planner = SmallPlanner(about["kind"], TrajectoryCodec.load(folder))

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from model.driving.facts import mirrored
 from model.driving.scene_store import read_scenes, scene_files
 from model.driving.tracks import tracks_of
 from model.driving.trajectory import FloatArray
@@ -135,7 +136,8 @@ class SmallExamples:
         inputs = self.inputs
         tracks = inputs.tracks.clone()
         tracks[..., list(MIRRORED)] *= -1
-        swapped = SmallInputs(inputs.history * _POSE_MIRROR, inputs.route * _POSE_MIRROR[:2], tracks)
+        facts = None if inputs.facts is None else torch.from_numpy(mirrored(inputs.facts.numpy()))
+        swapped = SmallInputs(inputs.history * _POSE_MIRROR, inputs.route * _POSE_MIRROR[:2], tracks, facts)
         return SmallExamples(swapped, self.futures * _POSE_MIRROR, self.episodes)
 
 

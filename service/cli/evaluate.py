@@ -61,6 +61,18 @@ def evaluate(
         Path | None,
         typer.Option(help="SQLite file that keeps all draws: started again, it goes on where it was."),
     ] = None,
+    perception: Annotated[
+        bool, typer.Option("--perception", help="How well pictures are read, fact by fact, and nothing else.")
+    ] = False,
+    gate_scenes: Annotated[
+        Path | None,
+        typer.Option(
+            help="perception: scenes for small planners to learn on, from read and from true facts."
+        ),
+    ] = None,
+    gate_steps: Annotated[
+        int, typer.Option(help="perception: training steps of those planners.", min=1)
+    ] = 8000,
     as_json: Json = False,
 ) -> None:
     """Evaluate open loop: baselines, with and without route, expert plans given, images shuffled."""
@@ -71,6 +83,12 @@ def evaluate(
 
         controls = Controls(n=n, temperature=temperature, think_threshold=think_threshold)
         labelled = list(_evenly(read_scenes(scenes, dense=False), count_scenes(scenes), limit))
+        if perception:
+            from service.cli.perception import tell_perception
+
+            told_as, text = tell_perception(checkpoint, labelled, gate_scenes, gate_steps, quiet=as_json)
+            typer.echo(json.dumps(told_as) if as_json else text)
+            return
 
         def engine_of(folder: Path) -> Engine:
             made = make_engine(folder, rows, name=engine, device=device, vllm_arguments=vllm_arguments)

@@ -71,7 +71,7 @@ def train(
     from model.evaluation.curves import training_curves
     from model.network.allocator import keep_freed_memory
     from model.network.precision import bfloat16_is_fast
-    from model.network.small_planner import SMALL_KINDS
+    from model.network.small_planner import DRIVING_KINDS
     from model.training.recipes import NANO, PAPER
     from model.training.run import RunSettings, create, run
     from model.training.small import SmallSettings
@@ -86,7 +86,7 @@ def train(
             for name, value in create(scenes, cache, target, seed=seed).items():
                 typer.echo(f"codec {name} {value:.3f}")
             return
-        if recipe in SMALL_KINDS:
+        if recipe in DRIVING_KINDS:
             codec_from = source or BUNDLED_CHECKPOINT
             settings = SmallSettings(seed=seed, steps=steps or SmallSettings.steps)
             train_small_in_rounds(
@@ -107,7 +107,7 @@ def train(
             return
         recipes = PAPER if paper else NANO
         if recipe not in recipes:
-            known = ", ".join(["create", "ladder", *SMALL_KINDS, *recipes])
+            known = ", ".join(["create", "ladder", *DRIVING_KINDS, *recipes])
             raise ValueError(f"unknown recipe {recipe!r}; known are {known}")
         if source is None:
             raise ValueError("give the checkpoint to start from: --from FOLDER")

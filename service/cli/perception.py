@@ -1,0 +1,53 @@
+"""`looktwice evaluate --perception`: how well a checkpoint reads its pictures, and what that is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import Progress
+
+from model.driving.scene import LabelledScene
+from model.driving.scene_store import count_scenes, read_scenes
+from model.evaluation.perception import Reading, format_perception, perception_rows, read_facts
+from model.network.checkpoint import load
+from model.network.perception import load_heads
+from model.network.vla import VlaConfig
+from model.training.perception_gate import format_gate, perception_gate
+from model.training.small import SmallSettings
+
+
+def tell_perception(
+    checkpoint: Path,
+    scenes: Sequence[LabelledScene],
+    gate_scenes: Path | None,
+    gate_steps: int,
+    *,
+    quiet: bool,
+) -> tuple[dict[str, Any], str]:
+    """The table of every fact as JSON and as text; with ``gate_scenes`` to learn on, the gate's too.
+
+    Raises:
+        PerceptionError: the checkpoint was not grounded.
+        ValueError: no scene has a route.
+    """
+    loaded = load(checkpoint)
+    config: VlaConfig = loaded.model.config
+    heads = load_heads(checkpoint, config.text_config.hidden_size, loaded.settings.scene_tokens, loaded.codec)
+
+    def reading(what: str, of: Iterable[LabelledScene], count: int) -> Reading:
+        # Progress goes to stderr, so that stdout holds nothing but the table.
+        with Progress(console=Console(stderr=True, quiet=quiet)) as progress:
+            task = progress.add_task(what, total=count)
+            return read_facts(loaded, heads, of, lambda done: progress.update(task, completed=done))
+
+    read = reading("scenes", scenes, len(scenes))
+    rows = perception_rows(read)
+    told, text = {"facts": rows}, format_perception(rows)
+    if gate_scenes is not None:
+        learned_on = reading("to learn on", read_scenes(gate_scenes, dense=False), count_scenes(gate_scenes))
+        gate = perception_gate(learned_on, read, loaded.codec, SmallSettings(steps=gate_steps))
+        told["gate"], text = gate, f"{text}\n\n{format_gate(gate)}"
+    return told, text
