@@ -101,11 +101,16 @@ class PlannedDraw:
 
 @dataclass(frozen=True, eq=False)
 class PlanResult:
-    """What came back for one scene."""
+    """What came back for one scene.
+
+    Attributes:
+        agreed: the place of the draw whose trajectory is nearest to all others': the one to drive by.
+    """
 
     request_id: str
     model: wire.ModelName
     draws: tuple[PlannedDraw, ...]
+    agreed: int
     timing: wire.Timing
     deadline: wire.Deadline | None = None
 
@@ -216,7 +221,16 @@ def batch_results(response: httpx.Response) -> list[PlanResult | PlannerProblem]
 def _planned(answered: wire.PlanResponse, response: httpx.Response) -> PlanResult:
     with _contract(response):
         draws = tuple(_draw(draw) for draw in answered.draws)
-    return PlanResult(answered.request_id, answered.model, draws, answered.timing, answered.deadline)
+        if answered.agreed >= len(draws):
+            raise ValueError(f"draw {answered.agreed} is agreed on, and there are {len(draws)}")
+    return PlanResult(
+        request_id=answered.request_id,
+        model=answered.model,
+        draws=draws,
+        agreed=answered.agreed,
+        timing=answered.timing,
+        deadline=answered.deadline,
+    )
 
 
 Told = (

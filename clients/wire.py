@@ -23,6 +23,8 @@ Camera = Literal[
 Thinking = Literal["adaptive", "always", "never"]
 Branch = Literal["Action:", "Thinking:"]
 Cut = Literal["skipped", "shortened", "replaced"]
+AgentKind = Literal["vehicle", "pedestrian", "cone", "barrier"]
+Light = Literal["brake", "left", "right"]
 Group = Literal["longitudinal", "lateral", "lane"]
 
 PROBLEM_MEDIA_TYPE: Final = "application/problem+json"
@@ -101,6 +103,23 @@ class Clip(Asked):
     )
 
 
+class Track(Asked):
+    """One tracked road user or obstacle, now, in the ego frame."""
+
+    x_m: Nearby = Field(description="Centre of its box.")
+    y_m: Nearby
+    heading_rad: Finite
+    speed_ms: Finite = Field(description="Over the ground along its heading; below 0 where it reverses.")
+    length_m: Length = Field(description="Of its box, along the heading.")
+    width_m: Length
+    kind: AgentKind
+    lights: list[Light] = Field(
+        default_factory=list,
+        max_length=3,
+        description="Those that are on; left and right together are hazard lights.",
+    )
+
+
 class Scene(Asked):
     """One planning instant."""
 
@@ -110,6 +129,12 @@ class Scene(Asked):
     )
     history: History
     route: Route | None = Field(default=None, description="The way to go, or null where it is unknown.")
+    tracks: list[Track] | None = Field(
+        default=None,
+        max_length=16,
+        description="The nearest tracked objects, or null where nobody tracks; an empty list says that "
+        "nobody is around. GET /v1/models says whether the model takes them.",
+    )
 
 
 class MetaAction(Asked):
@@ -247,6 +272,9 @@ class PlanResponse(Answered):
     request_id: str
     model: ModelName
     draws: list[Draw]
+    agreed: int = Field(
+        ge=0, description="Index of the draw whose trajectory is nearest to all others': the one to drive by."
+    )
     timing: Timing
     deadline: Deadline | None = Field(default=None, description="Null where none was set.")
 
@@ -387,6 +415,10 @@ class ModelCard(Answered):
         description="Width and height in pixels that pictures are resized to."
     )
     parameters: int = Field(description="How many weights.")
+    inputs: list[str] = Field(
+        default_factory=lambda: ["route"],
+        description="What it takes of a scene beside pictures and history: route, tracks.",
+    )
     details: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -423,6 +455,10 @@ class LabelledScene(Answered):
         description="Closed rings; a point is on the road when an odd number of rings contains it."
     )
     lane_lines: list[list[Point]] = Field(description="Centre lines of the lanes around.")
+    tracks: list[Track] = Field(
+        default_factory=list,
+        description="What a perfect tracker would tell of the agents, for `scene.tracks`.",
+    )
     tags: list[str] = Field(description="What makes the scene difficult.")
 
 

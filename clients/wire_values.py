@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from clients import wire
-from model.driving.scene import Agent, Scene
+from model.driving.scene import Agent, Scene, Track
 
 
 def wire_scene(scene: Scene, decimals: int | None = None) -> wire.Scene:
@@ -26,7 +26,24 @@ def wire_scene(scene: Scene, decimals: int | None = None) -> wire.Scene:
         ],
         history=rows(scene.history, decimals),
         route=None if scene.route is None else rows(scene.route, decimals),
+        tracks=None if scene.tracks is None else wire_tracks(scene.tracks, decimals),
     )
+
+
+def wire_tracks(tracks: Sequence[Track], decimals: int | None = None) -> list[wire.Track]:
+    """Tracks of objects; numbers rounded to so many ``decimals``, or as they are."""
+    return [
+        wire.Track(
+            **{
+                name: value if decimals is None else round(value, decimals)
+                for name in ("x_m", "y_m", "heading_rad", "speed_ms", "length_m", "width_m")
+                for value in (getattr(track, name),)
+            },
+            kind=track.kind,
+            lights=sorted(track.lights),
+        )
+        for track in tracks
+    ]
 
 
 def with_pictures(document: Any, change: Callable[[Any], Any]) -> Any:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
+import numpy as np
+
 import clients.wire as wire
 from model.driving.plan import Plan, plan_changes, plan_iou
+from model.driving.trajectory import agreed
 from model.engines.engine import Draw, ModelCard
 from service.planning import Planned
 from service.problems import REFUSED, ProblemError
@@ -20,6 +23,7 @@ def plan_answer(planned: Planned, request_id: str) -> wire.PlanResponse:
         request_id=request_id,
         model=_model(planned.card),
         draws=[_draw(draw, planned.drafts.get(draw.index)) for draw in planned.draws],
+        agreed=agreed(np.stack([draw.trajectory for draw in planned.draws])),
         timing=planned.timing,
         deadline=planned.deadline,
     )
@@ -51,6 +55,7 @@ def model_card(card: ModelCard) -> wire.ModelCard:
         cameras=list(card.cameras),
         image_size=list(card.image_size),
         parameters=card.parameters,
+        inputs=list(card.inputs),
         details=dict(card.details),
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 import clients.wire as wire
 from model.driving.images import ImageError, check_image
 from model.driving.plan import GROUPS, TICKS, MetaAction, Plan, PlanError, parse_plan
-from model.driving.scene import Clip, Scene, SceneError
+from model.driving.scene import Clip, Scene, SceneError, Track
 from model.driving.trajectory import (
     FloatArray,
     GeometryError,
@@ -28,6 +28,7 @@ from service.problems import (
     INVALID_IMAGE,
     INVALID_PLAN,
     INVALID_ROUTE,
+    INVALID_TRACKS,
     MISSING_CAMERA,
     UNKNOWN_FORMAT,
     at,
@@ -59,6 +60,8 @@ def engine_request(
     cameras = [clip.camera for clip in asked.scene.clips]
     if missing := [camera for camera in card.cameras if camera not in cameras]:
         raise at(MISSING_CAMERA, "/scene/clips", f"{card.name} also needs {', '.join(missing)}")
+    if asked.scene.tracks is not None and "tracks" not in card.inputs:
+        raise at(INVALID_TRACKS, "/scene/tracks", f"{card.name} takes none; leave them out")
     if isinstance(asked, wire.ReflectRequest):
         controls = _controls(asked.controls, plan_of(asked.plan, "/plan"))
     else:
@@ -79,10 +82,18 @@ def scene_of(asked: wire.Scene) -> Scene:
         Clip(clip.camera, tuple(_images(clip.images, f"/scene/clips/{number}/images")))
         for number, clip in enumerate(asked.clips)
     )
+    tracks = None if asked.tracks is None else tuple(map(_track, range(len(asked.tracks)), asked.tracks))
     try:
-        return Scene(asked.scene_id, clips, history, route)
+        return Scene(asked.scene_id, clips, history, route, tracks)
     except SceneError as error:
         raise at(INVALID_CLIP, "/scene/clips", str(error)) from None
+
+
+def _track(number: int, asked: wire.Track) -> Track:
+    try:
+        return Track(**asked.model_dump(exclude={"lights"}), lights=frozenset(asked.lights))
+    except SceneError as error:
+        raise at(INVALID_TRACKS, f"/scene/tracks/{number}", str(error)) from None
 
 
 def _images(given: Iterable[str | bytes], pointer: str) -> Iterable[bytes]:

@@ -80,6 +80,7 @@ class Extras(wire.Asked):
 
     history: wire.History | None = Field(default=None, description="Without it the car is taken to stand.")
     route: wire.Route | None = None
+    tracks: list[wire.Track] | None = Field(default=None, max_length=16)
     thinking: wire.Thinking = "adaptive"
     think_threshold: wire.Probability | None = None
     prefill: wire.PlanGiven | None = None
@@ -134,7 +135,12 @@ def plan_request(chat: ChatRequest, card: ModelCard) -> wire.PlanRequest:
     controls |= chat.model_dump(include={"n", "temperature", "top_p", "seed"})
     return wire.PlanRequest.model_validate(
         {
-            "scene": {"clips": clips, "history": extras.history or _STANDING, "route": extras.route},
+            "scene": {
+                "clips": clips,
+                "history": extras.history or _STANDING,
+                "route": extras.route,
+                "tracks": extras.tracks,
+            },
             "controls": controls,
             "format": extras.format,
             "stream": chat.stream,

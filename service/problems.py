@@ -45,6 +45,7 @@ MISSING_CAMERA: Final = Kind("missing-camera", 422, "The model needs a camera th
 INVALID_IMAGE: Final = Kind("invalid-image", 422, "A picture cannot be accepted")
 INVALID_HISTORY: Final = Kind("invalid-history", 422, "The ego history is not one a car can have driven")
 INVALID_ROUTE: Final = Kind("invalid-route", 422, "The route is not 20 points in the ego frame")
+INVALID_TRACKS: Final = Kind("invalid-tracks", 422, "The tracks are not ones that the model can take")
 INVALID_CONTROLS: Final = Kind("invalid-controls", 422, "The controls contradict each other or their limits")
 INVALID_PLAN: Final = Kind("invalid-plan", 422, "The given plan breaks the plan language")
 UNKNOWN_FORMAT: Final = Kind("unknown-format", 422, "The model does not write this response format")

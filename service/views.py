@@ -12,9 +12,10 @@ from typing import Final
 import pyarrow.parquet as pq
 
 import clients.wire as wire
-from clients.wire_values import rows, wire_agents, wire_scene
+from clients.wire_values import rows, wire_agents, wire_scene, wire_tracks
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import SceneFileError, count_scenes, read_scenes
+from model.driving.tracks import tracks_of
 from service.problems import INVALID_SCENE_FILE, SCENES_UNREADABLE, UNKNOWN_SCENE, ProblemError
 
 MAX_SCENES_SHOWN: Final = 64
@@ -78,6 +79,7 @@ def view(labelled: LabelledScene) -> wire.LabelledScene:
         agents=wire_agents(labelled.agents, _DECIMALS),
         drivable=[rows(ring, _DECIMALS) for ring in labelled.drivable],
         lane_lines=[rows(line, _DECIMALS) for line in labelled.lane_lines],
+        tracks=wire_tracks(tracks_of(labelled.agents), _DECIMALS),
         tags=sorted(labelled.tags),
     )
 

@@ -23,7 +23,7 @@ from clients.alpasim.frames import fitted
 from clients.alpasim.session import CAMERAS, Moment, Session
 from clients.answers import PlanResult
 from model.driving.scene import Scene
-from model.driving.trajectory import FloatArray, agreed
+from model.driving.trajectory import FloatArray
 
 TRANSPORT_MS: Final = 10
 """Of a drive's time, kept back for the way to the planner and back."""
@@ -175,7 +175,7 @@ class Egodriver:
             scene = Scene(scene.scene_id, scene.clips, scene.history)
         result = await self._planner.plan(scene, controls)
         trajectories = np.stack([draw.trajectory for draw in result.draws])
-        chosen = agreed(trajectories)
+        chosen = result.agreed
         debug = _debug(result, chosen, controls, 1000 * (time.perf_counter() - began_s))
         return Driven(moment, trajectories, chosen, debug | {"seen": session.counts()})
 

@@ -26,7 +26,7 @@ from model.driving.hashing import hash_of, scene_hash
 from model.driving.labeller import expert_plan
 from model.driving.metrics import displacement_errors
 from model.driving.plan import Plan, plan_iou
-from model.driving.scene import LabelledScene, Scene
+from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
 
 PATIENCE = Patience(timeout_s=120.0, attempts=1)
@@ -43,6 +43,7 @@ class Sampling:
         n: draws, both freely and with the expert's plan.
         temperature, top_p, seed: as in `wire.Controls`.
         route: whether the model is told the route.
+        tracks: whether it is told the tracks of the agents around.
     """
 
     n: int = 6
@@ -50,6 +51,7 @@ class Sampling:
     top_p: float = 1.0
     seed: int = 0
     route: bool = True
+    tracks: bool = False
 
     @property
     def controls(self) -> wire.Controls:
@@ -89,7 +91,7 @@ async def roll_out(
         StageStopped: another model answers than before.
     """
     expert = expert_plan(labelled)
-    scene = labelled.scene if sampling.route else _without_route(labelled.scene)
+    scene = labelled.given(route=sampling.route, tracks=sampling.tracks)
     try:
         free = await planner.plan(scene, sampling.controls)
         given = await planner.plan(scene, sampling.controls, prefill=expert)
@@ -130,10 +132,6 @@ def _draws(result: PlanResult, labelled: LabelledScene, expert: Plan | None) -> 
             }
         told.append(row)
     return told
-
-
-def _without_route(scene: Scene) -> Scene:
-    return Scene(scene.scene_id, scene.clips, scene.history)
 
 
 def min_ade_m(draws: Sequence[Mapping[str, Any]]) -> float:

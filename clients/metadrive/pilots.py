@@ -11,7 +11,7 @@ import numpy as np
 from clients import wire
 from clients.planner import PlannerClient
 from model.driving.scene import Scene
-from model.driving.trajectory import FloatArray, agreed, constant_velocity
+from model.driving.trajectory import FloatArray, constant_velocity
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,26 +74,38 @@ class ServicePilot:
         name: of its row.
         controls: of every request; the seed goes up by one from plan to plan.
         route: whether the model is told the route.
+        tracks: whether it is told the tracks of the objects around.
     """
 
     needs_pictures = True
 
     def __init__(
-        self, planner: PlannerClient, name: str, controls: wire.Controls, *, route: bool = True
+        self,
+        planner: PlannerClient,
+        name: str,
+        controls: wire.Controls,
+        *,
+        route: bool = True,
+        tracks: bool = False,
     ) -> None:
-        self._planner, self.name, self._controls, self._route = planner, name, controls, route
+        self._planner, self.name, self._controls = planner, name, controls
+        self._route, self._tracks = route, tracks
         self._asked = 0
 
     def plan(self, scene: Scene) -> Planned:
         """See `Pilot.plan`; raises `PlannerError`."""
         controls = self._controls.model_copy(update={"seed": self._controls.seed + self._asked})
         self._asked += 1
-        asked = replace(scene, route=scene.route if self._route else None, tracks=None)
+        asked = replace(
+            scene,
+            route=scene.route if self._route else None,
+            tracks=scene.tracks if self._tracks else None,
+        )
         began_s = time.perf_counter()
         result = self._planner.plan(asked, controls)
         milliseconds = 1000 * (time.perf_counter() - began_s)
         trajectories = np.stack([draw.trajectory for draw in result.draws])
-        chosen = agreed(trajectories)
+        chosen = result.agreed
         draw = result.draws[chosen]
         plan = draw.revised_plan or draw.plan
         return Planned(

@@ -16,7 +16,7 @@ from clients.planner import Access, Patience, PlannerClient
 from model.driving.cameras import FRONT_CAMERAS, CameraSpec
 from model.driving.images import encode_jpeg
 from model.driving.scene import Clip, Scene
-from model.driving.trajectory import STEP_S, FloatArray, agreed
+from model.driving.trajectory import STEP_S, FloatArray
 
 POSES: Final = 8
 """Every half second of four."""
@@ -54,8 +54,7 @@ class NavsimPlanner:
         controls = self._controls.model_copy(update={"seed": self._controls.seed + self._asked})
         self._asked += 1
         result = self._planner.plan(self.scene(agent_input), controls)
-        trajectories = np.stack([draw.trajectory for draw in result.draws])
-        rows = trajectories[agreed(trajectories)][_EVERY - 1 : _EVERY * POSES : _EVERY]
+        rows = result.draws[result.agreed].trajectory[_EVERY - 1 : _EVERY * POSES : _EVERY]
         return np.ascontiguousarray(rows[:, [0, 1, 3]])
 
     def scene(self, agent_input: AgentInput) -> Scene:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from model.driving.agents import (
     Light,
     SceneError,
 )
-from model.driving.tracks import Track, check_tracks
+from model.driving.tracks import Track, check_tracks, tracks_of
 from model.driving.trajectory import (
     FloatArray,
     GeometryError,
@@ -189,6 +189,19 @@ class LabelledScene:
         unknown = set(self.tags) - set(TAGS)
         if unknown:
             raise SceneError(f"unknown tags: {', '.join(sorted(unknown))}")
+
+    def given(self, *, route: bool, tracks: bool = False) -> Scene:
+        """The scene as a planner is given it.
+
+        Args:
+            route: with its route, where it has one; without it otherwise.
+            tracks: with what a perfect tracker would tell of the agents; without any tracks otherwise.
+        """
+        return replace(
+            self.scene,
+            route=self.scene.route if route else None,
+            tracks=tracks_of(self.agents) if tracks else None,
+        )
 
     @property
     def split(self) -> Literal["train", "validation", "test"]:

@@ -202,7 +202,8 @@ class ModelCard:
         cameras: cameras it looks at; a scene must have these.
         image_size: width, height in pixels that pictures are resized to.
         parameters: how many weights.
-        prompt_tokens: of a scene, with its route where it can have one.
+        inputs: what it takes of a scene beside pictures and history: ``route``, ``tracks``.
+        prompt_tokens: of a scene that brings all of these.
         details: anything else worth showing, JSON-like.
     """
 
@@ -213,6 +214,7 @@ class ModelCard:
     cameras: tuple[str, ...]
     image_size: tuple[int, int]
     parameters: int
+    inputs: tuple[str, ...] = ("route",)
     prompt_tokens: int = 0
     details: Mapping[str, Any] = field(default_factory=dict)
 

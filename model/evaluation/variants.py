@@ -32,6 +32,7 @@ class Variant:
         format: the response format asked for.
         controls: of every request; the seed is varied from scene to scene, alike in all variants.
         route: whether the scene's route is given.
+        tracks: whether the tracks of its agents are given.
         expert_plan: the expert's plan is given as the first plan.
         shuffled_images: scenes get the clips of scenes from other episodes: a planner that looks gets worse.
     """
@@ -40,25 +41,27 @@ class Variant:
     format: str = "cf_vla"
     controls: Controls = field(default_factory=Controls)
     route: bool = False
+    tracks: bool = False
     expert_plan: bool = False
     shuffled_images: bool = False
 
 
-def standard_variants(formats: Sequence[str], controls: Controls = Controls()) -> list[Variant]:
-    """The open-loop table's rows for a checkpoint that writes ``formats``, without and with the route."""
+def standard_variants(
+    formats: Sequence[str], controls: Controls = Controls(), inputs: Sequence[str] = ("route",)
+) -> list[Variant]:
+    """The open-loop table's rows for a checkpoint that writes ``formats`` and takes ``inputs``."""
     no_branch = replace(controls, thinking="adaptive", think_threshold=None)
     variants = []
-    for route in (False, True):
-        suffix = " + route" if route else ""
+    given = [("", False, False), (" + route", True, False), (" + route + tracks", True, True)]
+    for suffix, route, tracks in given if "tracks" in inputs else given[:2]:
+        plain = Variant("", controls=controls, route=route, tracks=tracks)
         if "traj_only" in formats:
-            variants.append(Variant(f"traj-only{suffix}", "traj_only", no_branch, route))
+            variants.append(replace(plain, name=f"traj-only{suffix}", format="traj_only", controls=no_branch))
         if "cf_vla" in formats:
             variants += [
-                Variant(f"meta-act{suffix}", "cf_vla", controls, route),
-                Variant(f"meta-act{suffix}, expert plan", "cf_vla", controls, route, expert_plan=True),
-                Variant(
-                    f"meta-act{suffix}, shuffled images", "cf_vla", controls, route, shuffled_images=True
-                ),
+                replace(plain, name=f"meta-act{suffix}"),
+                replace(plain, name=f"meta-act{suffix}, expert plan", expert_plan=True),
+                replace(plain, name=f"meta-act{suffix}, shuffled images", shuffled_images=True),
             ]
     return variants
 
@@ -134,7 +137,7 @@ def request_for(labelled: LabelledScene, variant: Variant) -> PlanRequest:
     seed = variant.controls.seed ^ zlib.crc32(scene.scene_id.encode())
     return PlanRequest(
         request_id=f"{variant.name}/{scene.scene_id}",
-        scene=scene if variant.route else replace(scene, route=None),
+        scene=labelled.given(route=variant.route, tracks=variant.tracks),
         format=variant.format,
         controls=replace(
             variant.controls,

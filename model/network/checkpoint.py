@@ -160,6 +160,7 @@ def read_parts(folder: Path) -> Parts:
             cameras=settings.cameras,
             image_size=(settings.image_width, settings.image_height),
             parameters=card["parameters"],
+            inputs=settings.inputs,
             prompt_tokens=len(inputs.longest_prompt(settings.formats[0]).ids),
             details=card["details"],
         ),

@@ -84,6 +84,12 @@ class VlaSettings:
         return len(self.cameras) * self.clip_tokens
 
     @property
+    def inputs(self) -> tuple[str, ...]:
+        """What is taken of a scene beside pictures and history."""
+        taken = {"route": self.with_route, "tracks": self.with_tracks}
+        return tuple(name for name, is_taken in taken.items() if is_taken)
+
+    @property
     def seconds_per_slice(self) -> float:
         """Seconds from one time slice of a clip to the next (1.0 with pairs of frames at 2 Hz)."""
         return CLIP_PERIOD_S * self.temporal_patch_size

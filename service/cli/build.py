@@ -54,6 +54,7 @@ def rollout(
     top_p: Annotated[float, typer.Option(help="Nucleus mass.", min=0.01, max=1)] = 1.0,
     seed: Annotated[int, typer.Option(help="Of sampling.", min=0)] = 0,
     route: Annotated[bool, typer.Option(help="Tell the model the route.")] = True,
+    tracks: Annotated[bool, typer.Option(help="Tell the model the tracks of the agents around.")] = False,
     at_once: AtOnce = 32,
     give_up_after: GiveUp = 300.0,
     max_error_rate: MaxErrorRate = 0.1,
@@ -70,7 +71,7 @@ def rollout(
     from clients.planner import Access, AsyncPlannerClient, PlannerError
     from clients.wire import ModelName
 
-    sampling, access = Sampling(n, temperature, top_p, seed, route), Access.from_environment()
+    sampling, access = Sampling(n, temperature, top_p, seed, route, tracks), Access.from_environment()
     limits = Limits(at_once, give_up_after, max_error_rate, dry_run or limit)
     unlabelled: list[str] = []
 

@@ -31,6 +31,7 @@ def drive(
     ] = None,
     deadline_ms: Annotated[int | None, typer.Option(help="That each plan has.", min=1)] = None,
     route: Annotated[bool, typer.Option(help="Tell the model the route.")] = True,
+    tracks: Annotated[bool, typer.Option(help="Tell the model the tracks of the objects around.")] = False,
     small: Annotated[
         list[Path] | None,
         typer.Option(help="Folder of a small planner (`train blind`, `train teacher`) that drives too."),
@@ -68,7 +69,7 @@ def drive(
             return ConstantVelocity()
         if driver in small_pilots:
             return small_pilots[driver]
-        return ServicePilot(planner, driver, controls_of(driver), route=route)
+        return ServicePilot(planner, driver, controls_of(driver), route=route, tracks=tracks)
 
     def controls_of(driver: str) -> wire.Controls:
         return wire.Controls(
@@ -84,7 +85,7 @@ def drive(
             return hash_of(driver, seed, seconds, small_pilots[driver].revision)
         if driver in ("expert", "constant-velocity"):
             return hash_of(driver, seed, seconds)
-        return hash_of(driver, seed, seconds, controls_of(driver).model_dump_json(), route, models)
+        return hash_of(driver, seed, seconds, controls_of(driver).model_dump_json(), route, tracks, models)
 
     with told():
         small_pilots = {pilot.name: pilot for pilot in map(SmallPilot, small or ())}

@@ -113,7 +113,7 @@ def evaluate(
             from model.evaluation.variants import standard_variants
 
             made = engine_of(checkpoint)
-            variants = standard_variants(made.card.formats, controls)
+            variants = standard_variants(made.card.formats, controls, made.card.inputs)
             run = _run(evaluate_checkpoint, labelled, made, variants, n, rows, quiet=as_json)
             report = asyncio.run(run)
         typer.echo(json.dumps(report.to_json()) if as_json else str(report))

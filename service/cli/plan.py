@@ -26,6 +26,10 @@ def plan(
     temperature: Annotated[float, typer.Option(help="0 takes the likeliest words.")] = 1.0,
     seed: Annotated[int, typer.Option(help="The same seed gives the same draws.")] = 0,
     route: Annotated[bool, typer.Option(help="Give the route to the model where there is one.")] = True,
+    tracks: Annotated[
+        bool,
+        typer.Option(help="Give the tracks of the objects around, as a perfect tracker would tell them."),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Plan for scenes and draw what was planned."""
@@ -45,17 +49,23 @@ def plan(
                 checkpoint,
                 out,
                 as_json,
-                route,
+                {"route": route, "tracks": tracks},
                 {"thinking": thinking, "n": n, "temperature": temperature, "seed": seed},
             )
         )
 
 
 async def _plan(
-    labelled: list[Any], checkpoint: Path, out: Path, as_json: bool, route: bool, controls: dict[str, Any]
+    labelled: list[Any],
+    checkpoint: Path,
+    out: Path,
+    as_json: bool,
+    given: dict[str, bool],
+    controls: dict[str, Any],
 ) -> None:
-    from dataclasses import replace
+    import numpy as np
 
+    from model.driving.trajectory import agreed
     from model.engines.engine import Controls, DrawFinished, PlanRequest
     from model.engines.torch.engine import TorchEngine
     from model.evaluation.pictures import plan_picture
@@ -64,30 +74,32 @@ async def _plan(
     await engine.start()
     try:
         for scene in labelled:
-            given = scene.scene if route else replace(scene.scene, route=None)
-            request = PlanRequest(given.scene_id, given, controls=Controls(**controls))
+            asked = scene.given(**given)
+            request = PlanRequest(asked.scene_id, asked, controls=Controls(**controls))
             draws = [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
             draws.sort(key=lambda draw: draw.index)
-            picture = out / f"{given.scene_id}.png"
+            picture = out / f"{asked.scene_id}.png"
             picture.parent.mkdir(parents=True, exist_ok=True)
-            plan_picture(scene, draws, picture)
+            chosen = agreed(np.stack([draw.trajectory for draw in draws]))
+            plan_picture(scene, draws, picture, shown=chosen)
             if as_json:
-                typer.echo(json.dumps(_as_json(given.scene_id, draws, picture)))
+                typer.echo(json.dumps(_as_json(asked.scene_id, draws, chosen, picture)))
             else:
-                first = draws[0]
-                typer.echo(f"scene {given.scene_id}, draw 1 of {len(draws)}\n\n{first.text}\n")
-                if first.think_probability is not None:
-                    typer.echo(f"branch {first.branch}  think probability {first.think_probability:.3f}")
-                end = first.trajectory[-1]
+                draw = draws[chosen]
+                typer.echo(f"scene {asked.scene_id}, draw {chosen} of {len(draws)}\n\n{draw.text}\n")
+                if draw.think_probability is not None:
+                    typer.echo(f"branch {draw.branch}  think probability {draw.think_probability:.3f}")
+                end = draw.trajectory[-1]
                 typer.echo(f"in 6.4 s at x {end[0]:.1f} m, y {end[1]:.1f} m; picture {picture}")
     finally:
         await engine.stop()
 
 
-def _as_json(scene_id: str, draws: list[Any], picture: Path) -> dict[str, Any]:
+def _as_json(scene_id: str, draws: list[Any], chosen: int, picture: Path) -> dict[str, Any]:
     return {
         "scene_id": scene_id,
         "picture": str(picture),
+        "agreed": chosen,
         "draws": [
             {
                 "index": draw.index,

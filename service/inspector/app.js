@@ -6,7 +6,7 @@ import { showCameras } from "./cameras.js";
 import { byId, element } from "./dom.js";
 import { showDraw } from "./timeline.js";
 
-const state = { view: null, draws: [], chosen: 0, running: null, opened: new Map() };
+const state = { view: null, draws: [], chosen: 0, running: null, opened: new Map(), inputs: [] };
 
 const say = (text) => { byId("status").textContent = text; };
 
@@ -47,6 +47,7 @@ function showView(view) {
   showCameras(view.scene);
   byId("tags").replaceChildren(...view.tags.map((tag) => element("li", { textContent: tag.replaceAll("_", " ") })));
   byId("with-route").disabled = !view.scene.route;
+  byId("with-tracks").disabled = !state.inputs.includes("tracks");
   redraw();
   say(`Scene ${view.scene.scene_id || "without a name"}: press Plan.`);
 }
@@ -111,13 +112,17 @@ async function plan() {
   if (!state.view) return;
   state.running?.abort();
   const running = state.running = new AbortController();
-  const scene = byId("with-route").checked ? state.view.scene : { ...state.view.scene, route: null };
+  const scene = {
+    ...state.view.scene,
+    route: byId("with-route").checked ? state.view.scene.route : null,
+    tracks: byId("with-tracks").checked && !byId("with-tracks").disabled ? state.view.tracks : null,
+  };
   say("Planning …");
   byId("plan").disabled = true;
   const began = performance.now();
   try {
     const body = await api.plan(scene, controls(), running.signal);
-    showDraws(body.draws);
+    showDraws(body.draws, body.agreed);
     const { total_ms: total, engine_ms: engine } = body.timing;
     say(`${body.draws.length} draws in ${total.toFixed(0)} ms (engine ${engine.toFixed(0)} ms, `
       + `with the network ${(performance.now() - began).toFixed(0)} ms), request ${body.request_id}`);
@@ -136,12 +141,13 @@ function averageError(trajectory, expert) {
   return `${(sum / trajectory.length).toFixed(2)} m`;
 }
 
-function showDraws(draws) {
+function showDraws(draws, agreed) {
   state.draws = draws;
+  state.agreed = agreed;
   byId("draws").hidden = draws.length === 0;
   for (const empty of document.querySelectorAll(".empty")) empty.hidden = true;
   byId("draws").tBodies[0].replaceChildren(...draws.map(drawRow));
-  if (draws.length) choose(Math.min(state.chosen, draws.length - 1));
+  if (draws.length) choose(agreed);
 }
 
 function drawRow(draw, index) {
@@ -151,7 +157,8 @@ function drawRow(draw, index) {
   const branch = element("span", { className: `branch${thinks ? " think" : ""}`, textContent: thinks ? "second look" : "direct" });
   const tokens = Object.values(draw.tokens).reduce((sum, count) => sum + count, 0);
   const row = element("tr", {},
-    element("td", {}, element("label", {}, radio, `draw ${draw.index}`)),
+    element("td", {}, element("label", {}, radio, `draw ${draw.index}`),
+      index === state.agreed ? element("span", { className: "agreed", textContent: "agreed", title: "nearest to all other draws: the one to drive by" }) : ""),
     element("td", {}, draw.branch === null ? "–" : branch),
     element("td", {}, draw.think_probability === null ? "–" : probability(draw.think_probability)),
     element("td", { className: "number", textContent: tokens }),
@@ -210,7 +217,7 @@ function listen() {
 }
 
 async function begin() {
-  const [scenes] = await Promise.all([api.sceneList(), showModel()]);
+  const [scenes] = await Promise.all([api.sceneList(), showModel()]); // the model says what it takes
   byId("scene").replaceChildren(...scenes.map(({ scene_id: id, tags }) =>
     element("option", { value: id, textContent: tags.length ? `${id} · ${tags.join(", ").replaceAll("_", " ")}` : id })));
   if (scenes.length) await chooseScene();
@@ -218,6 +225,7 @@ async function begin() {
 
 async function showModel() {
   const [card] = await api.models();
+  state.inputs = card.inputs;
   byId("model").textContent = `${card.name} ${card.revision} · ${card.engine} · ${card.cameras.length} cameras`;
 }
 

@@ -6,6 +6,7 @@ import io
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,27 @@ def test_plans_with_the_controls(inspector: Page, engine: ScriptedEngine) -> Non
     assert asked.scene.route is None
     assert asked.scene.scene_id == "slow-leader"
     expect(inspector.get_by_role("status")).to_contain_text("3 draws in")
+
+
+def test_tracks_are_given_to_a_model_that_takes_them(
+    page: Page, served: Served, engine: ScriptedEngine
+) -> None:
+    page.goto(served.url)
+    expect(page.get_by_label("give the tracks")).to_be_disabled()
+    plain = engine.card_shown
+    engine.card_shown = replace(plain, inputs=("route", "tracks"))
+    try:
+        page.reload()
+        page.get_by_label("give the tracks").check()
+        engine.submitted.clear()
+        plan(page)
+        expect(page.locator("#draws tbody tr")).to_have_count(6)
+        expect(page.locator("#draws .agreed")).to_have_count(1)
+        expect(page.locator("#draws tr.is-chosen .agreed")).to_have_count(1)
+        [asked] = engine.submitted
+        assert len(asked.scene.tracks or ()) == 3
+    finally:
+        engine.card_shown = plain
 
 
 def test_a_second_look_is_shown_with_what_it_changed(inspector: Page) -> None:

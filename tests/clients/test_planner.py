@@ -181,6 +181,7 @@ def test_a_trajectory_out_of_this_world_is_a_bad_answer() -> None:
         "request_id": "r",
         "model": {"name": "m", "revision": "1"},
         "timing": {"total_ms": 1.0, "checks_ms": 0.0, "engine_ms": 1.0},
+        "agreed": 0,
         "draws": [
             {
                 **dict.fromkeys(["plan", "branch", "think_probability", "thinking", "revised_plan"]),

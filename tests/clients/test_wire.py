@@ -7,7 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from clients import wire
-from model.driving import plan, scene, trajectory
+from clients.wire_values import wire_tracks
+from model.driving import plan, scene, tracks, trajectory
 from model.engines import engine
 from tests.service.serving import body
 
@@ -15,6 +16,8 @@ from tests.service.serving import body
 def test_the_contract_speaks_the_words_of_the_model() -> None:
     assert get_args(wire.Camera) == scene.CAMERAS
     assert get_args(wire.Thinking) == get_args(engine.Thinking)
+    assert get_args(wire.AgentKind) == scene.AGENT_KINDS
+    assert get_args(wire.Light) == scene.LIGHTS
     assert get_args(wire.Branch) == get_args(engine.Branch)
     assert tuple(wire.Tracks.model_fields) == plan.GROUPS
     asked = wire.Controls()
@@ -26,6 +29,11 @@ def test_shapes_are_those_of_the_model() -> None:
     assert properties["history"]["minItems"] == properties["history"]["maxItems"] == trajectory.HISTORY_STEPS
     route = properties["route"]["anyOf"][0]
     assert route["minItems"] == route["maxItems"] == trajectory.ROUTE_POINTS
+    assert properties["tracks"]["anyOf"][0]["maxItems"] == tracks.MAX_TRACKS
+    told = {"x_m": 1.0, "y_m": 2.0, "heading_rad": 0.1, "speed_ms": 3.0, "length_m": 4.0, "width_m": 2.0}
+    track = tracks.Track(**told, kind="cone", lights=frozenset({"left", "right"}))
+    [sent] = wire_tracks([track])
+    assert tracks.Track(**sent.model_dump(exclude={"lights"}), lights=frozenset(sent.lights)) == track
     future = wire.Draw.model_json_schema()["properties"]["trajectory"]
     assert future["minItems"] == future["maxItems"] == trajectory.FUTURE_STEPS
 
@@ -58,6 +66,7 @@ def change(document: dict[str, Any], *path: Any, to: Any) -> dict[str, Any]:
         (("scene", "history", 3, 1), "1.0"),
         (("scene", "history", 3, 1), 10**400),
         (("scene", "route", 3), [1.0, 2.0, 3.0]),
+        (("scene", "tracks"), [{"kind": "dragon"}]),
         (("controls", "n"), 0),
         (("controls", "n"), 65),
         (("controls", "n"), 2.0),

@@ -286,6 +286,7 @@ def test_types_are_stable() -> None:
         "invalid-image": 422,
         "invalid-history": 422,
         "invalid-route": 422,
+        "invalid-tracks": 422,
         "invalid-controls": 422,
         "invalid-plan": 422,
         "unknown-format": 422,

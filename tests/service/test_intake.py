@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from clients import wire
 from service.intake import MAX_STEP_CHANGE_M, engine_request
-from service.problems import ProblemError
+from service.problems import INVALID_TRACKS, ProblemError
 from tests.service.scripted_engine import CARD
 from tests.service.serving import body
 
@@ -65,3 +67,37 @@ def test_cameras_the_model_does_not_need_are_welcome() -> None:
     document["scene"]["clips"].append(document["scene"]["clips"][0] | {"camera": "back"})
     request = engine_request(wire.PlanRequest.model_validate(document), CARD, "id")
     assert [clip.camera for clip in request.scene.clips] == ["front_wide_120", "front_tele_30", "back"]
+
+
+CAR = {
+    **{"x_m": 20.0, "y_m": 0.0, "heading_rad": 0.0, "speed_ms": 3.0, "length_m": 4.5, "width_m": 1.9},
+    **{"kind": "vehicle", "lights": ["brake"]},
+}
+
+
+def with_tracks(*tracks: dict[str, object]) -> wire.PlanRequest:
+    document = body()
+    document["scene"]["tracks"] = list(tracks)
+    return wire.PlanRequest.model_validate(document)
+
+
+def test_tracks_reach_a_model_that_takes_them() -> None:
+    card = replace(CARD, inputs=("route", "tracks"))
+    [track] = engine_request(with_tracks(CAR), card, "id").scene.tracks or ()
+    assert (track.x_m, track.speed_ms, track.kind) == (20.0, 3.0, "vehicle")
+    assert track.lights == frozenset({"brake"})
+    assert engine_request(with_tracks(), card, "id").scene.tracks == ()  # nobody is around
+    assert engine_request(with_history(driven(np.zeros(15))), card, "id").scene.tracks is None
+
+
+def test_tracks_that_cannot_be_are_refused_by_place() -> None:
+    card = replace(CARD, inputs=("route", "tracks"))
+    with pytest.raises(ProblemError, match="heading_rad") as caught:
+        engine_request(with_tracks(CAR, CAR | {"heading_rad": 90.0}), card, "id")
+    assert caught.value.kind is INVALID_TRACKS
+    assert caught.value.errors[0].pointer == "/scene/tracks/1"
+
+
+def test_a_model_without_tracks_says_so() -> None:
+    with pytest.raises(ProblemError, match="takes none"):
+        engine_request(with_tracks(CAR), CARD, "id")

@@ -65,7 +65,7 @@ def process(stderr: int | IO[str] = subprocess.PIPE) -> Iterator[tuple[subproces
     port = free_port()
     started = subprocess.Popen(
         [sys.executable, "-m", "service.cli", "serve", "--port", str(port)],
-        env=os.environ | {"LOOKTWICE_DRAIN_NOTICE_S": "0.5", "LOOKTWICE_MAX_DRAWS": "24"},
+        env=os.environ | {"LOOKTWICE_DRAIN_NOTICE_S": "3", "LOOKTWICE_MAX_DRAWS": "24"},
         stderr=stderr,
         text=True,
     )

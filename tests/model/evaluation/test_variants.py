@@ -9,6 +9,7 @@ import pytest
 
 from model.driving.labeller import expert_plan
 from model.driving.scene import LabelledScene
+from model.driving.tracks import tracks_of
 from model.engines.engine import Controls, EngineError
 from model.evaluation.open_loop import SceneResult
 from model.evaluation.variants import (
@@ -18,7 +19,7 @@ from model.evaluation.variants import (
     standard_variants,
     with_shuffled_images,
 )
-from tests.model.driving.drives import labelled_scene
+from tests.model.driving.drives import agent, labelled_scene
 from tests.model.evaluation.fakes import FakeEngine
 
 SCENES = [labelled_scene(8.0 + i, scene_id=f"s{i}", episode_id=f"e{i // 3}", pictures=i) for i in range(10)]
@@ -63,7 +64,7 @@ def test_requests_carry_what_the_variant_says() -> None:
     full = request_for(
         labelled, Variant("full", "other", Controls(n=2, thinking="never"), route=True, expert_plan=True)
     )
-    assert full.scene.route is labelled.scene.route
+    np.testing.assert_array_equal(np.asarray(full.scene.route), np.asarray(labelled.scene.route))
     assert full.controls.prefill == expert_plan(labelled)
     assert (full.format, full.controls.n, full.controls.thinking) == ("other", 2, "never")
 
@@ -133,3 +134,16 @@ def test_the_standard_rows_fit_what_a_checkpoint_writes() -> None:
         of_route = [variant for variant in both if variant.route is route]
         assert sum(variant.expert_plan for variant in of_route) == 1
         assert sum(variant.shuffled_images for variant in of_route) == 1
+    takes_tracks = standard_variants(["cf_vla"], inputs=("route", "tracks"))
+    assert [variant.name for variant in takes_tracks if variant.tracks] == [
+        "meta-act + route + tracks",
+        "meta-act + route + tracks, expert plan",
+        "meta-act + route + tracks, shuffled images",
+    ]
+
+
+def test_tracks_are_given_where_the_variant_says_so() -> None:
+    car = agent(12.0, 0.0)
+    labelled = labelled_scene(8.0, agents=(car,))
+    assert request_for(labelled, Variant("with", tracks=True)).scene.tracks == tracks_of(labelled.agents)
+    assert request_for(labelled, Variant("without")).scene.tracks is None
