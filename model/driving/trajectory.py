@@ -157,6 +157,12 @@ def constant_turn_rate(history: FloatArray) -> FloatArray:
     return baseline
 
 
+def path_length(trajectory: FloatArray) -> float:
+    """Metres that a trajectory [64, 4] covers, from the present on."""
+    points = np.concatenate([np.zeros((1, 2)), trajectory[:, :2].astype(np.float64)])
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
 def agreed(trajectories: FloatArray) -> int:
     """The place of the trajectory [n, 64, 4] that is nearest to all others on average: the draw to drive."""
     apart = np.linalg.norm(trajectories[:, None, :, :2] - trajectories[None, :, :, :2], axis=-1)

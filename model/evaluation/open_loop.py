@@ -11,22 +11,34 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.labeller import expert_plan
+from model.driving.labeller import expert_plan, label_plan
 from model.driving.lead import lead_within
 from model.driving.metrics import collides, displacement_errors, leaves_road
 from model.driving.plan import Plan, plan_iou
 from model.driving.scene import LabelledScene, Tag
-from model.driving.trajectory import FloatArray, constant_turn_rate, constant_velocity
+from model.driving.trajectory import (
+    FloatArray,
+    agreed,
+    constant_turn_rate,
+    constant_velocity,
+    path_length,
+    present_speed,
+)
 from model.engines.engine import Draw
 
 MEASURES: Final = (
-    "min_ade_m",
+    "agreed_ade_m",
+    "greedy_ade_m",
     "avg_ade_m",
+    "min_ade_m",
+    "path_m",
+    "path_error_m",
     "min_fde_m",
     "avg_fde_m",
     "corner_distance_m",
     "collision_rate",
     "off_road_rate",
+    "agreement_plan_trajectory",
     "plan_iou_first",
     "plan_iou_best",
     "plan_iou_revised",
@@ -43,6 +55,13 @@ BASELINES: Final[Mapping[str, Callable[[FloatArray], FloatArray]]] = {
 }
 
 
+LEAD_WITHIN_S: Final = 4.0
+"""A lead vehicle this near decides how fast one may go."""
+
+
+EXPERT: Final = "expert"
+
+
 @dataclass(frozen=True)
 class SceneResult:
     """What one scene's draws are worth. A measure is None where it has no meaning.
@@ -50,9 +69,16 @@ class SceneResult:
     Attributes:
         scene_id, episode_id, tags: the scene's own.
         lead_close: a vehicle is in the ego's way close by, see `lead_within`.
+        lead_soon: one is nearer than `LEAD_WITHIN_S` at the present speed.
+        agreed_ade_m: average displacement error of the draw that is driven by, see `agreed`.
+        greedy_ade_m: that of the likeliest response; None where nobody asked for it.
+        path_m: length of the draw that is driven by.
+        path_error_m: by how much that is longer than the expert's.
         min_ade_m, avg_ade_m, min_fde_m, avg_fde_m, corner_distance_m: see `DisplacementErrors`.
         collision_rate: share of draws that meet another agent or obstacle within 5 s.
         off_road_rate: share of draws that leave the road; None where no drivable area is known.
+        agreement_plan_trajectory: IOU of the plan that a draw ends with and the plan that its trajectory
+            carries out (`label_plan`; lanes cannot be told from it), mean; None without plans.
         plan_iou_first: IOU of the first plan with the expert's, mean over draws; None without plans.
         plan_iou_best: the same, best of the draws.
         plan_iou_revised: IOU of the plan a draw ends with (the first one, where it did not reflect), mean.
@@ -66,13 +92,19 @@ class SceneResult:
     episode_id: str
     tags: frozenset[Tag]
     lead_close: bool
-    min_ade_m: float
+    lead_soon: bool
+    agreed_ade_m: float
     avg_ade_m: float
+    min_ade_m: float
+    path_m: float
+    path_error_m: float
     min_fde_m: float
     avg_fde_m: float
     corner_distance_m: float
     collision_rate: float
     off_road_rate: float | None
+    greedy_ade_m: float | None = None
+    agreement_plan_trajectory: float | None = None
     plan_iou_first: float | None = None
     plan_iou_best: float | None = None
     plan_iou_revised: float | None = None
@@ -85,13 +117,20 @@ class SceneResult:
 def evaluate_trajectories(labelled: LabelledScene, trajectories: FloatArray) -> SceneResult:
     """The result of bare trajectories [n, 64, 4]."""
     errors = displacement_errors(trajectories, labelled.future)
+    driven = trajectories[agreed(trajectories)]
+    path_m = path_length(driven)
+    soon_m = LEAD_WITHIN_S * max(0.0, present_speed(labelled.scene.history))
     return SceneResult(
         scene_id=labelled.scene.scene_id,
         episode_id=labelled.episode_id,
         tags=labelled.tags,
         lead_close=lead_within(labelled),
-        min_ade_m=errors.min_ade_m,
+        lead_soon=lead_within(labelled, soon_m),
+        agreed_ade_m=displacement_errors(driven[None], labelled.future).min_ade_m,
         avg_ade_m=errors.avg_ade_m,
+        min_ade_m=errors.min_ade_m,
+        path_m=path_m,
+        path_error_m=path_m - path_length(labelled.future),
         min_fde_m=errors.min_fde_m,
         avg_fde_m=errors.avg_fde_m,
         corner_distance_m=errors.corner_distance_m,
@@ -102,8 +141,13 @@ def evaluate_trajectories(labelled: LabelledScene, trajectories: FloatArray) -> 
     )
 
 
-def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw]) -> SceneResult:
+def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw], greedy: Draw | None = None) -> SceneResult:
     """The result of a scene's draws: trajectories, plans, tokens and thinking.
+
+    Args:
+        labelled: the scene.
+        draws: at least one.
+        greedy: the likeliest response, where it was asked for.
 
     Raises:
         ValueError: no draws.
@@ -120,9 +164,18 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw]) -> SceneResul
         for draw in draws
         if draw.plan is not None and draw.revised_plan is not None
     ]
+    followed = [
+        iou_with_expert(plan, label_plan(draw.trajectory, labelled.scene.history, None))
+        for draw in draws
+        if (plan := draw.revised_plan or draw.plan) is not None
+    ]
     branches = [draw.branch for draw in draws if draw.branch is not None]
     return replace(
         evaluate_trajectories(labelled, np.stack([draw.trajectory for draw in draws])),
+        greedy_ade_m=None
+        if greedy is None
+        else displacement_errors(greedy.trajectory[None], labelled.future).min_ade_m,
+        agreement_plan_trajectory=_mean(followed),
         plan_iou_first=_mean(first),
         plan_iou_best=max(first, default=None),
         plan_iou_revised=_mean(last),
@@ -134,9 +187,10 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw]) -> SceneResul
 
 
 def evaluate_baselines(scenes: Iterable[LabelledScene]) -> dict[str, list[SceneResult]]:
-    """Results of each kinematic baseline (`BASELINES`), one trajectory a scene."""
-    results: dict[str, list[SceneResult]] = {name: [] for name in BASELINES}
+    """Results of each kinematic baseline (`BASELINES`) and of the expert itself, one trajectory a scene."""
+    results: dict[str, list[SceneResult]] = {name: [] for name in (EXPERT, *BASELINES)}
     for labelled in scenes:
+        results[EXPERT].append(evaluate_trajectories(labelled, labelled.future[None]))
         for name, baseline in BASELINES.items():
             trajectory = baseline(labelled.scene.history)
             results[name].append(evaluate_trajectories(labelled, trajectory[None]))

@@ -3,34 +3,59 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 from model.driving.lead import LEAD_WITHIN_M
 from model.driving.scene import LabelledScene
+from model.driving.trajectory import FloatArray
 from model.engines.engine import Draw, Engine
 from model.evaluation.bootstrap import Comparison, compare
-from model.evaluation.open_loop import SceneResult, evaluate_baselines
+from model.evaluation.open_loop import (
+    EXPERT,
+    LEAD_WITHIN_S,
+    SceneResult,
+    evaluate_baselines,
+    evaluate_trajectories,
+)
 from model.evaluation.table import Row, format_table, to_json
 from model.evaluation.variants import Variant, evaluate_engine
 
 LEAD_SUBGROUP = f"lead within {LEAD_WITHIN_M:.0f} m"
+SOON_SUBGROUP = f"lead within {LEAD_WITHIN_S:.0f} s"
 
 
 @dataclass(frozen=True)
 class Report:
-    """Rows and comparisons of one evaluation."""
+    """Rows and comparisons of one evaluation.
+
+    Attributes:
+        rows, comparisons: of the table.
+        speed_response: by variant and factor of speed, how much of the change of speed its path follows: 1
+            copies it, 0 does not mind.
+    """
 
     rows: tuple[Row, ...]
     comparisons: tuple[Comparison, ...]
+    speed_response: Mapping[str, Mapping[float, float]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """See `model.evaluation.table.to_json`."""
-        return to_json(self.rows, self.comparisons)
+        """See `model.evaluation.table.to_json`; factors of speed are told as text."""
+        responses = {
+            name: {f"{factor:g}": value for factor, value in of.items()}
+            for name, of in self.speed_response.items()
+        }
+        return to_json(self.rows, self.comparisons) | {"speed_response": responses}
 
     def __str__(self) -> str:
-        return format_table(self.rows, self.comparisons)
+        lines = [
+            f"{name}: speed response "
+            + ", ".join(f"{value:.2f} at x {factor:g}" for factor, value in of.items())
+            for name, of in self.speed_response.items()
+        ]
+        return format_table(self.rows, self.comparisons) + "".join(f"{line}\n" for line in lines)
 
 
 async def evaluate_checkpoint(
@@ -40,8 +65,9 @@ async def evaluate_checkpoint(
     *,
     concurrency: int = 16,
     on_result: Callable[[Variant, SceneResult], None] | None = None,
+    planners: Mapping[str, Callable[[LabelledScene], FloatArray]] = MappingProxyType({}),
 ) -> Report:
-    """Evaluate a started engine in every variant, and the kinematic baselines, on the same scenes.
+    """Evaluate a started engine in every variant, the expert and all baselines, on the same scenes.
 
     Args:
         engine: started.
@@ -49,15 +75,30 @@ async def evaluate_checkpoint(
         variants: see `standard_variants`.
         concurrency: scenes under way at once.
         on_result: called after each scene of each variant, for progress.
+        planners: that get a row beside the baselines.
 
     Raises:
         EngineError, RequestError, ValueError: see `evaluate_engine`.
     """
     baselines = evaluate_baselines(scenes)
+    for name, planner in planners.items():
+        baselines[name] = [evaluate_trajectories(each, planner(each)[None]) for each in scenes]
     results = await evaluate_variants(engine, scenes, variants, concurrency=concurrency, on_result=on_result)
     rows = [row for name, of in baselines.items() for row in _rows(name, of)]
     rows += [row for variant, of in results.items() for row in variant_rows(variant, of)]
-    return Report(tuple(rows), tuple(compare_variants(baselines, results)))
+    return Report(tuple(rows), tuple(compare_variants(baselines, results)), speed_responses(results))
+
+
+def speed_responses(results: Mapping[Variant, Sequence[SceneResult]]) -> dict[str, dict[float, float]]:
+    """How much of a change of speed the paths of variants follow; see `Report.speed_response`."""
+    path_m = {variant: sum(result.path_m for result in of) for variant, of in results.items()}
+    responses: dict[str, dict[float, float]] = {}
+    for variant, length_m in path_m.items():
+        free = _free(variant, results)
+        if variant.speed != 1.0 and free is not None:
+            change = length_m / path_m[free] - 1
+            responses.setdefault(free.name, {})[variant.speed] = change / (variant.speed - 1)
+    return responses
 
 
 async def evaluate_variants(
@@ -90,56 +131,66 @@ def variant_rows(variant: Variant, results: Sequence[SceneResult]) -> list[Row]:
 
 
 def _rows(name: str, results: Sequence[SceneResult], **about: Any) -> list[Row]:
-    """A variant's row over all scenes, and one over those with a lead vehicle close by."""
+    """A variant's row over all scenes, and those over scenes with a lead vehicle close by or soon met."""
     rows = [Row.from_results(name, results, **about)]
-    if close := _with_lead(results):
-        rows.append(Row.from_results(name, close, subgroup=LEAD_SUBGROUP, **about))
+    for subgroup, of in ((LEAD_SUBGROUP, _with_lead(results)), (SOON_SUBGROUP, _soon(results))):
+        if of:
+            rows.append(Row.from_results(name, of, subgroup=subgroup, **about))
     return rows
 
 
 def compare_variants(
     baselines: Mapping[str, Sequence[SceneResult]], results: Mapping[Variant, Sequence[SceneResult]]
 ) -> list[Comparison]:
-    """minADE of what should differ, pair by pair.
+    """What should differ, pair by pair.
 
-    Free planning against the best baseline and against the format without plans; given the expert's plan
-    against free; shuffled images against free, also where a lead vehicle is close by.
+    Of the draw that is driven by: free planning against every baseline but the expert. Of minADE: against
+    the format without plans, and given the expert's plan against free. Of avgADE: against the format without
+    plans, and shuffled images against free. Of path lengths: shuffled against free, where a lead is near.
     """
-    best = min(baselines, key=lambda name: sum(result.min_ade_m for result in baselines[name]))
     comparisons = []
     for variant, of in results.items():
-        if variant.expert_plan or variant.shuffled_images:
-            free = _free(variant, results)
-            if free is None:
-                continue
+        free = _free(variant, results)
+        if free is not None and variant.expert_plan:
             comparisons.append(compare(f"{variant.name} : {free.name}", of, results[free]))
-            if variant.shuffled_images and (close := _with_lead(of)):
-                comparisons.append(
-                    compare(
-                        f"{variant.name} : {free.name} [{LEAD_SUBGROUP}]", close, _with_lead(results[free])
-                    )
-                )
+        if free is not None and variant.shuffled_images:
+            name = f"{variant.name} : {free.name}"
+            comparisons.append(compare(name, of, results[free], "avg_ade_m"))
+            if close := _with_lead(of):
+                lead = f"{name} [{LEAD_SUBGROUP}]"
+                comparisons.append(compare(lead, close, _with_lead(results[free]), "avg_ade_m"))
+            if soon := _soon(of):
+                comparisons.append(compare(f"{name} [{SOON_SUBGROUP}]", soon, _soon(results[free]), "path_m"))
+        if variant != replace(variant, expert_plan=False, shuffled_images=False, speed=1.0):
             continue
-        comparisons.append(compare(f"{variant.name} : {best}", of, baselines[best]))
+        comparisons += [
+            compare(f"{variant.name} : {name}", of, baseline, "agreed_ade_m")
+            for name, baseline in baselines.items()
+            if name != EXPERT
+        ]
         for other in results:
             plain = other.format == "traj_only" and not other.shuffled_images
-            if variant.format != "traj_only" and plain and other.route == variant.route:
-                comparisons.append(compare(f"{variant.name} : {other.name}", of, results[other]))
+            given = (other.route, other.tracks) == (variant.route, variant.tracks)
+            if variant.format != "traj_only" and plain and given:
+                name = f"{variant.name} : {other.name}"
+                comparisons += [
+                    compare(name, of, results[other], measure) for measure in ("min_ade_m", "avg_ade_m")
+                ]
     return comparisons
 
 
 def _free(variant: Variant, results: Mapping[Variant, Sequence[SceneResult]]) -> Variant | None:
-    """The variant that differs from ``variant`` only in what it is given."""
+    """The variant that differs from ``variant`` only in what is changed about its scenes; None for itself."""
+    plain = replace(variant, name="", expert_plan=False, shuffled_images=False, speed=1.0, greedy=False)
     for other in results:
-        alike = (other.format, other.controls, other.route) == (
-            variant.format,
-            variant.controls,
-            variant.route,
-        )
-        if alike and not other.expert_plan and not other.shuffled_images:
+        if other is not variant and replace(other, name="", greedy=False) == plain:
             return other
     return None
 
 
 def _with_lead(results: Sequence[SceneResult]) -> list[SceneResult]:
     return [result for result in results if result.lead_close]
+
+
+def _soon(results: Sequence[SceneResult]) -> list[SceneResult]:
+    return [result for result in results if result.lead_soon]

@@ -93,13 +93,17 @@ def to_json(rows: Sequence[Row], comparisons: Sequence[Comparison] = ()) -> dict
 
 
 _COLUMNS: Final[tuple[tuple[str, str, str], ...]] = (
-    ("min_ade_m", "minADE m", "{:.2f}"),
+    ("agreed_ade_m", "ADE m", "{:.2f}"),
+    ("greedy_ade_m", "greedy", "{:.2f}"),
     ("avg_ade_m", "avgADE m", "{:.2f}"),
+    ("min_ade_m", "minADE m", "{:.2f}"),
+    ("path_error_m", "path m", "{:+.1f}"),
     ("min_fde_m", "minFDE m", "{:.2f}"),
     ("avg_fde_m", "avgFDE m", "{:.2f}"),
     ("corner_distance_m", "corner m", "{:.2f}"),
     ("collision_rate", "collision", "{:.1%}"),
     ("off_road_rate", "off-road", "{:.1%}"),
+    ("agreement_plan_trajectory", "follows", "{:.3f}"),
     ("plan_iou_first", "plan IOU", "{:.3f}"),
     ("plan_iou_revised", "revised", "{:.3f}"),
     ("output_tokens", "tokens", "{:.0f}"),
@@ -108,7 +112,7 @@ _COLUMNS: Final[tuple[tuple[str, str, str], ...]] = (
 
 
 def format_table(rows: Sequence[Row], comparisons: Sequence[Comparison] = ()) -> str:
-    """The table as plain text; minADE carries its 95 % interval, comparisons follow below."""
+    """The table as plain text; the ADE that is driven by carries its 95 % interval, comparisons follow."""
     header = ["", "scenes", "n", *(title for _, title, _ in _COLUMNS)]
     header.insert(4, "95 %")
     lines = _aligned([header, *(_cells(row) for row in rows)])
@@ -128,7 +132,7 @@ def _cells(row: Row) -> list[str]:
         str(row.n),
         *(shown(measure, pattern) for measure, _, pattern in _COLUMNS),
     ]
-    cells.insert(4, _shown_interval(row.intervals["min_ade_m"]))
+    cells.insert(4, _shown_interval(row.intervals["agreed_ade_m"]))
     return cells
 
 

@@ -7,6 +7,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 
@@ -22,6 +23,9 @@ from model.engines.engine import (
 )
 from model.evaluation.open_loop import SceneResult, evaluate_draws
 
+SPEED_FACTORS: Final = (0.5, 1.5)
+"""A planner that copies its speed goes as much slower or faster as its history; the expert does not."""
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -34,6 +38,8 @@ class Variant:
         route: whether the scene's route is given.
         tracks: whether the tracks of its agents are given.
         expert_plan: the expert's plan is given as the first plan.
+        greedy: the likeliest response is asked for too.
+        speed: the history is driven at so many times its speed.
         shuffled_images: scenes get the clips of scenes from other episodes: a planner that looks gets worse.
     """
 
@@ -44,6 +50,8 @@ class Variant:
     tracks: bool = False
     expert_plan: bool = False
     shuffled_images: bool = False
+    greedy: bool = False
+    speed: float = 1.0
 
 
 def standard_variants(
@@ -59,10 +67,15 @@ def standard_variants(
             variants.append(replace(plain, name=f"traj-only{suffix}", format="traj_only", controls=no_branch))
         if "cf_vla" in formats:
             variants += [
-                replace(plain, name=f"meta-act{suffix}"),
+                replace(plain, name=f"meta-act{suffix}", greedy=True),
                 replace(plain, name=f"meta-act{suffix}, expert plan", expert_plan=True),
                 replace(plain, name=f"meta-act{suffix}, shuffled images", shuffled_images=True),
             ]
+            if route:
+                variants += [
+                    replace(plain, name=f"meta-act{suffix}, speed x {factor:g}", speed=factor)
+                    for factor in SPEED_FACTORS
+                ]
     return variants
 
 
@@ -103,8 +116,9 @@ async def evaluate_engine(
             if item is None:
                 return
             index, labelled = item
-            draws = await _plan(engine, labelled, variant)
-            results[index] = evaluate_draws(labelled, draws)
+            draws = await _plan(engine, request_for(labelled, variant))
+            greedy = await _plan(engine, greedy_request(labelled, variant)) if variant.greedy else [None]
+            results[index] = evaluate_draws(labelled, draws, greedy[0])
             if on_draws is not None:
                 on_draws(labelled, draws)
             if on_result is not None:
@@ -119,8 +133,7 @@ async def evaluate_engine(
     return [results[index] for index in range(len(results))]
 
 
-async def _plan(engine: Engine, labelled: LabelledScene, variant: Variant) -> list[Draw]:
-    request = request_for(labelled, variant)
+async def _plan(engine: Engine, request: PlanRequest) -> list[Draw]:
     draws = [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
     if len(draws) != request.controls.n:
         raise EngineError(f"{request.request_id}: {len(draws)} draws came for {request.controls.n}")
@@ -135,9 +148,12 @@ def request_for(labelled: LabelledScene, variant: Variant) -> PlanRequest:
     # A draw's random numbers depend on the seed alone: one seed for all scenes would give all the same
     # luck. A seed from the scene's name does not, and variants still meet the same luck in the same scene.
     seed = variant.controls.seed ^ zlib.crc32(scene.scene_id.encode())
+    given = labelled.given(route=variant.route, tracks=variant.tracks)
+    if variant.speed != 1.0:
+        given = replace(given, history=given.history * np.array([variant.speed] * 3 + [1.0], np.float32))
     return PlanRequest(
         request_id=f"{variant.name}/{scene.scene_id}",
-        scene=labelled.given(route=variant.route, tracks=variant.tracks),
+        scene=given,
         format=variant.format,
         controls=replace(
             variant.controls,
@@ -145,6 +161,13 @@ def request_for(labelled: LabelledScene, variant: Variant) -> PlanRequest:
             prefill=expert_plan(labelled) if variant.expert_plan else variant.controls.prefill,
         ),
     )
+
+
+def greedy_request(labelled: LabelledScene, variant: Variant) -> PlanRequest:
+    """The request for the likeliest response alone."""
+    request = request_for(labelled, variant)
+    controls = replace(request.controls, n=1, temperature=0.0)
+    return replace(request, request_id=f"{request.request_id}/greedy", controls=controls)
 
 
 def with_shuffled_images(scenes: Iterable[LabelledScene], seed: int = 0) -> Iterator[LabelledScene]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -17,13 +16,14 @@ from model.evaluation.open_loop import evaluate_draws
 from model.network.checkpoint import Loaded
 
 _ROWS = 48
-_MEASURES: Final = ("min_ade_m", "plan_iou_first", "plan_iou_revised", "think_rate")
+_GIVEN: Final = (("", False, False), ("+route", True, False), ("+route+tracks", True, True))
+_MEASURES: Final = ("agreed_ade_m", "min_ade_m", "plan_iou_first", "plan_iou_revised", "think_rate")
 
 
 def open_loop(
     loaded: Loaded, scenes: Sequence[LabelledScene], formats: Sequence[str], n: int = 6
 ) -> Mapping[str, float]:
-    """minADE over n draws, per format and with or without the route; IOU of first and last plan, think rate.
+    """Errors, IOU of first and last plan and think rate, per format and what is given beside pictures.
 
     The network is put into evaluation mode meanwhile.
     """
@@ -34,10 +34,10 @@ def open_loop(
     figures: dict[str, float] = {}
     with torch.inference_mode():
         for format in formats:
-            for route in (False, True):
+            for suffix, route, tracks in _GIVEN if loaded.settings.with_tracks else _GIVEN[:2]:
                 decoder = Decoder(Runner(loaded, _ROWS))
                 for labelled in scenes:
-                    scene = labelled.scene if route else replace(labelled.scene, route=None)
+                    scene = labelled.given(route=route, tracks=tracks)
                     decoder.add(PlanRequest(scene.scene_id, scene, format, Controls(n=n)))
                 draws: dict[str, list[DrawFinished]] = {}
                 while not decoder.idle:
@@ -50,7 +50,7 @@ def open_loop(
                     evaluate_draws(futures[name], [event.draw for event in finished])
                     for name, finished in draws.items()
                 ]
-                label = f"{format}{'+route' if route else ''}"
+                label = f"{format}{suffix}"
                 for measure in _MEASURES:
                     values = [getattr(result, measure) for result in results]
                     if None not in values:

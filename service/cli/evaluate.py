@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from model.driving.scene import LabelledScene
+    from model.driving.trajectory import FloatArray
     from model.engines.engine import Controls, Draw, Engine
     from model.evaluation.ladder import LadderReport
     from model.evaluation.open_loop import SceneResult
@@ -60,6 +61,10 @@ def evaluate(
     keep: Annotated[
         Path | None,
         typer.Option(help="SQLite file that keeps all draws: started again, it goes on where it was."),
+    ] = None,
+    small: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of a small planner (`train blind`, `train teacher`) that gets a row too."),
     ] = None,
     perception: Annotated[
         bool, typer.Option("--perception", help="How well pictures are read, fact by fact, and nothing else.")
@@ -114,9 +119,19 @@ def evaluate(
 
             made = engine_of(checkpoint)
             variants = standard_variants(made.card.formats, controls, made.card.inputs)
-            run = _run(evaluate_checkpoint, labelled, made, variants, n, rows, quiet=as_json)
+            planners = dict(map(_small_planner, small or ()))
+            evaluate = partial(evaluate_checkpoint, planners=planners)
+            run = _run(evaluate, labelled, made, variants, n, rows, quiet=as_json)
             report = asyncio.run(run)
         typer.echo(json.dumps(report.to_json()) if as_json else str(report))
+
+
+def _small_planner(folder: Path) -> tuple[str, Callable[[LabelledScene], FloatArray]]:
+    """A small planner's kind, and how it plans; scenes need a route."""
+    from model.network.small_planner import load_small
+
+    planner = load_small(folder)
+    return planner.kind, lambda labelled: planner.plan([labelled.given(route=True, tracks=True)])[0]
 
 
 def _evenly(scenes: Iterable[LabelledScene], count: int, limit: int | None) -> Iterator[LabelledScene]:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,10 +34,14 @@ from tests.model.evaluation.fakes import draw_of
 
 
 def result(scene: int, error_m: float, think_rate: float | None = None, **more: float) -> SceneResult:
-    return SceneResult(
-        f"s{scene}", f"e{scene // 4}", frozenset(), False, *(error_m,) * 5, 0.1, 0.1,
-        plan_iou_first=0.5, plan_iou_revised=0.6, output_tokens=60.0, think_rate=think_rate, **more,
-    )  # fmt: skip
+    errors = dict.fromkeys(
+        ("agreed_ade_m", "avg_ade_m", "min_ade_m", "min_fde_m", "avg_fde_m", "corner_distance_m"), error_m
+    )
+    rates = {"collision_rate": 0.1, "off_road_rate": 0.1, "path_m": 50.0, "path_error_m": 0.0}
+    plans = {"plan_iou_first": 0.5, "plan_iou_revised": 0.6, "output_tokens": 60.0, "think_rate": think_rate}
+    measures: dict[str, Any] = errors | rates | plans | more
+    about: dict[str, Any] = {"scene_id": f"s{scene}", "episode_id": f"e{scene // 4}", "tags": frozenset()}
+    return SceneResult(**about, lead_close=False, lead_soon=False, **measures)
 
 
 def test_a_rung_has_its_rows_with_and_without_the_route() -> None:

@@ -9,6 +9,7 @@ from model.driving.labeller import expert_plan
 from model.driving.plan import MetaAction, Plan, plan_iou
 from model.evaluation.open_loop import (
     BASELINES,
+    EXPERT,
     MEASURES,
     SceneResult,
     evaluate_baselines,
@@ -77,8 +78,10 @@ def test_no_draws_are_an_error() -> None:
 def test_baselines_are_right_where_their_assumption_holds() -> None:
     straight, arc = labelled_scene(10.0), labelled_scene(10.0, 0.2)
     results = evaluate_baselines(iter([straight, arc]))
-    assert list(results) == list(BASELINES)
-    velocity, turn_rate = results.values()
+    assert list(results) == [EXPERT, *BASELINES]
+    expert, velocity, turn_rate = results.values()
+    assert [result.agreed_ade_m for result in expert] == [0.0, 0.0]
+    assert [result.path_error_m for result in expert] == [0.0, 0.0]
     assert velocity[0].min_ade_m < 1e-3
     assert velocity[1].min_ade_m > 5
     assert turn_rate[1].avg_ade_m < 1e-3
@@ -86,3 +89,35 @@ def test_baselines_are_right_where_their_assumption_holds() -> None:
 
 def test_every_measure_is_a_field() -> None:
     assert set(MEASURES) <= set(SceneResult.__dataclass_fields__)
+
+
+def test_the_draw_that_is_driven_by_has_measures_of_its_own() -> None:
+    scene = labelled_scene(10.0)
+    away = [offset(scene.future, metres) for metres in (0.0, 2.0, 3.0)]
+    greedy = draw_of(offset(scene.future, 0.25), expert_plan(scene))
+    result = evaluate_draws(scene, [draw_of(each, expert_plan(scene)) for each in away], greedy)
+    assert result.agreed_ade_m == pytest.approx(2.0, abs=1e-5)
+    assert result.greedy_ade_m == pytest.approx(0.25, abs=1e-5)
+    assert result.path_m == pytest.approx(64.0 + result.path_error_m, abs=0.01)
+    assert evaluate_draws(scene, [greedy]).greedy_ade_m is None
+
+
+def test_a_trajectory_that_does_what_its_plan_says_agrees_with_it() -> None:
+    steady, braking = labelled_scene(10.0), labelled_scene(10.0 - 1.2 * np.maximum(MIDDLES_S, 0))
+    says, does = expert_plan(steady), braking.future
+    assert evaluate_draws(steady, [draw_of(steady.future, says)]).agreement_plan_trajectory == 1.0
+    part = evaluate_draws(steady, [draw_of(does, says)]).agreement_plan_trajectory
+    assert part is not None
+    assert part < 0.7
+    # What counts is the plan that the trajectory follows: the last one.
+    revised = draw_of(does, says, revised=expert_plan(braking))
+    assert evaluate_draws(steady, [revised]).agreement_plan_trajectory == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_lead_is_soon_met_by_who_drives_fast() -> None:
+    lead = agent(45.0, 0.0, speed=5.0)
+    draws = [draw_of(labelled_scene(10.0).future)]
+    assert not evaluate_draws(labelled_scene(5.0, agents=(lead,)), draws).lead_soon
+    fast = evaluate_draws(labelled_scene(15.0, agents=(lead,)), draws)
+    assert fast.lead_soon
+    assert not fast.lead_close

@@ -11,7 +11,7 @@ from model.driving.scene import FRONT_WIDE
 from model.driving.trajectory import FloatArray
 from model.engines.engine import Controls, DrawFinished, Event, PlanRequest
 from model.evaluation.open_loop import SceneResult
-from model.evaluation.report import LEAD_SUBGROUP, Report, evaluate_checkpoint
+from model.evaluation.report import LEAD_SUBGROUP, SOON_SUBGROUP, Report, evaluate_checkpoint
 from model.evaluation.variants import Variant, standard_variants
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
 from tests.model.evaluation.fakes import FakeEngine, draw_of
@@ -58,33 +58,55 @@ def report() -> Report:
     return made
 
 
-def test_every_variant_and_baseline_has_a_row_and_one_for_scenes_with_a_lead(report: Report) -> None:
+def test_every_variant_and_baseline_has_a_row_and_those_for_scenes_with_a_lead(report: Report) -> None:
     names = [row.name for row in report.rows]
-    assert names[:4] == ["constant velocity"] * 2 + ["constant turn rate"] * 2
-    assert len(names) == 2 * (2 + 8)
-    assert {(row.subgroup, row.scenes) for row in report.rows} == {(None, 6), (LEAD_SUBGROUP, 3)}
+    assert list(dict.fromkeys(names))[:3] == ["expert", "constant velocity", "constant turn rate"]
+    assert len(names) == 3 * (3 + 10)
+    assert {(row.subgroup, row.scenes) for row in report.rows} == {
+        (None, 6),
+        (LEAD_SUBGROUP, 3),
+        (SOON_SUBGROUP, 3),
+    }
     assert {row.route for row in report.rows if "route" in row.name} == {True}
     assert report.to_json()["scenes"] == 6
 
 
 def test_what_should_differ_is_compared(report: Report) -> None:
-    ratio = {comparison.name: comparison.ratio for comparison in report.comparisons}
+    ratio = {(each.name, each.measure): each.ratio for each in report.comparisons}
     for free in ("meta-act", "meta-act + route"):
-        plain = free.replace("meta-act", "traj-only")
-        assert ratio[f"{free} : {plain}"] == pytest.approx(0.8, rel=1e-3)
-        assert ratio[f"{free}, expert plan : {free}"] == pytest.approx(0.5, rel=1e-3)
-        assert ratio[f"{free}, shuffled images : {free}"] == pytest.approx(2.0, rel=1e-3)
-        assert ratio[f"{free}, shuffled images : {free} [{LEAD_SUBGROUP}]"] == pytest.approx(2.0, rel=1e-3)
-    baseline = min(row.values["min_ade_m"] or 0 for row in report.rows if row.name.startswith("constant"))
-    assert baseline > 1
-    assert "meta-act : constant velocity" in ratio or "meta-act : constant turn rate" in ratio
-    assert "meta-act + route : meta-act" not in ratio
+        plain, shuffled = free.replace("meta-act", "traj-only"), f"{free}, shuffled images : {free}"
+        for measure in ("min_ade_m", "avg_ade_m"):
+            assert ratio[f"{free} : {plain}", measure] == pytest.approx(0.8, rel=1e-3)
+        assert ratio[f"{free}, expert plan : {free}", "min_ade_m"] == pytest.approx(0.5, rel=1e-3)
+        assert ratio[shuffled, "avg_ade_m"] == pytest.approx(2.0, rel=1e-3)
+        assert ratio[f"{shuffled} [{LEAD_SUBGROUP}]", "avg_ade_m"] == pytest.approx(2.0, rel=1e-3)
+        assert (f"{shuffled} [{SOON_SUBGROUP}]", "path_m") in ratio
+        for baseline in ("constant velocity", "constant turn rate"):
+            assert (f"{free} : {baseline}", "agreed_ade_m") in ratio
+    assert not any(name.endswith(": expert") for name, _ in ratio)
+    assert not any(name == "meta-act + route : meta-act" for name, _ in ratio)
 
 
-def test_the_text_holds_rows_and_comparisons(report: Report) -> None:
+def test_a_planner_that_copies_its_speed_has_a_response_of_one(report: Report) -> None:
+    # The engine of this report follows the expert, whatever the speed.
+    assert report.speed_response == {"meta-act + route": {0.5: pytest.approx(0), 1.5: pytest.approx(0)}}
+    variants = [each for each in standard_variants(["cf_vla"], Controls(n=1)) if each.route]
+    copying = asyncio.run(evaluate_checkpoint(FakeEngine(), SCENES, variants))
+    told = copying.to_json()["speed_response"]["meta-act + route"]
+    assert told == {"0.5": pytest.approx(1.0, abs=0.02), "1.5": pytest.approx(1.0, abs=0.02)}
+
+
+def test_a_planner_of_ones_own_has_a_row() -> None:
+    planners = {"teacher": lambda labelled: labelled.future}
+    report = asyncio.run(evaluate_checkpoint(FakeEngine(), SCENES, [], planners=planners))
+    row = next(row for row in report.rows if row.name == "teacher")
+    assert row.values["agreed_ade_m"] == 0
+
+
+def test_the_text_holds_rows_comparisons_and_responses(report: Report) -> None:
     text = str(report)
     assert "meta-act, shuffled images : meta-act" in text
-    assert text.count("\n") == 1 + len(report.rows) + len(report.comparisons)
+    assert text.count("\n") == 1 + len(report.rows) + len(report.comparisons) + len(report.speed_response)
 
 
 def test_a_variant_without_its_free_counterpart_is_only_a_row() -> None:
@@ -92,4 +114,4 @@ def test_a_variant_without_its_free_counterpart_is_only_a_row() -> None:
     scenes = [replace(scene, agents=()) for scene in SCENES]
     report = asyncio.run(evaluate_checkpoint(FakeEngine(), scenes, [alone]))
     assert report.comparisons == ()
-    assert [row.subgroup for row in report.rows] == [None] * 3
+    assert [row.subgroup for row in report.rows] == [None] * 4

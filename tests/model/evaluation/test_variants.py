@@ -127,7 +127,7 @@ def test_images_that_cannot_be_shuffled_across_episodes_are_an_error() -> None:
 
 def test_the_standard_rows_fit_what_a_checkpoint_writes() -> None:
     both = standard_variants(["cf_vla", "traj_only"], Controls(n=4))
-    assert len({variant.name for variant in both}) == len(both) == 8
+    assert len({variant.name for variant in both}) == len(both) == 10
     assert {variant.format for variant in standard_variants(["traj_only"])} == {"traj_only"}
     assert all(variant.controls.n == 4 for variant in both)
     for route in (False, True):
@@ -139,6 +139,8 @@ def test_the_standard_rows_fit_what_a_checkpoint_writes() -> None:
         "meta-act + route + tracks",
         "meta-act + route + tracks, expert plan",
         "meta-act + route + tracks, shuffled images",
+        "meta-act + route + tracks, speed x 0.5",
+        "meta-act + route + tracks, speed x 1.5",
     ]
 
 
@@ -147,3 +149,19 @@ def test_tracks_are_given_where_the_variant_says_so() -> None:
     labelled = labelled_scene(8.0, agents=(car,))
     assert request_for(labelled, Variant("with", tracks=True)).scene.tracks == tracks_of(labelled.agents)
     assert request_for(labelled, Variant("without")).scene.tracks is None
+
+
+def test_another_speed_is_the_same_way_driven_faster() -> None:
+    request = request_for(SCENES[3], Variant("fast", speed=1.5))
+    history = SCENES[3].scene.history
+    np.testing.assert_allclose(request.scene.history[:, :3], 1.5 * history[:, :3], rtol=1e-6)
+    np.testing.assert_array_equal(request.scene.history[:, 3], history[:, 3])
+
+
+def test_the_likeliest_response_is_asked_for_beside_the_draws() -> None:
+    engine = FakeEngine()
+    results = evaluate(engine, replace(FREE, greedy=True))
+    assert all(result.greedy_ade_m is not None for result in results)
+    greedy = [request for request in engine.requests if request.controls.temperature == 0]
+    assert len(greedy) == len(SCENES)
+    assert {request.controls.n for request in greedy} == {1}
