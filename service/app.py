@@ -29,6 +29,7 @@ from service.middleware import Around
 from service.openapi import describe
 from service.parts import Parts
 from service.planning import Limits, Planning
+from service.pulse import Pulse
 from service.rates import Rates
 from service.routes import make_router
 from service.settings import Settings
@@ -70,14 +71,17 @@ def create_app(
     metrics.watch(lambda: lifecycle.load, admission)
     limits = Limits(settings.queue_timeout_s, settings.decode_timeout_s)
     planning = Planning(lifecycle, admission, Rates(settings.rate_limit), metrics, traces, limits)
+    pulse = Pulse()
     idempotency = Idempotency(settings.idempotency_s, time.monotonic)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         lifecycle.begin()
+        pulse.begin()
         try:
             yield
         finally:
+            pulse.end()
             await lifecycle.end()
             await teacher.close()
 
@@ -108,7 +112,7 @@ def create_app(
         )
     app.add_middleware(Around, metrics=metrics, traces=traces, stopping=lambda: lifecycle.stopping)
     install_error_handlers(app, metrics)
-    parts = Parts(settings, metrics, lifecycle, planning, idempotency, teacher, load, int(time.time()))
+    parts = Parts(settings, metrics, lifecycle, planning, idempotency, teacher, load, int(time.time()), pulse)
     app.include_router(make_router(parts))
     add_inspector(app)
     describe(app, keys=bool(keys))

@@ -38,6 +38,8 @@ from service.problems import (
 )
 
 _MAX_FAULTS: Final = 20
+_MAX_QUOTED: Final = 200
+"""Characters."""
 
 # The kind of a schema violation is that of the first place that fits.
 _KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], Kind]]] = (
@@ -149,7 +151,7 @@ def from_validation(error: RequestValidationError) -> ProblemError:
             INVALID_JSON, f"not JSON at character {first['loc'][-1]}: {first['ctx']['error']}"
         )
     faults = [
-        Fault(pointer=_pointer(fault["loc"][1:], error.body), detail=fault["msg"])
+        Fault(pointer=_pointer(fault["loc"][1:], error.body), detail=_shortened(fault["msg"]))
         for fault in found[:_MAX_FAULTS]
     ]
     detail = f"{faults[0].pointer or 'body'}: {faults[0].detail}"
@@ -181,8 +183,13 @@ def _pointer(location: Sequence[str | int], body: object) -> str:
             node = node[part]  # type: ignore[index]  # it was just asked
         elif position < len(location) - 1 or not isinstance(node, dict):
             continue
-        parts.append(str(part).replace("~", "~0").replace("/", "~1"))
+        parts.append(_shortened(str(part).replace("~", "~0").replace("/", "~1")))
     return "".join(f"/{part}" for part in parts)
+
+
+def _shortened(text: str) -> str:
+    """As much of a caller's own words as an answer quotes."""
+    return text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}…"
 
 
 def _holds(node: object, part: str | int) -> bool:

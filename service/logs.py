@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
+import select
 import sys
-from typing import Final, Literal
+from dataclasses import dataclass
+from typing import Final, Literal, TextIO
 
 import structlog
 
@@ -36,14 +39,51 @@ def configure_logging(log_format: Literal["json", "console"]) -> None:
 
 
 class _StandardError:
-    """Writes lines; one that cannot be written is lost, since planning must go on when a disk is full."""
+    """Writes lines; one that cannot be written at once is lost, since planning must go on meanwhile.
 
-    def msg(self, line: str) -> None:
+    A pipe whose reader has stopped, or a full disk, would hold up the whole service otherwise.
+    """
+
+    def msg(self, text: str) -> None:
+        line = f"{text}\n".encode(errors="backslashreplace")
+        begun = b"\n" if _lost.within_line else b""
         # Looked up for each line, so that a redirected standard error is honoured.
-        with contextlib.suppress(OSError, ValueError):
-            print(line, file=sys.stderr, flush=True)
+        left = write_now(sys.stderr, begun + line)
+        _lost.count += left > 0
+        _lost.within_line = 0 < left < len(line)
 
     debug = info = warning = error = critical = exception = msg
+
+
+@dataclass
+class _Lost:
+    count: int = 0
+    within_line: bool = False
+
+
+_lost = _Lost()
+
+
+def lines_lost() -> int:
+    """Lines of this process that were never written, or only in part."""
+    return _lost.count
+
+
+def write_now(stream: TextIO, text: bytes) -> int:
+    """Write UTF-8 ``text`` as far as that takes no waiting; how many bytes are left."""
+    rest = memoryview(text)
+    with contextlib.suppress(OSError, ValueError):
+        try:
+            place = stream.fileno()
+        except (OSError, ValueError, AttributeError):  # no file of the system's
+            stream.write(text.decode())
+            return 0
+        writable = select.poll()
+        writable.register(place, select.POLLOUT)
+        while rest and any(event & select.POLLOUT for _, event in writable.poll(0)):
+            # A pipe that can be written to takes so many bytes without waiting (POSIX, `write`).
+            rest = rest[os.write(place, rest[: select.PIPE_BUF]) :]
+    return len(rest)
 
 
 class _Handler(logging.Handler):

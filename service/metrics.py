@@ -10,6 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from model.driving.plan import plan_iou
 from model.engines.engine import Draw, Load, ModelCard, Thinking
 from service.admission import Admission
+from service.logs import lines_lost
 from service.problems import REJECTIONS, Kind
 
 LATENCY_BUCKETS_S: Final = (
@@ -193,6 +194,8 @@ class Metrics:
             "Draws accepted that the engine has not begun with.",
             lambda: sum(place.draws for place in admission.waiting),
         )
+
+        gauge("looktwice_log_lines_lost", "Lines of the log that nobody took in time.", lines_lost)
 
     def problem_told(self, kind: Kind) -> None:
         """Count a request, or a scene of a batch, that may have been right and was not served."""

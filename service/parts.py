@@ -12,6 +12,7 @@ from service.idempotency import Idempotency
 from service.lifecycle import Lifecycle
 from service.metrics import Metrics
 from service.planning import Planning
+from service.pulse import Pulse
 from service.settings import Settings
 
 
@@ -33,3 +34,4 @@ class Parts:
     teacher: Teacher
     load: Callable[[Path], Engine] | None
     began_s: int
+    pulse: Pulse

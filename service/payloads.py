@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Coroutine
 from typing import Any, Final
 
@@ -20,6 +19,7 @@ from clients.wire import (
     REQUEST_PART,
 )
 from clients.wire_values import with_pictures
+from service.documents import read_json, read_msgpack
 from service.problems import INVALID_BODY, INVALID_IMAGE, INVALID_JSON, ProblemError
 
 _JSON: Final = b"application/json"
@@ -66,9 +66,11 @@ def payload_route(check_open: Callable[[Request], None]) -> type[APIRoute]:
                     raise
                 media_type = media_type_of(request.headers)
                 if media_type == MSGPACK_MEDIA_TYPE:
-                    request = _Decoded(request, _msgpack(await request.body()))
+                    request = _Decoded(request, read_msgpack(await request.body()))
                 elif media_type == MULTIPART_MEDIA_TYPE:
                     request = _Decoded(request, await _multipart(request))
+                elif _is_json(media_type) and (body := await request.body()):
+                    request = _Decoded(request, read_json(body))
                 return await handle(request)
 
             return decoded
@@ -81,22 +83,15 @@ def media_type_of(headers: Headers) -> str:
     return headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
+def _is_json(media_type: str) -> bool:
+    main, _, kind = media_type.partition("/")
+    return main == "application" and (kind == "json" or kind.endswith("+json"))
+
+
 def packed(value: Any) -> bytes:
     """A JSON-like value as msgpack."""
     content: bytes = msgpack.packb(value)
     return content
-
-
-def _msgpack(body: bytes) -> Any:
-    try:
-        # Types beyond those of JSON are refused, but for bytes.
-        return msgpack.unpackb(body, ext_hook=_no_extension)
-    except (ValueError, msgpack.UnpackException) as error:
-        raise ProblemError(INVALID_BODY, f"not msgpack: {error or type(error).__name__}") from None
-
-
-def _no_extension(code: int, _: bytes) -> Any:
-    raise ValueError(f"extension type {code} is not taken here")
 
 
 async def _multipart(request: Request) -> Any:
@@ -114,10 +109,11 @@ async def _multipart(request: Request) -> Any:
         parts = {name: await part.read() for name, part in form.items() if isinstance(part, UploadFile)}
     finally:
         await form.close()
+    document = read_json(text.encode() if isinstance(text, str) else text)
     try:
-        return with_pictures(json.loads(text), lambda picture: _part(picture, parts))
-    except (ValueError, RecursionError) as error:  # the latter: nested too deeply
-        raise ProblemError(INVALID_JSON, f"part {REQUEST_PART!r} is not JSON: {error}") from None
+        return with_pictures(document, lambda picture: _part(picture, parts))
+    except RecursionError:
+        raise ProblemError(INVALID_JSON, f"part {REQUEST_PART!r} is nested too deeply") from None
 
 
 def _part(image: Any, parts: dict[str, bytes]) -> Any:

@@ -56,10 +56,11 @@ from service.problems import (
     UNSUPPORTED_MEDIA_TYPE,
     ProblemError,
 )
-from service.views import BundledScenes, scenes_of_file, view
+from service.scene_files import read_scene_file
+from service.views import BundledScenes, view
 
-_FILES_AT_ONCE: Final = 2
-"""Scene files that are unpacked; others wait."""
+_FILES_AT_ONCE: Final = 1
+"""Scene files that are unpacked, which may take much memory; others wait."""
 NOT_NOW = (NOT_READY, DRAINING, ENGINE_FAILED)
 METRICS_TEXT: Responses = {200: {"description": "Prometheus text", "content": {"text/plain": {}}}}
 
@@ -122,7 +123,9 @@ def _add_models(router: APIRouter, parts: Parts) -> None:
         named = wire.NamedModel(id=card.name, created=parts.began_s)
         return wire.ModelList(models=[card], teacher=teacher_name(parts.teacher), data=[named])
 
-    @router.post(
+    loading = APIRouter(route_class=payload_route(lambda _: None))
+
+    @loading.post(
         "/v1/models:load",
         tags=["operations"],
         responses=problems(
@@ -144,6 +147,8 @@ def _add_models(router: APIRouter, parts: Parts) -> None:
             raise ProblemError(UNKNOWN_CHECKPOINT, f"there is no checkpoint {asked.checkpoint!r}")
         return model_card(await parts.lifecycle.replace(lambda: make(found)))
 
+    router.include_router(loading)
+
 
 def _add_probes(router: APIRouter, parts: Parts) -> None:
     @router.get("/healthz", tags=["operations"], responses=problems(ENGINE_FAILED))
@@ -154,8 +159,13 @@ def _add_probes(router: APIRouter, parts: Parts) -> None:
 
     @router.get("/readyz", tags=["operations"], responses=problems(*NOT_NOW))
     async def readyz() -> dict[str, str]:
-        """Whether requests can be served now."""
+        """Whether requests can be served now, and were lately."""
         parts.lifecycle.check_ready()
+        still_s, limit_s = parts.pulse.stood_still_s, parts.settings.stall_s
+        if still_s > limit_s:
+            raise ProblemError(NOT_READY, f"nobody was answered for {still_s:.1f} s")
+        if (wait_s := parts.lifecycle.load.pictures_wait_s) > limit_s:
+            raise ProblemError(NOT_READY, f"pictures have waited for {wait_s:.1f} s to be decoded")
         return {"status": "ready"}
 
     @router.get(
@@ -193,6 +203,7 @@ def _add_scenes(router: APIRouter, parts: Parts) -> None:
     @router.post(
         "/v1/scenes:read",
         tags=["scenes"],
+        response_model=wire.SceneFile,
         responses=problems(UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE, INVALID_SCENE_FILE),
         openapi_extra={
             "requestBody": {
@@ -201,7 +212,7 @@ def _add_scenes(router: APIRouter, parts: Parts) -> None:
             }
         },
     )
-    async def read(request: Request) -> wire.SceneFile:
+    async def read(request: Request) -> Any:
         """The scenes of a Parquet scene file, for looking at; nothing is kept."""
         content = await request.body()
         largest = parts.settings.max_scene_file_bytes
@@ -210,4 +221,5 @@ def _add_scenes(router: APIRouter, parts: Parts) -> None:
                 BODY_TOO_LARGE, f"the file has {len(content)} bytes; at most {largest} are read"
             )
         async with reading:
-            return wire.SceneFile(scenes=await asyncio.to_thread(scenes_of_file, content))
+            told = await while_connected(request, read_scene_file(content))
+        return Response(told, media_type="application/json")

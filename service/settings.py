@@ -36,6 +36,8 @@ class Settings(BaseSettings):
         headers_timeout_s, body_timeout_s: a connection that takes longer to send them is closed, or gets a
             408 problem.
         write_timeout_s: a caller that takes nothing of its answer for so long is disconnected.
+        stall_s: a service that answered nobody for so long lately, or whose pictures wait for so long to be
+            decoded, says that it is not ready.
         drain_s: after SIGTERM accepted requests have so long to finish.
         drain_notice_s: after SIGTERM the service listens, and says that it is draining, at least so long.
         idempotency_s: answers are kept for so long for callers that ask again with the same key.
@@ -62,6 +64,7 @@ class Settings(BaseSettings):
     headers_timeout_s: float = Field(default=10.0, gt=0)
     body_timeout_s: float = Field(default=30.0, gt=0)
     write_timeout_s: float = Field(default=30.0, gt=0)
+    stall_s: float = Field(default=3.0, gt=0)
     drain_s: float = Field(default=25.0, gt=0)
     drain_notice_s: float = Field(default=1.0, ge=0)
     idempotency_s: float = Field(default=600.0, gt=0)

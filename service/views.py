@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import tempfile
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
@@ -57,16 +56,13 @@ class BundledScenes:
         return tuple(islice(read_scenes(self._path, dense=False), MAX_SCENES_SHOWN))
 
 
-def scenes_of_file(content: bytes) -> list[wire.LabelledScene]:
-    """The first scenes of an uploaded Parquet file; raises `ProblemError` where it is none of ours."""
-    with tempfile.TemporaryDirectory(prefix="looktwice-") as folder:
-        path = Path(folder) / "scenes.parquet"
-        path.write_bytes(content)
-        try:
-            _refuse_bombs(path)
-            return [view(scene) for scene in islice(read_scenes(path, dense=False), MAX_SCENES_SHOWN)]
-        except SceneFileError as error:
-            raise ProblemError(INVALID_SCENE_FILE, _told(error, path, "the file")) from error
+def scenes_of_file(path: Path) -> list[wire.LabelledScene]:
+    """The first scenes of a Parquet file from outside; raises `ProblemError` where it is none of ours."""
+    try:
+        _refuse_bombs(path)
+        return [view(scene) for scene in islice(read_scenes(path, dense=False), MAX_SCENES_SHOWN)]
+    except SceneFileError as error:
+        raise ProblemError(INVALID_SCENE_FILE, _told(error, path, "the file")) from error
 
 
 def view(labelled: LabelledScene) -> wire.LabelledScene:

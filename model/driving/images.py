@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import time
 from typing import Final
 
 import numpy as np
@@ -13,10 +14,36 @@ ALLOWED_FORMATS: Final = ("JPEG", "PNG", "WEBP")
 MAX_PIXELS: Final = 4_000_000
 """About twice full HD; Pillow's own limit (89 million) would let a small file fill gigabytes."""
 MAX_ENCODED_BYTES: Final = 8_000_000
+MAX_SCANS: Final = 32
+"""Of a progressive JPEG: encoders write about ten, and each makes the decoder go over all pixels again."""
+MAX_FRAMES: Final = 64
+"""Of an animated WebP, whose first frame alone is shown: all of them are looked for when it is opened."""
+_JPEG, _SCAN, _RIFF, _FRAME = b"\xff\xd8", b"\xff\xda", b"RIFF", b"ANMF"
+MAX_READS: Final = 40_000
+"""That a decoder may make: one for 64 kB of pixels, three for a chunk of a PNG, which is some kB."""
+MAX_DECODE_CPU_S: Final = 1.0
+"""Five times what the dearest picture within the other bounds takes. Time of the thread itself, so that a
+busy neighbour refuses nobody."""
 
 
 class ImageError(ValueError):
     """Bytes that are not an acceptable picture; the text says why."""
+
+
+class _Reader(io.BytesIO):
+    """Bytes that can be read so many times, and not for longer than a picture may take."""
+
+    def __init__(self, encoded: bytes) -> None:
+        super().__init__(encoded)
+        self._reads, self._ends_s = 0, time.thread_time() + MAX_DECODE_CPU_S
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        self._reads += 1
+        if self._reads > MAX_READS:
+            raise ImageError("the picture is in too many pieces")
+        if not self._reads % 64 and time.thread_time() > self._ends_s:
+            raise ImageError("the picture takes too long to decode")
+        return super().read(size)
 
 
 def check_image(encoded: bytes) -> tuple[int, int]:
@@ -40,6 +67,8 @@ def decode_image(encoded: bytes) -> npt.NDArray[np.uint8]:
     with _open(encoded) as image:
         try:
             return np.asarray(image.convert("RGB"), dtype=np.uint8)
+        except ImageError:
+            raise
         except (OSError, SyntaxError, ValueError) as error:
             raise ImageError(f"the picture is damaged: {error}") from error
 
@@ -61,8 +90,15 @@ def encode_png(pixels: npt.NDArray[np.uint8]) -> bytes:
 def _open(encoded: bytes) -> Image.Image:
     if len(encoded) > MAX_ENCODED_BYTES:
         raise ImageError(f"the picture has {len(encoded)} bytes; at most {MAX_ENCODED_BYTES} are accepted")
+    # Either may stand in data that says nothing of scans or frames, so these are upper bounds.
+    if encoded.startswith(_JPEG) and encoded.count(_SCAN) > MAX_SCANS:
+        raise ImageError(f"the picture has more than {MAX_SCANS} scans; save it again, without so many")
+    if encoded.startswith(_RIFF) and encoded.count(_FRAME) > MAX_FRAMES:
+        raise ImageError(f"the picture has more than {MAX_FRAMES} frames; send one")
     try:
-        image = Image.open(io.BytesIO(encoded), formats=ALLOWED_FORMATS)
+        image = Image.open(_Reader(encoded), formats=ALLOWED_FORMATS)
+    except ImageError:
+        raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         # Pillow warns from 89 million pixels on (an error under -W error) and refuses from twice that on.
         raise ImageError(f"the picture is too large: {error}") from error

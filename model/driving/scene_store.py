@@ -150,6 +150,10 @@ def read_scenes(
                         unlabelled(row["scene_id"])
                         continue
                     yield _from_row(row)
+        except (
+            MemoryError
+        ):  # pyarrow's own, which counts as an `ArrowException` too, says nothing of the file
+            raise
         except (pa.ArrowException, OSError) as error:
             raise SceneFileError(f"{file} is damaged: {error}") from error
         except (SceneError, GeometryError, KeyError, TypeError, ValueError) as error:

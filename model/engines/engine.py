@@ -226,10 +226,12 @@ class Load:
     Attributes:
         rows: draws that it has memory for.
         rows_used: draws that memory is reserved for.
+        pictures_wait_s: how long the oldest scene whose pictures are not decoded has waited for that.
     """
 
     rows: int
     rows_used: int
+    pictures_wait_s: float = 0.0
 
 
 class Engine(Protocol):
@@ -267,6 +269,7 @@ class Engine(Protocol):
 
         Raises:
             RequestError: at the first iteration, when the request cannot be served.
+            ImageError: at the first iteration, when a picture is damaged.
             EngineError: when decoding failed.
         """
         ...

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import asyncio
 import base64
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from model.driving.scene_store import write_scenes
-from service import views
+from service import scene_files, views
 from service.problems import ProblemError
 from service.settings import Settings
 from service.views import BundledScenes, scenes_of_file, view
@@ -87,12 +89,18 @@ def test_a_truncated_file_says_so(served: Served, scene_file: Path) -> None:
         assert found.detail.startswith("the file is not a whole Parquet file (truncated?)")
 
 
-def test_a_damaged_page_says_so(scene_file: Path) -> None:
+def test_a_damaged_page_says_so(scene_file: Path, tmp_path: Path) -> None:
     content = bytearray(scene_file.read_bytes())
     footer = int.from_bytes(content[-8:-4], "little") + 8
     content[4:-footer] = bytes(len(content) - 4 - footer)
     with pytest.raises(ProblemError, match="the file is damaged"):
-        scenes_of_file(bytes(content))
+        scenes_of_file(_kept(tmp_path, bytes(content)))
+
+
+def _kept(folder: Path, content: bytes) -> Path:
+    path = folder / "kept.parquet"
+    path.write_bytes(content)
+    return path
 
 
 def rewritten(path: Path, metadata: dict[bytes, bytes] | None) -> bytes:
@@ -118,14 +126,52 @@ def test_another_parquet_file_says_so(served: Served, scene_file: Path) -> None:
 def test_a_file_that_would_fill_the_memory(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(views, "MAX_UNPACKED_BYTES", 1000)
     with pytest.raises(ProblemError, match="the file would unpack to"):
-        scenes_of_file(scene_file.read_bytes())
+        scenes_of_file(scene_file)
 
 
 def test_a_file_with_too_many_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "many.parquet"
     write_scenes(path, (labelled(str(number)) for number in range(4)))
     monkeypatch.setattr(views, "MAX_SCENES_SHOWN", 3)
-    assert len(scenes_of_file(path.read_bytes())) == 3
+    assert len(scenes_of_file(path)) == 3
     monkeypatch.setattr(views, "MAX_SCENES_IN_FILE", 3)
     with pytest.raises(ProblemError, match="more than 3 scenes"):
-        scenes_of_file(path.read_bytes())
+        scenes_of_file(path)
+
+
+def bomb(scene_file: Path, images: int) -> bytes:
+    """A scene file of some kB whose first clip has so many pictures, all of them the same 8 kB."""
+    rows = pq.read_table(scene_file)
+    first = rows.slice(0, 1).to_pylist()
+    for clip in first[0]["clips"]:
+        clip["images"] = [bytes(8000)] * images
+    table = pa.Table.from_pylist(first, schema=rows.schema)
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd", use_dictionary=True, write_page_checksum=True)
+    content: bytes = sink.getvalue().to_pybytes()
+    return content
+
+
+def test_a_small_file_that_holds_gigabytes_is_refused(served: Served, scene_file: Path) -> None:
+    content = bomb(scene_file, 100_000)
+    assert len(content) < 200_000
+    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = problem(served.http.post("/v1/scenes:read", content=content), "invalid-scene-file")
+    assert "memory" in found.detail
+    # The service itself took none of it, and reads the next one.
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < 200_000
+    assert served.http.post("/v1/scenes:read", content=scene_file.read_bytes()).status_code == 200
+
+
+def test_a_file_with_much_to_tell_is_refused(
+    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scene_files, "MAX_ANSWER_BYTES", 1000)
+    monkeypatch.setattr(resource, "setrlimit", lambda *_: None)
+    assert scene_files.main(scene_file) != 0
+
+
+def test_a_file_that_takes_too_long_is_ended(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_files, "MAX_SECONDS", 0.01)
+    with pytest.raises(ProblemError, match=r"longer than 0\.01 s"):
+        asyncio.run(scene_files.read_scene_file(scene_file.read_bytes()))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import httpx
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clients.answers import retry_after_s
 from clients.labelling.checks import FailedCheck
@@ -24,6 +25,8 @@ from model.driving.images import media_type
 
 _BUSY: Final = (408, 409, 425, 429, 500, 502, 503, 504, 529)
 _CLOSED: Final = (401, 402, 403, 404, 405)
+MAX_ANSWER_BYTES: Final = 1_000_000
+"""A paragraph has some kB with everything around it; reasoning that an endpoint tells beside it, tens."""
 _SHOWN: Final = 300
 """Characters of an error's body that are told."""
 
@@ -37,7 +40,7 @@ class OpenAiSettings:
         model: as the endpoint calls it.
         api_key: sent as a bearer token; None where none is needed. Never shown or stored.
         temperature, max_tokens: of sampling.
-        timeout_s: for one answer.
+        timeout_s: for one whole answer.
         input_price_usd, output_price_usd: for a million tokens, to count costs by.
         extra_body: more fields of the request, such as an endpoint's own sampling options; null takes a
             field out.
@@ -67,8 +70,8 @@ class _Choice(BaseModel):
 
 class _Usage(BaseModel):
     model_config = ConfigDict(extra="ignore")
-    prompt_tokens: int = 0
-    completion_tokens: int = 0
+    prompt_tokens: int = Field(default=0, ge=0)
+    completion_tokens: int = Field(default=0, ge=0)
 
 
 class _Completion(BaseModel):
@@ -104,7 +107,11 @@ class OpenAiTeacher:
         """See `Teacher.reflect`."""
         body = completion_request(self._settings, question, complaints)
         try:
-            response = await self._http.post("chat/completions", json=body)
+            async with asyncio.timeout(self._settings.timeout_s):
+                response = await self._answer(body)
+        except TimeoutError:
+            told = f"there was no whole answer after {self._settings.timeout_s:g} s"
+            raise TeacherBusy(told) from None
         except httpx.HTTPError as error:
             raise TeacherBusy(f"{type(error).__name__}: {error}") from error
         status = response.status_code
@@ -115,6 +122,21 @@ class OpenAiTeacher:
         if status != 200:
             raise TeacherError(_told(response))
         return completion_answer(self._settings, response.content)
+
+    async def _answer(self, body: Mapping[str, Any]) -> httpx.Response:
+        """The response with its whole body; raises `TeacherError` for one that no completion needs."""
+        async with self._http.stream("POST", "chat/completions", json=body) as response:
+            content = bytearray()
+            async for part in response.aiter_bytes():
+                content += part
+                if len(content) > MAX_ANSWER_BYTES:
+                    raise TeacherError(f"the answer has more than {MAX_ANSWER_BYTES} bytes")
+        return httpx.Response(
+            response.status_code,
+            headers={"Retry-After": response.headers.get("Retry-After", "")},
+            content=bytes(content),
+            request=response.request,
+        )
 
     async def close(self) -> None:
         """Close the connections."""

@@ -9,6 +9,8 @@ import stamina
 
 _Result = TypeVar("_Result")
 _LONGEST_WAIT_S: Final = 30.0
+_SHORTEST_WAIT_S: Final = 0.2
+"""Also where whoever is busy asks to be asked again at once."""
 
 
 class TryLater(Exception):
@@ -35,10 +37,14 @@ async def patiently(call: Callable[[], Awaitable[_Result]], give_up_after_s: flo
             return False
         if error.wait_s is None:
             return True
-        return error.wait_s if error.wait_s <= give_up_after_s else False
+        return max(_SHORTEST_WAIT_S, error.wait_s) if error.wait_s <= give_up_after_s else False
 
     async for attempt in stamina.retry_context(
-        on=wait, attempts=None, timeout=give_up_after_s, wait_initial=0.2, wait_max=_LONGEST_WAIT_S
+        on=wait,
+        attempts=None,
+        timeout=give_up_after_s,
+        wait_initial=_SHORTEST_WAIT_S,
+        wait_max=_LONGEST_WAIT_S,
     ):
         with attempt:
             return await call()

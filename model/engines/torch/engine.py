@@ -22,6 +22,7 @@ from model.engines.engine import (
     PlanRequest,
     RequestError,
 )
+from model.engines.pictures import PictureThreads
 from model.engines.torch.decoder import Counts, Decoder, Failed
 from model.engines.torch.frames import Frames
 from model.engines.torch.graphs import CudaGraph
@@ -90,7 +91,7 @@ class TorchEngine:
         self._worker: Worker | None = _worker()
         loading = self._worker.submit(lambda: load(checkpoint, settings.dtype, settings.device))
         self._loaded = loading.result()
-        self._frames = Frames(self._loaded.inputs)
+        self._frames, self._pictures = Frames(self._loaded.inputs), PictureThreads()
         self._decoding: Future[None] | None = None
         self._counts, self._rows_used = Counts(), 0
         self._broke: EngineError | None = None
@@ -105,7 +106,7 @@ class TorchEngine:
     @property
     def load(self) -> Load:
         """How full it is now."""
-        return Load(self._settings.rows, self._rows_used)
+        return Load(self._settings.rows, self._rows_used, self._pictures.waiting_s)
 
     @property
     def counts(self) -> Counts:
@@ -137,6 +138,7 @@ class TorchEngine:
             self._commands.put(None)
             await asyncio.wrap_future(self._decoding)
         worker, self._worker, self._decoding = self._worker, None, None
+        self._pictures.close()
         if worker is not None:
             await asyncio.to_thread(worker.close)
 
@@ -151,7 +153,7 @@ class TorchEngine:
         # Now and not when the thread gets to it, which may be a long step later.
         submitted_s = time.monotonic()
         try:
-            await asyncio.to_thread(self._frames.look_at, request.scene)
+            await self._pictures.run(lambda: self._frames.look_at(request.scene))
             self._commands.put(lambda decoder: self._add(decoder, request, submitted_s))
             remaining = request.controls.n
             while remaining:

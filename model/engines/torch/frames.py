@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.images import ImageError
 from model.driving.scene import Scene, SceneError
 from model.network.inputs import InputBuilder
 
@@ -41,8 +40,11 @@ class Frames:
         return len(self._kept)
 
     def look_at(self, scene: Scene) -> None:
-        """Decode a scene's pictures ahead; what is wrong with it is told by who asks for its patches."""
-        with suppress(SceneError, ImageError):
+        """Decode a scene's pictures ahead; raises `ImageError` where one is damaged.
+
+        A camera that is missing is told by who asks for its patches.
+        """
+        with suppress(SceneError):
             for pictures in self._inputs.slices(scene):
                 for picture in pictures:
                     self._frame(picture)

@@ -14,8 +14,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from model.driving.images import ImageError
 from model.driving.scene import Scene
 from model.engines.engine import EngineError, Event, Load, ModelCard, PlanRequest, RequestError
+from model.engines.pictures import PictureThreads
 from model.engines.requests import begin
 from model.engines.vllm.decoding import Decoding, VllmPrompt
 from model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
@@ -69,6 +71,7 @@ class VllmEngine:
         }
         self._llm: Any = None
         self._running: dict[str, Decoding] = {}
+        self._pictures = PictureThreads()
 
         @lru_cache(_GRAMMARS)
         def grammar(compiled: CompiledFormat, active: Active, rest: Rest) -> str:
@@ -85,7 +88,7 @@ class VllmEngine:
     def load(self) -> Load:
         """How full it is now; what waits within vLLM counts as far as there would be room."""
         asked = sum(decoding.draws for decoding in self._running.values())
-        return Load(self._settings.rows, min(asked, self._settings.rows))
+        return Load(self._settings.rows, min(asked, self._settings.rows), self._pictures.waiting_s)
 
     @property
     def llm(self) -> Any:
@@ -119,6 +122,7 @@ class VllmEngine:
             return
         for decoding in self._running.values():
             decoding.fail(EngineError("the engine was stopped"))
+        self._pictures.close()
         llm, self._llm = self._llm, None
         # Else it would take the end of vLLM's processes for their death, and say so.
         if llm.output_handler is not None:
@@ -139,7 +143,7 @@ class VllmEngine:
         decoding = Decoding(llm, self._parts, self._grammar_of, request, start)
         self._running[request.request_id] = decoding
         try:
-            prompt = await asyncio.to_thread(self.prompt, request.scene, request.format)
+            prompt = await self._pictures.run(lambda: self.prompt(request.scene, request.format))
             async with aclosing(decoding.events(prompt)) as events:
                 async for event in events:
                     yield event
@@ -155,10 +159,13 @@ class VllmEngine:
         """A scene as vLLM takes it.
 
         Raises:
-            RequestError: the scene cannot be made into inputs (missing camera, damaged picture).
+            RequestError: the scene cannot be made into inputs (a missing camera).
+            ImageError: a picture is damaged.
         """
         try:
             inputs = self._parts.inputs.build(scene, format)
+        except ImageError:
+            raise
         except ValueError as error:
             raise RequestError(str(error)) from error
         ids, items = inputs.prompt.ids, items_of(inputs, self._parts.settings)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import contextlib
 import io
 import struct
+import time
 import zlib
 
 import numpy as np
@@ -11,8 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from model.driving import images
 from model.driving.images import (
     MAX_ENCODED_BYTES,
+    MAX_FRAMES,
+    MAX_SCANS,
     ImageError,
     check_image,
     decode_image,
@@ -102,3 +106,62 @@ def test_damaged_bytes_are_decoded_or_refused_and_nothing_else(
         encoded[place % len(encoded)] = value
     with contextlib.suppress(ImageError):
         assert decode_image(bytes(encoded)).ndim == 3
+
+
+def progressive(scans: int) -> bytes:
+    """A progressive JPEG whose last scan comes so many times more."""
+    buffer = io.BytesIO()
+    Image.fromarray(PIXELS).save(buffer, "JPEG", progressive=True, quality=70)
+    encoded = buffer.getvalue()
+    begins = encoded.rfind(b"\xff\xda")
+    return encoded[:-2] + encoded[begins:-2] * scans + encoded[-2:]
+
+
+def chunk(kind: bytes, body: bytes = b"") -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def animated(frames: int) -> bytes:
+    buffer = io.BytesIO()
+    numbers = np.random.default_rng(2)
+    first, *others = (
+        Image.fromarray(numbers.integers(0, 256, (8, 8, 3), dtype=np.uint8)) for _ in range(frames)
+    )
+    first.save(buffer, "WEBP", save_all=True, append_images=others, lossless=True)
+    return buffer.getvalue()
+
+
+def test_pictures_as_encoders_write_them_are_decoded() -> None:
+    assert decode_image(progressive(0)).shape == (12, 20, 3)
+    assert decode_image(progressive(MAX_SCANS - 12)).shape == (12, 20, 3)
+    assert decode_image(animated(3)).shape == (8, 8, 3)
+
+
+JPEG, PNG = progressive(0), encode_png(PIXELS)
+
+
+@pytest.mark.parametrize(
+    ("encoded", "message"),
+    [
+        (progressive(3000), "scans"),
+        (animated(MAX_FRAMES + 8), "frames"),
+        (PNG[:33] + chunk(b"teSt") * 600_000 + PNG[33:], "pieces"),
+        (PNG[:33] + chunk(b"IDAT") * 600_000 + PNG[33:], "pieces"),
+        (JPEG[:2] + b"\xff\xe1\x00\x02" * 1_900_000 + JPEG[2:], "pieces"),
+        (JPEG[:2] + b"\xff" * 7_500_000 + JPEG[2:], "pieces"),
+    ],
+    ids=["scans", "frames", "chunks", "empty data", "segments", "fill bytes"],
+)
+def test_small_pictures_that_are_dear_to_decode_are_refused(encoded: bytes, message: str) -> None:
+    began_s = time.thread_time()
+    with pytest.raises(ImageError, match=message):
+        decode_image(encoded)
+    # Seconds before; of the thread's own time, so that a busy machine does not matter.
+    assert time.thread_time() - began_s < 1.0
+
+
+def test_decoding_has_a_budget_of_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(images, "MAX_DECODE_CPU_S", -1.0)
+    many = PNG[:33] + chunk(b"teSt") * 200 + PNG[33:]
+    with pytest.raises(ImageError, match="too long"):
+        decode_image(many)

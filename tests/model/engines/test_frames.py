@@ -12,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from model.driving.images import ImageError
 from model.driving.scene import Clip, Scene
-from model.engines.engine import Controls, DrawFinished, PlanRequest, RequestError
+from model.engines.engine import Controls, DrawFinished, PlanRequest
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.torch.frames import Frames
 from model.network.checkpoint import load
@@ -89,7 +90,7 @@ def test_the_engines_thread_decodes_nothing(untrained_checkpoint: Path, decoded:
             clip = request.scene.clips[0]
             damaged = replace(clip, images=(*clip.images[:3], clip.images[3][:-200]))
             broken = replace(request.scene, clips=(damaged, *request.scene.clips[1:]))
-            with pytest.raises(RequestError, match="damaged"):
+            with pytest.raises(ImageError, match="damaged"):
                 async for _ in engine.submit(PlanRequest("broken", broken, "traj_only", Controls(n=2))):
                     pass
         finally:

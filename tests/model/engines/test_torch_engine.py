@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from model.driving.images import ImageError
 from model.driving.scene import Clip, Scene
 from model.engines.engine import Controls, Draw, DrawFinished, EngineError, PlanRequest, RequestError
 from model.engines.torch.decoder import Decoder, StepEvent
@@ -118,7 +119,7 @@ def test_bad_requests_fail_alone(untrained_checkpoint: Path) -> None:
                 (direct("b", one_eyed), "lacks camera front_tele_30"),
                 (direct("c", n=9), "at most 8 draws"),
             ):
-                with pytest.raises(RequestError, match=message):
+                with pytest.raises((RequestError, ImageError), match=message):
                     await plan(engine, bad)
             assert len(await good) == 2
 

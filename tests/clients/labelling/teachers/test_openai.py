@@ -5,11 +5,15 @@ import base64
 import email.utils
 import json
 import time
+from collections.abc import AsyncIterator
 
 import pytest
+from fastapi import FastAPI
+from starlette.responses import StreamingResponse
 
 from clients.labelling.checks import FailedCheck, check_reflection
 from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from clients.labelling.teachers.patience import patiently
 from clients.labelling.teachers.teacher import (
     Answer,
     Question,
@@ -144,3 +148,66 @@ def test_fields_can_be_put_in_and_taken_out() -> None:
     answer(server, extra_body={"max_tokens": None, "max_completion_tokens": 99})
     assert "max_tokens" not in server.asked[0]
     assert server.asked[0]["max_completion_tokens"] == 99
+
+
+def slow_app(part: bytes, pause_s: float, parts: int) -> FastAPI:
+    """An endpoint whose answer comes in parts, with a pause behind each."""
+    app = FastAPI()
+
+    @app.post("/v1/chat/completions")
+    async def complete() -> StreamingResponse:
+        async def sent() -> AsyncIterator[bytes]:
+            for _ in range(parts):
+                yield part
+                await asyncio.sleep(pause_s)
+
+        return StreamingResponse(sent(), media_type="application/json")
+
+    return app
+
+
+def asked_of(app: FastAPI, timeout_s: float) -> None:
+    async def asking(url: str) -> None:
+        teacher = OpenAiTeacher(OpenAiSettings(f"{url}/v1", "some-vlm", timeout_s=timeout_s))
+        try:
+            await teacher.reflect(QUESTION)
+        finally:
+            await teacher.close()
+
+    with listening(app) as (url, _):
+        asyncio.run(asking(url))
+
+
+def test_an_answer_that_trickles_in_is_given_up() -> None:
+    # Each part comes well within the time of an answer; together they never would.
+    with pytest.raises(TeacherBusy, match="no whole answer after 1 s"):
+        asked_of(slow_app(b" ", 0.05, 10_000), timeout_s=1.0)
+
+
+def test_an_answer_without_end_is_given_up() -> None:
+    with pytest.raises(TeacherError, match="more than 1000000 bytes") as refused:
+        asked_of(slow_app(b" " * 100_000, 0.0, 1000), timeout_s=30.0)
+    assert not isinstance(refused.value, TeacherBusy)
+
+
+def test_counts_that_cannot_be_make_no_answer() -> None:
+    told = completion(GOOD)
+    told["usage"]["completion_tokens"] = -5
+    found = answer(ChatServer([json.dumps(told).encode()]))
+    assert found.unusable
+    assert (found.input_tokens, found.output_tokens) == (0, 0)
+
+
+def test_who_asks_to_be_asked_again_at_once_is_not() -> None:
+    server = ChatServer([(503, {"Retry-After": "-5"})])
+
+    async def asking(url: str) -> None:
+        teacher = OpenAiTeacher(OpenAiSettings(f"{url}/v1", "some-vlm"))
+        try:
+            await patiently(lambda: ask(teacher, QUESTION, []), 2.0)
+        finally:
+            await teacher.close()
+
+    with listening(server.app()) as (url, _), pytest.raises(TeacherBusy):
+        asyncio.run(asking(url))
+    assert 2 <= len(server.asked) <= 12

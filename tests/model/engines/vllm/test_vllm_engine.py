@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from model.bundled import CHECKPOINT, SCENES
+from model.driving.images import ImageError
 from model.driving.plan import parse_plan
 from model.driving.scene import Clip, Scene
 from model.driving.scene_store import read_scenes
@@ -259,7 +260,7 @@ def test_bad_requests_fail_alone(loop: asyncio.AbstractEventLoop, vllm: VllmEngi
             (PlanRequest("d", scene, controls=Controls(deadline_ms=50)), "torch engine"),
             (PlanRequest("good", scene), "in use"),
         ):
-            with pytest.raises(RequestError, match=message):
+            with pytest.raises((RequestError, ImageError), match=message):
                 await plan(vllm, bad)
         assert len(await good) == 2
 

@@ -1,0 +1,80 @@
+"""Scene files that callers send, read in a process of its own.
+
+Parquet packs so well that a small file can hold gigabytes, and what it holds is known only once it is
+unpacked. So it is unpacked where memory and time have an end that harms nobody: in a process with limits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import resource
+import sys
+import tempfile
+from pathlib import Path
+from typing import Final
+
+import clients.wire as wire
+from service.problems import INVALID_SCENE_FILE, ProblemError
+from service.views import scenes_of_file
+
+MAX_MEMORY_BYTES: Final = 768_000_000
+"""Of data; about 150 MB are taken by libraries."""
+MAX_SECONDS: Final = 20
+MAX_ANSWER_BYTES: Final = 64_000_000
+_REFUSED: Final = 3
+"""Exit status of a file that is told what is wrong with it."""
+
+
+async def read_scene_file(content: bytes) -> bytes:
+    """The `wire.SceneFile` of a scene file's bytes, as JSON; raises `ProblemError` where it is none.
+
+    Who stops waiting ends the process.
+    """
+    with tempfile.TemporaryDirectory(prefix="looktwice-") as folder:
+        path = Path(folder) / "scenes.parquet"
+        path.write_bytes(content)
+        reader = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", __name__, str(path)),
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            limit=MAX_ANSWER_BYTES,
+        )
+        try:
+            async with asyncio.timeout(MAX_SECONDS):
+                told, complaint = await reader.communicate()
+        except TimeoutError:
+            raise _refusal(f"the file takes longer than {MAX_SECONDS} s to read") from None
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                reader.kill()
+            await reader.wait()
+    if reader.returncode == 0:
+        return told
+    if reader.returncode == _REFUSED:
+        raise _refusal(complaint.decode(errors="replace"))
+    raise _refusal("the file takes too much memory or time to read")
+
+
+def _refusal(detail: str) -> ProblemError:
+    return ProblemError(INVALID_SCENE_FILE, detail)
+
+
+def main(path: Path) -> int:
+    """Write a file's scenes to standard output; what is wrong with it goes to standard error."""
+    for kind, limit in ((resource.RLIMIT_DATA, MAX_MEMORY_BYTES), (resource.RLIMIT_CPU, MAX_SECONDS)):
+        resource.setrlimit(kind, (limit, limit))
+    try:
+        told = wire.SceneFile(scenes=scenes_of_file(path)).model_dump_json().encode()
+    except ProblemError as error:
+        sys.stderr.write(error.detail)
+        return _REFUSED
+    if len(told) > MAX_ANSWER_BYTES:
+        sys.stderr.write(f"the file's scenes are {len(told)} bytes to tell; at most {MAX_ANSWER_BYTES} are")
+        return _REFUSED
+    sys.stdout.buffer.write(told)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))
