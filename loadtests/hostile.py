@@ -1,4 +1,4 @@
-"""Clients that mean no good or know no better: they leave, never read, or send their body byte by byte."""
+"""Clients that mean no good or know no better: they leave, never read, dawdle, or ask what is dear."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import asyncio
 import socket
 import struct
 from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 from urllib.parse import urlsplit
@@ -28,17 +30,23 @@ class Hostility:
         leaving: clients that ask for a plan, leave after ``leave_after_s``, and come back.
         never_reading: clients that ask for one and never read what comes.
         slow_bodies: clients that send a byte of their body now and then.
+        costly: clients that send requests that are dear to serve, one behind the other.
         leave_after_s: time enough for the service to begin.
     """
 
-    leaving: int = 4
-    never_reading: int = 8
-    slow_bodies: int = 16
+    leaving: int = 0
+    never_reading: int = 0
+    slow_bodies: int = 0
+    costly: int = 0
     leave_after_s: float = 0.05
 
 
+RUDE: Final = Hostility(leaving=4, never_reading=8, slow_bodies=16)
+COSTLY: Final = Hostility(costly=8)
+
+
 async def be_hostile(
-    target: Target, call: Call, hostility: Hostility, seconds: float
+    target: Target, call: Call, dear: Sequence[Call], hostility: Hostility, seconds: float
 ) -> dict[str, dict[str, int]]:
     """Do it for so many seconds; what became of these clients, by kind and by how it ended.
 
@@ -50,6 +58,7 @@ async def be_hostile(
             _leaves(target, call, hostility.leave_after_s, seconds) for _ in range(hostility.leaving)
         ],
         "never_reading": [_never_reads(target, call, seconds) for _ in range(hostility.never_reading)],
+        "costly": [_asks_much(target, dear, number, seconds) for number in range(hostility.costly)],
         "slow_bodies": [_sends_slowly(target, call, seconds) for _ in range(hostility.slow_bodies)],
     }
     ends = {}
@@ -76,6 +85,23 @@ async def _leaves(target: Target, call: Call, after_s: float, seconds: float) ->
         except OSError:
             ends["refused"] += 1
             await asyncio.sleep(after_s)
+    return ends
+
+
+async def _asks_much(target: Target, dear: Sequence[Call], first: int, seconds: float) -> Counter[str]:
+    ends = Counter[str]()
+    clock = asyncio.get_running_loop().time
+    until, number = clock() + seconds, first
+    while dear and clock() < until:
+        call, number = dear[number % len(dear)], number + 1
+        try:
+            reader, writer = await _connect(target)
+            writer.write(_head(target, call, len(call.body)) + call.body)
+            with suppress(OSError):  # it may answer before it has read all of it
+                await writer.drain()
+            ends += await _ending(reader, writer, max(_DRIP_S, until - clock()))
+        except OSError:
+            ends["refused"] += 1
     return ends
 
 
@@ -106,9 +132,11 @@ async def _sends_slowly(target: Target, call: Call, seconds: float) -> Counter[s
     return await _ending(reader, writer)
 
 
-async def _ending(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Counter[str]:
+async def _ending(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, patience_s: float = _DRIP_S
+) -> Counter[str]:
     try:
-        line = await asyncio.wait_for(reader.readline(), _DRIP_S)
+        line = await asyncio.wait_for(reader.readline(), patience_s)
         said = line.split()
         end = said[1].decode() if len(said) > 1 and said[1].isdigit() else "closed"
     except TimeoutError:

@@ -1,4 +1,4 @@
-"""Scenario `hostile`: a steady rate of polite requests while other clients leave, never read, or dawdle."""
+"""Scenarios `hostile` and `costly`: a steady rate of polite requests while others dawdle, or ask much."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from loadtests.aftermath import left_behind
 from loadtests.arrivals import Phase, poisson_arrivals, windows
 from loadtests.bodies import make_call, make_calls
+from loadtests.costly import costly_calls
 from loadtests.hostile import Hostility, be_hostile
 from loadtests.loads import OpenLoop
 from loadtests.mix import Kind
@@ -16,7 +17,7 @@ from loadtests.run import WARM_UP, Result, Setup, check, needed, run
 CALM, HOSTILE, AFTER = "calm", "hostile", "after"
 
 
-def hostile(setup: Setup, hostility: Hostility) -> Result:
+def hostile(setup: Setup, hostility: Hostility, name: str = "hostile") -> Result:
     """Measure polite requests before, during and after; hostile ones stream where the mix has streams.
 
     Raises:
@@ -32,12 +33,14 @@ def hostile(setup: Setup, hostility: Hostility) -> Result:
     bait = make_call(
         Kind("think", max(setup.mix.draws), stream=setup.mix.stream > 0), setup.scenes[:1], setup.seed
     )
+    one = make_call(Kind("direct", 1), setup.scenes[:1], setup.seed)
+    dear = costly_calls(one) if hostility.costly else []
     begins = next(window for window in windows(phases) if window.name == HOSTILE)
     ends: dict[str, dict[str, int]] = {}
 
     def meanwhile(starts_at: float) -> None:
         time.sleep(max(0.0, starts_at + begins.start_s - time.monotonic()))
-        ends.update(asyncio.run(be_hostile(setup.target, bait, hostility, begins.seconds)))
+        ends.update(asyncio.run(be_hostile(setup.target, bait, dear, hostility, begins.seconds)))
 
     ran = run(OpenLoop(poisson_arrivals(phases, setup.seed), calls), phases, setup, meanwhile)
     held = left_behind(setup.target)
@@ -51,7 +54,7 @@ def hostile(setup: Setup, hostility: Hostility) -> Result:
     before_s, during_s = (parts[name].latencies().percentile_s("p95") for name in (CALM, HOSTILE))
     ratio = during_s / before_s if during_s is not None and before_s else None
     return Result(
-        "hostile",
+        name,
         overall,
         parts,
         tuple(faults),

@@ -12,7 +12,7 @@ import typer
 
 from service.cli.options import DEFAULT_SCENES, Json, ScenePath, told
 
-Scenario = Literal["poisson", "sweep", "fleet", "soak", "burst", "hostile"]
+Scenario = Literal["poisson", "sweep", "fleet", "soak", "burst", "hostile", "costly"]
 
 
 def loadtest(
@@ -70,7 +70,7 @@ def loadtest(
     """Offer load, measured from when each request was due; exits with 1 where the run is not valid."""
     with told():
         from loadtests.about import about_client, about_service, versions
-        from loadtests.hostile import Hostility
+        from loadtests.hostile import COSTLY, RUDE
         from loadtests.knee import KneeSearch
         from loadtests.mix import parse_mix
         from loadtests.report import Report
@@ -97,7 +97,8 @@ def loadtest(
             "fleet": lambda: fleet(setup, planners, hz),
             "soak": soaked,
             "burst": lambda: burst(setup, factor, burst_seconds),
-            "hostile": lambda: hostile(setup, Hostility()),
+            "hostile": lambda: hostile(setup, RUDE),
+            "costly": lambda: hostile(setup, COSTLY, "costly"),
         }
         goal_s = (1 / hz if scenario == "fleet" else 1.0) if goal_ms is None else goal_ms / 1000
         setup = Setup(

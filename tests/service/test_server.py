@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
 import os
 import re
@@ -21,6 +22,9 @@ import pytest
 
 from clients.labelling.checks import FailedCheck
 from clients.labelling.teachers.teacher import Answer, Question
+from loadtests.bodies import make_call
+from loadtests.costly import costly_calls
+from loadtests.mix import Kind
 from model.bundled import CHECKPOINT
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from service.app import create_app
@@ -28,6 +32,7 @@ from service.keys import new_line
 from service.server import check_who_may_ask, make_server
 from service.settings import Settings
 from tests.checkpoints import noisy_scene
+from tests.model.driving.drives import labelled_scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem
@@ -345,3 +350,33 @@ def test_keys_are_made_on_the_command_line() -> None:
         [sys.executable, "-m", "service.cli", "keys", "new", "a b"], capture_output=True, text=True
     )
     assert strange.returncode == 2
+
+
+def test_a_log_that_nobody_reads_holds_up_nobody_and_dear_requests_are_refused() -> None:
+    """Standard error is a pipe that is never emptied: it takes some hundred lines."""
+    polite = make_call(Kind("direct", 1), [labelled_scene(8.0, pictures=1)], seed=1)
+    with process(subprocess.PIPE) as (started, url), httpx.Client(base_url=url, timeout=60) as http:
+        for _ in range(600):
+            assert http.get("/v1/models").status_code == 200
+        statuses = [
+            http.post(call.path, content=call.body, headers=dict(call.headers)).status_code
+            for call in costly_calls(polite)
+        ]
+        # Scans, chunks, large pictures; names, a name, points; maps; a file.
+        assert statuses == [422, 422, 200, 413, 413, 422, 400, 422]
+        lines = http.get("/metrics").text.splitlines()
+        [lost] = [line for line in lines if line.startswith("looktwice_log_lines_lost ")]
+        assert float(lost.split()[1]) > 0
+        started.send_signal(signal.SIGTERM)
+        assert started.wait(WAIT_S) == 0
+
+
+def test_a_damaged_picture_is_told_as_one() -> None:
+    damaged = body(noisy_scene(3))
+    image = base64.b64decode(damaged["scene"]["clips"][0]["images"][1])
+    damaged["scene"]["clips"][0]["images"][1] = base64.b64encode(image[:-200]).decode()
+    engine = TorchEngine(CHECKPOINT, TorchSettings(rows=8, products=None))
+    with serve(engine, Settings()) as served:
+        answer = served.http.post("/v1/plan", json=damaged)
+        assert "damaged" in problem(answer, "invalid-image").detail
+        assert served.http.post("/v1/plan", json=body(noisy_scene(3), n=1)).status_code == 200

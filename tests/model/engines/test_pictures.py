@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import asyncio
+import threading
+
+import pytest
+
+from model.engines.pictures import THREADS, PictureThreads
+
+
+def test_work_runs_on_threads_of_its_own_and_tells_how_long_it_waits() -> None:
+    async def test() -> None:
+        threads, go_on = PictureThreads(), threading.Event()
+        assert threads.waiting_s == 0.0
+        names: list[str] = []
+
+        def work() -> int:
+            names.append(threading.current_thread().name)
+            assert go_on.wait(30)
+            return 7
+
+        tasks = [asyncio.create_task(threads.run(work)) for _ in range(THREADS + 1)]
+        while len(names) < THREADS:
+            await asyncio.sleep(0.01)
+        assert threads.waiting_s > 0
+        # What is stuck there is in nobody's way elsewhere.
+        assert await asyncio.to_thread(lambda: 1) == 1
+        go_on.set()
+        assert await asyncio.gather(*tasks) == [7] * (THREADS + 1)
+        assert threads.waiting_s == 0.0
+        assert all(name.startswith("looktwice-pictures") for name in names)
+        threads.close()
+
+    asyncio.run(asyncio.wait_for(test(), 60))
+
+
+def test_what_fails_is_told_and_what_waits_is_dropped_in_the_end() -> None:
+    async def test() -> None:
+        threads, go_on = PictureThreads(), threading.Event()
+
+        def fail() -> None:
+            raise ValueError("no")
+
+        with pytest.raises(ValueError, match="no"):
+            await threads.run(fail)
+        tasks = [asyncio.create_task(threads.run(lambda: go_on.wait(30))) for _ in range(THREADS + 3)]
+        await asyncio.sleep(0.05)
+        threads.close()
+        go_on.set()
+        done = await asyncio.gather(*tasks, return_exceptions=True)
+        assert sum(isinstance(each, asyncio.CancelledError) for each in done) == 3
+        assert threads.waiting_s == 0.0
+
+    asyncio.run(asyncio.wait_for(test(), 60))
