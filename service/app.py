@@ -101,7 +101,7 @@ def create_app(
         max_held_bytes=settings.max_held_bytes,
         timeout_s=settings.body_timeout_s,
     )
-    app.add_middleware(Guard, keys=keys, metrics=metrics)
+    app.add_middleware(Guard, keys=keys, metrics=metrics, hosts=settings.answers_to())
     if settings.cors_origins:
         app.add_middleware(
             CORSMiddleware,

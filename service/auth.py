@@ -12,7 +12,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from service.errors import problem_response
 from service.keys import Keys
 from service.metrics import Metrics
-from service.problems import UNAUTHORIZED, ProblemError
+from service.problems import MISDIRECTED, UNAUTHORIZED, ProblemError
 
 OPEN_PATHS: Final = frozenset({"/healthz", "/readyz"})
 NOBODY: Final = ""
@@ -24,15 +24,25 @@ class Guard:
 
     The key comes as a bearer token; browsers, which cannot send one by themselves, may give it as the
     password of basic authentication, whatever the user's name.
+
+    Where there are no keys, a page of anybody's could have the browser of a user ask under a name of its own
+    that leads here (DNS rebinding): then only requests to ``hosts`` are served; None for any.
     """
 
-    def __init__(self, app: ASGIApp, keys: Keys, metrics: Metrics) -> None:
-        self._app, self._keys, self._metrics = app, keys, metrics
+    def __init__(
+        self, app: ASGIApp, keys: Keys, metrics: Metrics, hosts: frozenset[str] | None = None
+    ) -> None:
+        self._app, self._keys, self._metrics, self._hosts = app, keys, metrics, hosts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection; anything but HTTP passes through."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
+            return
+        host = _host(Headers(scope=scope).get("host", ""))
+        if not self._keys and self._hosts is not None and host not in self._hosts:
+            problem = ProblemError(MISDIRECTED, f"this is not {host!r}; LOOKTWICE_HOSTS tells its names")
+            await problem_response(problem, scope["state"]["request_id"])(scope, receive, send)
             return
         owner: str | None = NOBODY
         if self._keys and scope["path"] not in OPEN_PATHS:
@@ -45,6 +55,13 @@ class Guard:
             return
         scope["state"]["owner"] = owner
         await self._app(scope, receive, send)
+
+
+def _host(given: str) -> str:
+    """The name in a Host header, without its port."""
+    if given.startswith("["):  # an address of IPv6
+        return given.partition("]")[0].removeprefix("[").lower()
+    return given.partition(":")[0].lower()
 
 
 def _key(authorization: str) -> str | None:

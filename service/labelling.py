@@ -6,6 +6,7 @@ import asyncio
 from typing import Final
 
 import numpy as np
+import structlog
 
 import clients.wire as wire
 from clients.labelling.teachers.patience import patiently
@@ -36,6 +37,8 @@ from service.problems import (
     at,
 )
 
+log = structlog.stdlib.get_logger()
+
 PATIENCE_S: Final = 30.0
 """That a teacher may be busy or away before its caller is told."""
 
@@ -56,13 +59,17 @@ async def label(
     try:
         reflection = await patiently(lambda: ask(teacher, question, answers), PATIENCE_S)
     except (TeacherBusy, TeacherClosed) as error:
-        raise ProblemError(TEACHER_AWAY, f"{teacher.name}: {error}") from None
+        # What an endpoint says, or where it is, is the operator's business.
+        log.warning("teacher away", teacher=teacher.name, reason=str(error))
+        raise ProblemError(TEACHER_AWAY, f"{teacher.name} does not answer; the log has why") from None
     except AnnotationsMissing as error:
         raise ProblemError(NEEDS_ANNOTATIONS, f"{teacher.name}: {error}") from None
     except NothingInView as error:
         raise ProblemError(NOTHING_IN_VIEW, f"{teacher.name}: {error}") from None
     except TeacherError as error:
-        raise ProblemError(TEACHER_REFUSED, f"{teacher.name}: {error}") from None
+        log.warning("teacher refused", teacher=teacher.name, reason=str(error))
+        detail = f"{teacher.name} does not take this question; the log has why"
+        raise ProblemError(TEACHER_REFUSED, detail) from None
     except ReflectionRefused as error:
         metrics.label_asked(teacher.name, [each.check for each in error.failed], written=False)
         raise ProblemError(LABEL_REFUSED, f"{teacher.name}, asked {error.attempts} times: {error}") from None

@@ -51,7 +51,7 @@ class Lifecycle:
         self._nobody = asyncio.Event()
         self._nobody.set()
         self._ready = self._draining = self._swapping = False
-        self._failures, self._failure = 0, ""
+        self._failures, self._broke = 0, False
 
     @property
     def card(self) -> ModelCard:
@@ -130,15 +130,15 @@ class Lifecycle:
     def _check_engine(self) -> None:
         if self._ready:
             return
-        if self._failure:
-            raise ProblemError(ENGINE_FAILED, f"the engine is being started again; it broke: {self._failure}")
+        if self._broke:
+            raise ProblemError(ENGINE_FAILED, "the engine broke and is being started again; the log has why")
         raise ProblemError(NOT_READY, "the model is loading and warming up")
 
     def check_alive(self) -> None:
         """Raise `ProblemError` when only a restart of the process can help."""
         if self._failures >= _HOPELESS:
             raise ProblemError(
-                ENGINE_FAILED, f"the engine did not start {self._failures} times in a row: {self._failure}"
+                ENGINE_FAILED, f"the engine did not start {self._failures} times in a row; the log has why"
             )
 
     async def drain(self) -> None:
@@ -159,11 +159,12 @@ class Lifecycle:
         finally:
             self._swapping = False
 
-    async def replace(self, make: Callable[[], Engine]) -> ModelCard:
+    async def replace(self, make: Callable[[], Engine], hidden: str = "") -> ModelCard:
         """Let another engine answer; requests that run are finished by the one that has them.
 
         Args:
             make: loads the engine; called on a thread.
+            hidden: what callers are not told, such as where checkpoints lie.
 
         Raises:
             ProblemError: it cannot be loaded or started; the one that answered still does.
@@ -179,7 +180,7 @@ class Lifecycle:
                     await engine.stop()
                 self._metrics.checkpoint_swapped("failed")
                 log.warning("checkpoint refused", reason=str(error))
-                raise ProblemError(CHECKPOINT_FAILED, str(error)) from error
+                raise ProblemError(CHECKPOINT_FAILED, str(error).replace(hidden, "")) from error
             assert self._keeping is not None
             old, keeping = self._engine, self._keeping
             self._engine = engine
@@ -215,7 +216,7 @@ class Lifecycle:
                 await engine.wait()
                 return
             except Exception as error:  # whatever an engine dies of
-                self._failure = str(error)
+                self._broke = True
                 self._failures += not self._ready
                 log.error("engine broke", reason=str(error), ready=self._ready, exc_info=error)
             self._set_ready(False)

@@ -226,7 +226,7 @@ class Planning:
             raise ProblemError(REFUSED, str(error)) from error
         except EngineError as error:
             log.error("engine failed", exc_info=error)
-            raise ProblemError(ENGINE_FAILED, str(error)) from error
+            raise ProblemError(ENGINE_FAILED, "decoding failed; the log has why") from error
 
 
 async def last(events: AsyncGenerator[Event | Planned]) -> Planned:

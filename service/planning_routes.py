@@ -9,15 +9,16 @@ from typing import Annotated, Any, Final
 
 import structlog
 from fastapi import APIRouter, Body, Header, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.openapi.models import Example
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 from starlette.responses import Response
 
 import clients.wire as wire
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from service.answers import plan_answer, reflect_answer
 from service.callers import while_connected
-from service.errors import problem_document
+from service.errors import from_validation, problem_document
 from service.examples import example_reflection, example_request
 from service.idempotency import NotKept
 from service.openapi import PACKED, Responses, payloads, problems
@@ -146,16 +147,18 @@ def planning_router(parts: Parts) -> APIRouter:
         request: Request, asked: wire.BatchRequest, idempotency_key: IdempotencyKey = None
     ) -> Any:
         """Many scenes at once: each gets its answer or its problem; those that do not fit yet wait."""
-        for number, each in enumerate(asked.requests):
-            if each.stream:
+        scenes = [_scene_of_batch(each) for each in asked.requests]
+        for number, each in enumerate(scenes):
+            if isinstance(each, wire.PlanRequest) and each.stream:
                 raise at(INVALID_CONTROLS, f"/requests/{number}/stream", "a batch cannot stream")
         arrival = arrival_of(request)
 
         async def work() -> Response:
-            with parts.planning.batch(len(asked.requests)):
-                await parts.planning.spend(arrival.owner, sum(each.controls.n for each in asked.requests))
+            with parts.planning.batch(len(scenes)):
+                draws = sum(each.controls.n for each in scenes if isinstance(each, wire.PlanRequest))
+                await parts.planning.spend(arrival.owner, draws)
                 async with asyncio.TaskGroup() as group:
-                    tasks = [group.create_task(_result(parts, each, arrival)) for each in asked.requests]
+                    tasks = [group.create_task(_result(parts, each, arrival)) for each in scenes]
             results = [task.result() for task in tasks]
             answer = respond(request, wire.BatchResponse(results=results))
             if any(result.status in _TRY_AGAIN for result in results):
@@ -223,15 +226,27 @@ async def _once(
 ) -> Response:
     try:
         if idempotency_key is not None:
-            same = request.url.path.encode() + packed(asked.model_dump())
+            same = request.url.path.encode() + packed(asked.model_dump(warnings=False))
             return await parts.idempotency.once(arrival.owner, idempotency_key, same, work)
         return await while_connected(request, work())
     except NotKept as given:
         return given.answer
 
 
-async def _result(parts: Parts, asked: wire.PlanRequest, arrival: Arrival) -> wire.BatchResult:
+def _scene_of_batch(given: Any) -> wire.PlanRequest | ProblemError:
+    """A request of a batch, or what is wrong with it."""
     try:
+        return wire.PlanRequest.model_validate(given)
+    except ValidationError as error:
+        # As FastAPI tells them, so that a scene is told the same alone and in a batch.
+        told = [fault | {"loc": ("body", *fault["loc"])} for fault in error.errors(include_url=False)]
+        return from_validation(RequestValidationError(told, body=given))
+
+
+async def _result(parts: Parts, asked: wire.PlanRequest | ProblemError, arrival: Arrival) -> wire.BatchResult:
+    try:
+        if isinstance(asked, ProblemError):
+            raise asked
         planned = await parts.planning.in_turn(asked, arrival)
         return wire.BatchResult(status=200, response=plan_answer(planned, arrival.request_id))
     except ProblemError as error:

@@ -145,7 +145,7 @@ def _add_models(router: APIRouter, parts: Parts) -> None:
         found = folder / asked.checkpoint
         if not found.is_dir():
             raise ProblemError(UNKNOWN_CHECKPOINT, f"there is no checkpoint {asked.checkpoint!r}")
-        return model_card(await parts.lifecycle.replace(lambda: make(found)))
+        return model_card(await parts.lifecycle.replace(lambda: make(found), f"{folder}/"))
 
     router.include_router(loading)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -13,6 +13,8 @@ from clients.labelling.teachers.rules import RuleTeacher
 from clients.labelling.teachers.teacher import Teacher
 from model.bundled import SCENES
 from service.keys import Keys
+
+LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
 class Settings(BaseSettings):
@@ -26,6 +28,8 @@ class Settings(BaseSettings):
         log_format: ``json`` for machines, ``console`` for people.
         api_keys_file: a line ``name:sha256`` for each key; without it everybody may ask.
         open: listen beyond this machine although there are no keys.
+        hosts: names that a service without keys answers to; by default this machine's own for itself, and any
+            for a service that is open.
         rate_limit: draws per key, such as ``6000/minute``; None for no limit.
         max_draws, max_scenes: accepted at once, those that wait included; the next one gets a 429 problem,
             but a scene that would be alone is let in. Few keep answers quick under a burst, many keep a
@@ -55,6 +59,7 @@ class Settings(BaseSettings):
     log_format: Literal["json", "console"] = "json"
     api_keys_file: Path | None = None
     open: bool = False
+    hosts: frozenset[str] | None = None
     rate_limit: str | None = None
     max_draws: int = Field(default=12, gt=0)
     max_scenes: int = Field(default=64, gt=0)
@@ -71,6 +76,12 @@ class Settings(BaseSettings):
     checkpoints: Path | None = None
     operators: tuple[str, ...] = ("operator",)
     cors_origins: tuple[str, ...] = ()
+
+    def answers_to(self) -> frozenset[str] | None:
+        """Names under which it is asked without a key; None for any."""
+        if self.hosts is not None:
+            return frozenset(host.lower() for host in self.hosts)
+        return None if self.open else LOOPBACK
 
     def keys(self) -> Keys:
         """The keys that open the service; raises `ValueError` where their file is none."""

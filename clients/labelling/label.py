@@ -24,7 +24,7 @@ from clients.labelling.teachers.teacher import (
     ask,
 )
 from clients.labelling.teachers.view import Surroundings
-from model.driving.hashing import hash_of
+from model.driving.hashing import annotations_hash, hash_of
 from model.driving.plan import parse_plan
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
@@ -34,10 +34,11 @@ CHECKS_VERSION: Final = 2
 
 
 class Asked(NamedTuple):
-    """A question, and the rollout that it comes from."""
+    """A question, the rollout that it comes from, and what stands for the annotations that it was made of."""
 
     entry: Entry
     question: Question
+    annotations: str
 
 
 def config_of(rollout: Run, teacher: Teacher, seed: int) -> Record:
@@ -71,7 +72,7 @@ def questions(
             continue
         entry, draws = kept
         for text in predicted_plans(entry, draws, plans_per_scene, seed):
-            yield Asked(entry, _question(labelled, entry, text, seed))
+            yield Asked(entry, _question(labelled, entry, text, seed), annotations_hash(labelled))
 
 
 def predicted_plans(entry: Entry, draws: Sequence[int], count: int, seed: int) -> list[str]:
@@ -85,7 +86,7 @@ def predicted_plans(entry: Entry, draws: Sequence[int], count: int, seed: int) -
 def jobs(run: Run, asked: Iterator[Asked]) -> Iterator[Job[Asked]]:
     """Questions as pieces of work."""
     for each in asked:
-        key = hash_of(run.id, each.entry.key, str(each.question.predicted))
+        key = hash_of(run.id, each.entry.key, str(each.question.predicted), each.annotations)
         yield Job(key, each.entry.scene_id, each)
 
 

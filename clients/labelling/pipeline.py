@@ -131,11 +131,11 @@ async def work_through(
 
     async def collect(count: int) -> None:
         """Wait until at most ``count`` are under way; raises what one of them raised."""
-        nonlocal under_way
         while len(under_way) > count:
-            ended, under_way = await asyncio.wait(under_way, return_when=asyncio.FIRST_COMPLETED)
+            ended, _ = await asyncio.wait(under_way, return_when=asyncio.FIRST_COMPLETED)
             for task in ended:
                 task.result()
+                under_way.remove(task)
 
     try:
         while limits.at_most is None or len(begun) < limits.at_most:

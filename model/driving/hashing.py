@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from typing import Any
 
-from model.driving.scene import Scene
+import numpy.typing as npt
+
+from model.driving.scene import LabelledScene, Scene
 
 
 def hash_of(*parts: object) -> str:
@@ -23,3 +26,16 @@ def scene_hash(scene: Scene) -> str:
     pictures = [picture for clip in scene.clips for picture in (clip.camera.encode(), *clip.images)]
     tracks = () if scene.tracks is None else ([vars(t) | {"lights": sorted(t.lights)} for t in scene.tracks],)
     return hash_of(scene.scene_id, *pictures, *(array.tobytes() for array in arrays), *tracks)
+
+
+def annotations_hash(labelled: LabelledScene) -> str:
+    """Stands for what is known about a scene besides what a planner is given: future, agents, road, tags."""
+    agents: list[object] = []
+    for agent in labelled.agents:
+        size = (agent.length_m, agent.width_m, agent.height_m)
+        agents += [agent.agent_id, agent.kind, size, sorted(agent.lights), agent.poses.tobytes()]
+    trace = labelled.lane_trace
+    lanes: tuple[npt.NDArray[Any], ...] = () if trace is None else (trace.road, trace.lane, trace.offset_m)
+    groups = ((labelled.future,), labelled.drivable, labelled.lane_lines, lanes)
+    arrays = [part for group in groups for part in (len(group), *(array.tobytes() for array in group))]
+    return hash_of(len(labelled.agents), *agents, *arrays, sorted(labelled.tags))

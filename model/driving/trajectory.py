@@ -66,7 +66,10 @@ def check_trajectory(array: npt.ArrayLike) -> FloatArray:
 
 def check_route(array: npt.ArrayLike) -> FloatArray:
     """A route as read-only float32 [20, 2], evenly spaced over the next 80 m; raises `GeometryError`."""
-    return _checked(array, (ROUTE_POINTS, 2), "route")
+    route = _checked(array, (ROUTE_POINTS, 2), "route")
+    if np.ptp(route, axis=0).max() < ROUTE_SPACING_M:
+        raise GeometryError("route leads nowhere: its points lie one every 4 m along the way to go")
+    return route
 
 
 def wrap_angle(angle: npt.ArrayLike) -> npt.NDArray[np.float64]:

@@ -19,7 +19,7 @@ from transformers import AutoTokenizer, Qwen2_5_VLConfig
 from transformers.utils import logging as transformers_logging
 
 from model.engines.engine import ModelCard
-from model.network.card import CheckpointError, read_card, weight_files, write_card
+from model.network.card import CheckpointError, read_card, weight_files, weights_revision, write_card
 from model.network.codec import CodecError, TrajectoryCodec
 from model.network.inputs import InputBuilder
 from model.network.settings import SettingsError, VlaSettings
@@ -154,7 +154,7 @@ def read_parts(folder: Path) -> Parts:
         inputs=inputs,
         card=ModelCard(
             name=card["name"],
-            revision=card["revision"],
+            revision=weights_revision(folder),
             engine="torch",
             formats=settings.formats,
             cameras=settings.cameras,

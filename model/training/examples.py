@@ -6,7 +6,6 @@ The cache holds what training reads, in flat arrays, and is rebuilt whenever its
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields
@@ -24,6 +23,7 @@ from model.driving.scene import CLIP_FRAMES, LabelledScene
 from model.driving.scene_store import read_scenes, scene_files
 from model.driving.tracks import tracks_of
 from model.driving.trajectory import FloatArray
+from model.driving.whole_files import written_whole
 from model.network.inputs import InputBuilder
 from model.network.track_features import track_features
 from model.training.dense import coarse, no_target, relative_motion
@@ -167,9 +167,8 @@ def load_examples(scenes: Path, cache: Path, cameras: Sequence[str], workers: in
 
 def _fill_cache(file: Path, cached: Path, cameras: tuple[str, ...]) -> None:
     examples = Examples.from_scenes(read_scenes(file), cameras)
-    temporary = cached.with_name(f".{cached.name}.{os.getpid()}.npz")
-    np.savez(temporary, **{field.name: getattr(examples, field.name) for field in fields(Examples)})
-    os.replace(temporary, cached)
+    with written_whole(cached) as temporary, temporary.open("wb") as content:
+        np.savez(content, **{field.name: getattr(examples, field.name) for field in fields(Examples)})
 
 
 def example_frames(

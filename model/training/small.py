@@ -16,6 +16,7 @@ from model.driving.facts import mirrored
 from model.driving.scene_store import read_scenes, scene_files
 from model.driving.tracks import tracks_of
 from model.driving.trajectory import FloatArray
+from model.driving.whole_files import written_whole
 from model.network.codec import TrajectoryCodec
 from model.network.small_planner import SmallInputs, SmallKind, SmallPlanner
 from model.network.track_features import MIRRORED, track_features
@@ -111,16 +112,15 @@ class SmallExamples:
     def save(self, path: Path) -> None:
         """Keep the examples in one file, whole or not at all."""
         inputs = self.inputs
-        temporary = path.with_name(f".{path.name}.tmp.npz")
-        np.savez(
-            temporary,
-            history=inputs.history.numpy(),
-            route=inputs.route.numpy(),
-            tracks=inputs.tracks.numpy(),
-            future=self.futures.numpy(),
-            episode=self.episodes.numpy(),
-        )
-        temporary.replace(path)
+        with written_whole(path) as temporary, temporary.open("wb") as file:
+            np.savez(
+                file,
+                history=inputs.history.numpy(),
+                route=inputs.route.numpy(),
+                tracks=inputs.tracks.numpy(),
+                future=self.futures.numpy(),
+                episode=self.episodes.numpy(),
+            )
 
     @classmethod
     def load(cls, path: Path) -> SmallExamples:

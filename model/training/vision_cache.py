@@ -16,6 +16,7 @@ import numpy.typing as npt
 import torch
 
 from model.driving.hashing import hash_of
+from model.driving.whole_files import written_whole
 from model.network.checkpoint import Loaded
 from model.network.patches import patchify
 from model.training.examples import Examples, example_frames
@@ -112,6 +113,5 @@ def _key(loaded: Loaded, examples: Examples, sides: int) -> str:
 
 
 def _write(path: Path, done: int) -> None:
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps({"done": done}))
-    temporary.replace(path)
+    with written_whole(path) as temporary:
+        temporary.write_text(json.dumps({"done": done}))

@@ -126,7 +126,7 @@ async def _planner(service: str | None, engine: Engine | None) -> AsyncIterator[
     app = create_app(engine, Settings(api_keys_file=None, rate_limit=None, max_draws=4096, max_scenes=1024))
     async with (
         app.router.lifespan_context(app),
-        AsyncPlannerClient("http://in-process", transport=httpx.ASGITransport(app)) as planner,
+        AsyncPlannerClient("http://localhost", transport=httpx.ASGITransport(app)) as planner,
     ):
         yield planner
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,9 +26,9 @@ DEFAULT_SCENES = SCENES
 
 @contextmanager
 def told() -> Iterator[None]:
-    """Turn the project's own errors into one line on stderr and exit code 2."""
+    """Turn the project's own errors, and a disk that is full, into one line on stderr and exit code 2."""
     try:
         yield
-    except (ValueError, FileNotFoundError, RuntimeError) as error:
+    except (ValueError, RuntimeError, OSError, sqlite3.OperationalError) as error:
         typer.echo(f"looktwice: {error}", err=True)
         raise typer.Exit(2) from error

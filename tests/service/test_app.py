@@ -44,9 +44,9 @@ def test_an_engine_that_cannot_start_is_told_to_both_probes(
 ) -> None:
     engine.start_failure = EngineError("no weights")
     with serve(engine, settings, wait=False) as served:
-        served.until(lambda: "no weights" in served.http.get("/readyz").text)
+        served.until(lambda: "the log has why" in served.http.get("/readyz").text)
         served.until(lambda: served.http.get("/healthz").status_code == 503)
-        assert "no weights" in problem(served.http.get("/healthz"), "engine-failed").detail
+        assert "the log has why" in problem(served.http.get("/healthz"), "engine-failed").detail
         problem(served.http.post("/v1/plan", json=body()), "engine-failed")
 
 

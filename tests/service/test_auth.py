@@ -114,3 +114,29 @@ def test_each_key_has_a_rate_of_its_own(guarded: Served, keys: tuple[Path, str, 
     never = guarded.http.post("/v1/plan", json=body(n=13), headers=caller)
     problem(never, "rate-limited")
     assert "Retry-After" not in never.headers
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("localhost", 200),
+        ("LOCALHOST:80", 200),
+        ("127.0.0.1:8000", 200),
+        ("[::1]:8000", 200),
+        ("planner.example.com", 421),
+        ("localhost.example.com", 421),
+        ("", 421),
+    ],
+)
+def test_without_keys_only_known_names_are_answered_to(served: Served, host: str, status: int) -> None:
+    answer = served.http.get("/v1/models", headers={"Host": host})
+    assert answer.status_code == status
+    if status == 421:
+        problem(answer, "misdirected")
+
+
+def test_whom_a_service_answers_to_can_be_told(guarded: Served, keys: tuple[Path, str, str]) -> None:
+    assert guarded.http.get("/v1/models", headers={"Host": "car.example.com"}).status_code == 200
+    assert Settings(open=True).answers_to() is None
+    assert Settings(hosts=frozenset({"Car.local"})).answers_to() == frozenset({"car.local"})
+    assert Settings(open=True, hosts=frozenset({"car.local"})).answers_to() == frozenset({"car.local"})

@@ -50,15 +50,35 @@ def test_one_that_fails_leaves_the_others(served: Served) -> None:
 
 
 @pytest.mark.parametrize(
+    "broken",
+    [
+        {},
+        7,
+        body(n=0),
+        body() | {"colour": "red"},
+        body() | {"scene": body()["scene"] | {"history": [[0.0, 0.0, 0.0]] * 3}},
+    ],
+    ids=["no scene", "no request", "no draws", "unknown", "short history"],
+)
+def test_one_that_breaks_the_contract_fails_alone_and_as_it_would_alone(served: Served, broken: Any) -> None:
+    good, bad = ask(served, body(n=1), broken)
+    assert good.status == 200
+    alone = served.http.post("/v1/plan", json=broken)
+    assert bad.problem is not None
+    assert bad.status == alone.status_code == 422
+    told = wire.Problem.model_validate_json(alone.content)
+    assert bad.problem.type == told.type
+    assert [fault.pointer for fault in bad.problem.errors] == [fault.pointer for fault in told.errors]
+
+
+@pytest.mark.parametrize(
     ("requests", "slug", "pointer"),
     [
         ([], "invalid-request", "/requests"),
         ([body()] * 65, "invalid-request", "/requests"),
-        ([body(), {}], "invalid-request", "/requests/1/scene"),
-        ([body(), body(n=0)], "invalid-controls", "/requests/1/controls/n"),
         ([body() | {"stream": True}], "invalid-controls", "/requests/0/stream"),
     ],
-    ids=["none", "too many", "no scene", "no draws", "a stream"],
+    ids=["none", "too many", "a stream"],
 )
 def test_bad_batches(served: Served, engine: ScriptedEngine, requests: Any, slug: str, pointer: str) -> None:
     found = problem(served.http.post("/v1/plan/batch", json={"requests": requests}), slug)

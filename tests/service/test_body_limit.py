@@ -38,7 +38,7 @@ def test_a_lie_about_the_length_ends_the_answer_not_the_server(served: Served) -
 def test_who_asks_first_is_answered_before_sending(served: Served) -> None:
     host, port = served.url.removeprefix("http://").split(":")
     head = (
-        "POST /v1/plan HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+        "POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
         "Content-Length: 50000000\r\nExpect: 100-continue\r\n\r\n"
     )
     with socket.create_connection((host, int(port)), timeout=30) as connection:
@@ -64,7 +64,7 @@ def test_scene_files_have_a_limit_of_their_own(served: Served) -> None:
 def test_all_bodies_together_have_a_limit(engine: ScriptedEngine) -> None:
     with serve(engine, Settings(max_held_bytes=1_500_000, body_timeout_s=20)) as served:
         host, port = served.url.removeprefix("http://").split(":")
-        head = "POST /v1/plan HTTP/1.1\r\nHost: x\r\nContent-Length: 1000001\r\n\r\n"
+        head = "POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000001\r\n\r\n"
         with socket.create_connection((host, int(port)), timeout=30) as connection:
             connection.sendall(head.encode() + b" " * 1_000_000)
             padded = json.dumps(body()) + " " * 1_000_000

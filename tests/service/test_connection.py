@@ -18,7 +18,7 @@ from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.sockets import listening
 
-HEAD = b"POST /v1/plan HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+HEAD = b"POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_headers_that_trickle_are_not_waited_for(served: Served) -> None:
 def test_the_next_request_has_its_time_too(served: Served) -> None:
     with connect(served) as connection:
         for _ in range(2):
-            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
             received = b""
             while b"alive" not in received:
                 received += connection.recv(10_000)
@@ -94,7 +94,7 @@ def test_a_planning_that_takes_longer_than_its_body_is_not_cut(
 @pytest.mark.parametrize("chunk", [b"X-Pad: " + b"a" * 1000 + b"\r\n", b"X-Long: " + b"a" * 200_000])
 def test_huge_headers_are_refused(served: Served, chunk: bytes) -> None:
     with connect(served) as connection:
-        connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n")
+        connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n")
         answer = b""
         try:
             for _ in range(200):
@@ -168,7 +168,7 @@ def test_who_reads_slowly_is_not_cut_off_but_who_stops_is() -> None:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         connection.connect(("127.0.0.1", int(url.rsplit(":", 1)[1])))
         connection.settimeout(30)
-        connection.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         pause = threading.Event()
         for _ in range(30):
             connection.recv(65_536)

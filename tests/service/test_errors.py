@@ -276,6 +276,7 @@ def test_types_are_stable() -> None:
         "not-found": 404,
         "unknown-scene": 404,
         "method-not-allowed": 405,
+        "misdirected": 421,
         "body-too-large": 413,
         "unsupported-media-type": 415,
         "invalid-request": 422,

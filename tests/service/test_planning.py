@@ -130,7 +130,7 @@ def test_a_caller_that_leaves_cancels_the_planning(served: Served, engine: Scrip
     content = json.dumps(body()).encode()
     host, port = served.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port))) as connection:
-        head = "POST /v1/plan HTTP/1.1\r\nHost: x\r\nContent-Type: application/json"
+        head = "POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json"
         connection.sendall(f"{head}\r\nContent-Length: {len(content)}\r\n\r\n".encode() + content)
         served.until(lambda: len(engine.submitted) == 1)
         assert served.metric("looktwice_plans_in_flight") == 1

@@ -216,7 +216,7 @@ def test_what_is_cut_off_at_the_end_of_a_drain_is_told_to_ask_elsewhere(
         served = Served(engine, url, http, loop)
         served.until_ready()
         with socket.create_connection(("127.0.0.1", int(url.rsplit(":", 1)[1])), 30) as half:
-            half.sendall(b"POST /v1/plan HTTP/1.1\r\nHost: x\r\nContent-Length: 1000\r\n\r\n{")
+            half.sendall(b"POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\n{")
             served.until(lambda: len(server.server_state.tasks) > 0)
             served.in_loop(server.drain)
             told = b"".join(iter(lambda: half.recv(65536), b""))
@@ -314,11 +314,12 @@ def test_a_checkpoint_that_cannot_be_served_changes_nothing(engine: ScriptedEngi
     (tmp_path / "bad").mkdir()
 
     def load(path: Path) -> ScriptedEngine:
-        raise ValueError("no weights in it")
+        raise ValueError(f"{path / 'model.safetensors'} has no weights")
 
     with serve(engine, Settings(checkpoints=tmp_path), load=load) as served:
         refused = served.http.post("/v1/models:load", json={"checkpoint": "bad"})
-        assert "no weights" in problem(refused, "checkpoint-failed").detail
+        detail = problem(refused, "checkpoint-failed").detail
+        assert detail == "bad/model.safetensors has no weights", "where checkpoints lie is nobody's business"
         problem(served.http.post("/v1/models:load", json={"checkpoint": "none"}), "unknown-checkpoint")
         for strange in ("../bad", "", "/etc", ".hidden"):
             problem(served.http.post("/v1/models:load", json={"checkpoint": strange}), "invalid-request")

@@ -92,7 +92,7 @@ def test_leaving_a_stream_cancels_it(served: Served, engine: ScriptedEngine) -> 
     content = json.dumps(streaming()).encode()
     host, port = served.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port))) as connection:
-        head = "POST /v1/plan HTTP/1.1\r\nHost: x\r\nContent-Type: application/json"
+        head = "POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json"
         connection.sendall(f"{head}\r\nContent-Length: {len(content)}\r\n\r\n".encode() + content)
         while b"event: plan" not in connection.recv(10_000):
             pass

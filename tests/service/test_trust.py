@@ -26,7 +26,7 @@ def test_streams_that_are_left_leave_nothing_behind(engine: ScriptedEngine) -> N
         served.in_loop(engine.may_finish.clear)
         host, port = served.url.removeprefix("http://").split(":")
         content = json.dumps(body(n=2) | {"stream": True}).encode()
-        head = f"POST /v1/plan HTTP/1.1\r\nHost: x\r\nContent-Length: {len(content)}\r\n"
+        head = f"POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(content)}\r\n"
         asked = f"{head}Content-Type: application/json\r\n\r\n".encode() + content
 
         async def leave() -> None:

@@ -90,7 +90,11 @@ class TorchEngine:
         self._settings = settings
         self._worker: Worker | None = _worker()
         loading = self._worker.submit(lambda: load(checkpoint, settings.dtype, settings.device))
-        self._loaded = loading.result()
+        try:
+            self._loaded = loading.result()
+        except BaseException:
+            self._worker.close()
+            raise
         self._frames, self._pictures = Frames(self._loaded.inputs), PictureThreads()
         self._decoding: Future[None] | None = None
         self._counts, self._rows_used = Counts(), 0

@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from clients.labelling.teachers.teacher import (
     TeacherError,
 )
 from model.driving.reflection_store import ReflectionFileError, read_reflections, write_reflections
+from model.driving.scene_store import read_scenes, write_scenes
 from tests.clients.labelling.builds import (
     GOOD,
     LEAKING,
@@ -127,6 +129,17 @@ def test_labels_of_another_teacher_are_others(ledger: Ledger, file: Path) -> Non
     assert labelled(ledger, file, Scripted(Answer(GOOD)))[1].done == SCENES
     with pytest.raises(LedgerError, match="several runs"):
         ledger.the_run("label")
+
+
+def test_scenes_whose_annotations_have_changed_are_asked_about_anew(ledger: Ledger, file: Path) -> None:
+    assert labelled(ledger, file, RuleTeacher())[1].done == SCENES
+    changed = [
+        replace(each, tags=each.tags ^ {"turn"}) if number < 2 else each
+        for number, each in enumerate(read_scenes(file))
+    ]
+    write_scenes(file, iter(changed))
+    again = labelled(ledger, file, RuleTeacher())[1]
+    assert (again.done, again.earlier) == (2, SCENES - 2)
 
 
 def test_reflections_come_out_with_their_provenance(ledger: Ledger, file: Path, tmp_path: Path) -> None:

@@ -1,9 +1,35 @@
 from __future__ import annotations
 
-from model.driving.hashing import hash_of
+from dataclasses import replace
+
+import numpy as np
+
+from model.bundled import SCENES
+from model.driving.hashing import annotations_hash, hash_of
+from model.driving.scene_store import read_scenes
+from model.driving.trajectory import constant_velocity
 
 
 def test_hashes_tell_parts_apart() -> None:
     assert hash_of("ab", "c") != hash_of("a", "bc") != hash_of("abc")
     assert hash_of(b"1") != hash_of("1")
     assert hash_of({"a": 1, "b": 2}) == hash_of({"b": 2, "a": 1})
+
+
+def test_annotations_are_told_apart_by_whatever_a_teacher_may_read() -> None:
+    labelled = next(read_scenes(SCENES))
+    assert labelled.agents
+    first, *rest = labelled.agents
+    moved = np.array(first.poses)
+    moved[..., 0] += 0.5
+    changed = [
+        labelled,
+        replace(labelled, agents=tuple(rest)),
+        replace(labelled, agents=(replace(first, kind="cone"), *rest)),
+        replace(labelled, agents=(replace(first, poses=moved), *rest)),
+        replace(labelled, tags=labelled.tags ^ {"turn"}),
+        replace(labelled, future=constant_velocity(labelled.scene.history)),
+        replace(labelled, lane_lines=labelled.lane_lines[1:]),
+    ]
+    assert len({annotations_hash(each) for each in changed}) == len(changed)
+    assert annotations_hash(labelled) == annotations_hash(next(read_scenes(SCENES)))

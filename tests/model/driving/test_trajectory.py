@@ -96,3 +96,10 @@ def test_the_draw_that_the_others_agree_with_is_followed() -> None:
     draws[:, :, 1] = np.array([0.0, 1.0, 1.2, 9.0])[:, None]
     assert agreed(draws) == 1
     assert agreed(draws[:1]) == 0
+
+
+def test_a_route_that_leads_nowhere_is_refused() -> None:
+    for stands in (np.zeros((20, 2)), np.full((20, 2), 7.0)):
+        with pytest.raises(GeometryError, match="leads nowhere"):
+            check_route(stands)
+    assert check_route(np.stack([np.zeros(20), 4.0 * np.arange(20)], axis=1)).shape == (20, 2)

@@ -18,6 +18,7 @@ from model.engines.torch.decoder import Decoder, StepEvent
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.torch.runner import Runner
 from model.evaluation.ladder import at_threshold
+from model.network.card import CheckpointError
 from tests.checkpoints import noisy_scene
 
 
@@ -43,6 +44,13 @@ async def plan(engine: TorchEngine, request: PlanRequest) -> list[Draw]:
 
 def direct(name: str, scene: Scene | None = None, **controls: object) -> PlanRequest:
     return PlanRequest(name, scene or noisy_scene(), "traj_only", Controls(**controls))  # type: ignore[arg-type]
+
+
+def test_a_checkpoint_that_is_refused_leaves_no_thread(tmp_path: Path) -> None:
+    before = threading.active_count()
+    with pytest.raises(CheckpointError):
+        TorchEngine(tmp_path)
+    assert threading.active_count() == before
 
 
 def test_many_requests_at_once_get_what_they_get_alone(untrained_checkpoint: Path) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from tokenizers import AddedToken, Tokenizer
 from transformers import (
     AutoModelForImageTextToText,
@@ -228,3 +229,14 @@ def test_expanding_needs_a_qwen(small_codec: TrajectoryCodec, tmp_path: Path) ->
         expand_stock(tmp_path / "none", tmp_path / "ours", small_codec, settings)
     with pytest.raises(CheckpointError, match="another folder"):
         expand_stock(tmp_path, tmp_path, small_codec, settings)
+
+
+def test_a_checkpoint_is_told_by_its_weights_whatever_its_card_says(
+    nano_folder: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "other"
+    shutil.copytree(nano_folder, folder)
+    weights = load_file(folder / "model.safetensors")
+    others = {name: torch.zeros_like(tensor) for name, tensor in weights.items()}
+    save_file(others, folder / "model.safetensors")
+    assert load(folder).card.revision == weights_revision(folder) != load(nano_folder).card.revision

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -75,6 +78,26 @@ def test_labelled_and_exported_in_every_form(rolled: Path, tmp_path: Path) -> No
     ran("export", rolled, "--form", "messages", "--scenes", SCENES, "--to", tmp_path / "m", "--run", run)
     assert len((tmp_path / "m" / "messages.jsonl").read_text().splitlines()) == written
     assert "--scenes" in ran("export", rolled, "--form", "messages", "--to", tmp_path / "n", code=2)
+
+
+def test_a_full_disk_is_a_message_and_loses_nothing(rolled: Path, tmp_path: Path) -> None:
+    build = tmp_path / "build"
+    shutil.copytree(rolled, build)
+    # No file may grow beyond 40 kB: the ledger can be opened, and is full after a few labels.
+    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))\n"
+    begin = "from service.cli.commands import app; app()"
+    for arguments in (
+        ("label", build, SCENES, "--seed", 7),
+        ("export", build, "--form", "messages", "--scenes", SCENES, "--to", tmp_path / "m"),
+    ):
+        command = [sys.executable, "-c", full + begin, "build", *map(str, arguments)]
+        stopped = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert stopped.returncode == 2, stopped.stderr
+        assert "Traceback" not in stopped.stderr
+        assert stopped.stderr.splitlines()[-1].startswith("looktwice: ")
+    done = told("label", build, SCENES, "--seed", 7, "--json")
+    assert done["done"] + done["dead"] + done["earlier"] == COUNT
+    assert done["done"] > 0
 
 
 def test_labelled_by_the_service(rolled: Path, url: str) -> None:
