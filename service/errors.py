@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from clients.wire import PROBLEM_MEDIA_TYPE, Fault, Problem
+from service import openai_errors
 from service.callers import CALLER_LEFT_STATUS, CallerLeft
 from service.metrics import Metrics
 from service.problems import (
@@ -37,6 +39,7 @@ from service.problems import (
     ProblemError,
 )
 
+_Model = TypeVar("_Model", bound=BaseModel)
 _MAX_FAULTS: Final = 20
 _MAX_QUOTED: Final = 200
 """Characters."""
@@ -67,10 +70,8 @@ def install_error_handlers(app: FastAPI, metrics: Metrics) -> None:
 
     def answer(request: Request, problem: ProblemError, headers: dict[str, str] | None = None) -> Response:
         metrics.problem_told(problem.kind)
-        # OpenAI's clients show their users this member, and no other.
-        chat = request.url.path.startswith("/v1/chat/")
-        extension = {"message": problem.detail} if chat else {}
-        return problem_response(problem, request.state.request_id, headers, extension)
+        dialect = request.url.path.startswith(openai_errors.PATHS)
+        return problem_response(problem, request.state.request_id, headers, dialect=dialect)
 
     @app.exception_handler(ProblemError)
     async def _problem(request: Request, error: ProblemError) -> Response:
@@ -95,9 +96,10 @@ def problem_response(
     error: ProblemError,
     request_id: str,
     headers: Mapping[str, str] | None = None,
-    extension: Mapping[str, str] | None = None,
+    *,
+    dialect: bool = False,
 ) -> Response:
-    """The answer to a request that ended with ``error``, its document with ``extension``."""
+    """The answer to a request that ended with ``error``; as OpenAI's clients read it too with ``dialect``."""
     kind = error.kind
     extra = dict(headers or {})
     if error.retry_after_s is not None:
@@ -106,8 +108,10 @@ def problem_response(
         extra["Connection"] = "close"
     # Plain ASCII: details quote what callers sent, which need not be encodable otherwise.
     document = problem_document(error, request_id).model_dump(exclude_defaults=True)
-    content = json.dumps(document | dict(extension or {}))
-    response = Response(content, kind.status, extra, media_type=PROBLEM_MEDIA_TYPE)
+    if dialect:
+        document["status"] = openai_errors.dialect_status(kind.status)
+        document["error"] = openai_errors.dialect_error(error)
+    response = Response(json.dumps(document), document["status"], extra, media_type=PROBLEM_MEDIA_TYPE)
     if kind is UNAUTHORIZED:
         # A line for each: browsers look at the first word of a line only.
         for scheme in ("Bearer", "Basic"):
@@ -158,6 +162,15 @@ def from_validation(error: RequestValidationError) -> ProblemError:
     if len(found) > 1:
         detail += f" (and {len(found) - 1} more)"
     return ProblemError(_kind(first), detail, faults)
+
+
+def validated(model: type[_Model], document: object) -> _Model:
+    """``document`` as a body of kind ``model``; raises the `ProblemError` that it would meet as a body."""
+    try:
+        return model.model_validate(document)
+    except ValidationError as error:
+        found = [fault | {"loc": ("body", *fault["loc"])} for fault in error.errors(include_url=False)]
+        raise from_validation(RequestValidationError(found, body=document)) from None
 
 
 def _kind(fault: dict[str, Any]) -> Kind:

@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    ProcessCollector,
+    disable_created_metrics,
+)
 
 from model.driving.plan import plan_iou
 from model.engines.engine import Draw, Load, ModelCard, Thinking
@@ -22,11 +29,14 @@ QUEUE_BUCKETS_S: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.
 TOKEN_BUCKETS: Final = (1, 2, 5, 10, 20, 40, 60, 80, 100, 150, 200, 300, 500)
 PROBABILITY_BUCKETS: Final = tuple(step / 10 for step in range(1, 11))
 
+# When a series began is of use to nobody here, and in Prometheus' own format it is one more gauge each.
+disable_created_metrics()  # type: ignore[no-untyped-call]
+
 BRANCH_LABELS: Final = {"Action:": "direct", "Thinking:": "think", None: "none"}
 
 
 class Metrics:
-    """The service's metrics in one registry; names start with ``looktwice_``.
+    """The service's metrics in one registry: ``looktwice_…``, and ``process_…`` of its process.
 
     The think rate is ``looktwice_branches_total{branch="think"}`` over all branches; where a caller forced
     it, ``thinking`` is not ``adaptive``.
@@ -34,6 +44,7 @@ class Metrics:
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self.registry = registry
+        ProcessCollector(registry=registry)
         self._requests = Counter(
             "looktwice_requests",
             "Requests answered; status 499 is a caller that left.",

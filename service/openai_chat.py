@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
@@ -19,7 +19,7 @@ from model.driving.scene import CLIP_FRAMES
 from model.engines.engine import ModelCard
 from service.answers import plan_answer
 from service.planning import Planned
-from service.problems import INVALID_CLIP, INVALID_IMAGE, INVALID_REQUEST, at
+from service.problems import INVALID_CLIP, INVALID_IMAGE, INVALID_REQUEST, UNKNOWN_MODEL, ProblemError, at
 
 THINKING: Final = "Thinking: "
 _EVERY: Final = 5
@@ -28,10 +28,25 @@ _DATA: Final = "data:"
 _STANDING: Final = [[0.0, 0.0, 0.0, 0.0]] * 16
 
 
-_Off = Annotated[float, Field(ge=0, le=0)] | None
+_HARMLESS: Final[Mapping[str, Sequence[object]]] = {
+    **dict.fromkeys(("stop", "stop_token_ids", "bad_words"), (None, [], "")),
+    **dict.fromkeys(("tools", "functions"), (None, [])),
+    **dict.fromkeys(("tool_choice", "function_call"), (None, "none", "auto")),
+    **dict.fromkeys(("presence_penalty", "frequency_penalty", "min_p", "min_tokens"), (None, 0)),
+    **dict.fromkeys(("repetition_penalty", "length_penalty", "best_of"), (None, 1)),
+    **dict.fromkeys(("logprobs", "echo", "use_beam_search", "continue_final_message"), (None, False)),
+    **dict.fromkeys(("top_logprobs", "prompt_logprobs"), (None, 0)),
+    **dict.fromkeys(("guided_json", "guided_regex", "guided_choice", "guided_grammar"), (None,)),
+    **dict.fromkeys(("structured_outputs", "allowed_token_ids", "audio", "prediction"), (None,)),
+    "top_k": (None, 0, -1),
+    "logit_bias": (None, {}),
+    "response_format": (None, {"type": "text"}),
+    "modalities": (None, ["text"]),
+}
+"""Fields of OpenAI's and vLLM's dialects that would change an answer, and the values that change nothing."""
 
 
-def _null_is(default: float) -> BeforeValidator:
+def _null_is(default: object) -> BeforeValidator:
     """Clients send null for what they leave to the server."""
     return BeforeValidator(lambda value: default if value is None else value)
 
@@ -66,13 +81,13 @@ class Message(_Dialect):
     """One turn of the dialogue; only pictures of users matter."""
 
     role: Literal["system", "developer", "user", "assistant"]
-    content: str | list[Annotated[ImagePart | TextPart, Field(discriminator="type")]]
+    content: str | list[Annotated[ImagePart | TextPart, Field(discriminator="type")]] | None
 
 
 class StreamOptions(_Dialect):
     """Of a streamed answer."""
 
-    include_usage: bool = False
+    include_usage: Annotated[bool, _null_is(False)] = False
 
 
 class Extras(wire.Asked):
@@ -92,8 +107,10 @@ class ChatRequest(_Dialect):
     """Body of POST /v1/chat/completions, as far as it has a meaning here.
 
     Lengths of answers follow from the response format, so ``max_tokens`` says nothing; what would change
-    an answer and cannot be obeyed is refused.
+    an answer and cannot be obeyed is refused, see `plan_document`.
     """
+
+    model_config = ConfigDict(frozen=True, extra="allow")
 
     model: str = ""
     messages: list[Message] = Field(min_length=1, max_length=64)
@@ -101,25 +118,21 @@ class ChatRequest(_Dialect):
     temperature: Annotated[float, _null_is(1.0), Field(ge=0, le=2)] = 1.0
     top_p: Annotated[float, _null_is(1.0), Field(gt=0, le=1)] = 1.0
     seed: Annotated[int, _null_is(0), Field(ge=0, le=wire.MAX_SEED)] = 0
-    stream: bool = False
+    stream: Annotated[bool, _null_is(False)] = False
     stream_options: StreamOptions | None = None
-    looktwice: Extras = Extras()
-    stop: None = None
-    tools: None = None
-    response_format: None = None
-    logprobs: Literal[False] | None = None
-    presence_penalty: _Off = None
-    frequency_penalty: _Off = None
-    min_p: _Off = None
-    top_k: Annotated[int, Field(ge=-1, le=0)] | None = None
-    repetition_penalty: Annotated[float, Field(ge=1, le=1)] | None = None
-    logit_bias: Annotated[dict[str, float], Field(max_length=0)] | None = None
+    looktwice: Annotated[Extras, _null_is(Extras())] = Extras()
 
 
-def plan_request(chat: ChatRequest, card: ModelCard) -> wire.PlanRequest:
-    """The request that a chat stands for; raises `ProblemError` where it is none."""
-    if chat.model not in ("", card.name):
-        raise at(INVALID_REQUEST, "/model", f"{chat.model!r} is not here; {card.name!r} is")
+def plan_document(chat: ChatRequest, card: ModelCard) -> dict[str, Any]:
+    """The plan request that a chat stands for, not yet checked.
+
+    Raises:
+        ProblemError: it asks for what cannot be obeyed, or brings other pictures than the model takes.
+    """
+    check_model(chat.model, card)
+    for name, value in (chat.model_extra or {}).items():
+        if value not in _HARMLESS.get(name, [value]):
+            raise at(INVALID_REQUEST, f"/{name}", "this cannot be obeyed here; leave it out")
     images = list(_images(chat.messages))
     wanted = CLIP_FRAMES * len(card.cameras)
     if len(images) != wanted:
@@ -133,24 +146,59 @@ def plan_request(chat: ChatRequest, card: ModelCard) -> wire.PlanRequest:
     ]
     controls = extras.model_dump(include={"thinking", "think_threshold", "prefill", "deadline_ms"})
     controls |= chat.model_dump(include={"n", "temperature", "top_p", "seed"})
-    return wire.PlanRequest.model_validate(
-        {
-            "scene": {
-                "clips": clips,
-                "history": extras.history or _STANDING,
-                "route": extras.route,
-                "tracks": extras.tracks,
-            },
-            "controls": controls,
-            "format": extras.format,
-            "stream": chat.stream,
-        }
-    )
+    scene = {"clips": clips, "history": extras.history or _STANDING, "route": extras.route}
+    if extras.tracks is not None:
+        scene["tracks"] = [track.model_dump() for track in extras.tracks]
+    return {"scene": scene, "controls": controls, "format": extras.format, "stream": chat.stream}
+
+
+def check_model(name: str, card: ModelCard) -> None:
+    """Raise `ProblemError` where another model is asked for than the one that answers."""
+    if name not in ("", card.name):
+        raise at(UNKNOWN_MODEL, "/model", f"{name[:100]!r} is not here; {card.name!r} is")
+
+
+class ChatPlaces:
+    """Where in a chat stands what a plan request has elsewhere."""
+
+    def __init__(self, chat: ChatRequest) -> None:
+        self._pictures = [
+            f"/messages/{number}/content/{part}/image_url/url"
+            for number, message in enumerate(chat.messages)
+            if message.role == "user" and isinstance(message.content, list)
+            for part, content in enumerate(message.content)
+            if isinstance(content, ImagePart)
+        ]
+
+    def problem(self, problem: ProblemError) -> ProblemError:
+        """A problem of a plan request, told of the chat that it was made of."""
+        detail, faults = problem.detail, []
+        for fault in problem.errors:
+            pointer = self._pointer(fault.pointer)
+            if fault.pointer:
+                detail = detail.replace(fault.pointer, pointer)
+            faults.append(fault.model_copy(update={"pointer": pointer}))
+        return ProblemError(problem.kind, detail, faults, problem.retry_after_s)
+
+    def _pointer(self, pointer: str) -> str:
+        match pointer.split("/")[1:]:
+            case ["scene", "clips", camera, "images", number, *_] if camera.isdigit() and number.isdigit():
+                place = CLIP_FRAMES * int(camera) + int(number)
+                return self._pictures[place] if place < len(self._pictures) else "/messages"
+            case ["scene", "clips", *_]:
+                return "/messages"
+            case ["controls", ("n" | "temperature" | "top_p" | "seed") as name, *_]:
+                return f"/{name}"
+            case ["controls" | "scene", *rest]:
+                return "/".join(["/looktwice", *rest])
+            case ["format", *_]:
+                return "/looktwice/format"
+        return pointer
 
 
 def _images(messages: Iterable[Message]) -> Iterable[str]:
     for number, message in enumerate(messages):
-        if isinstance(message.content, str) or message.role != "user":
+        if not isinstance(message.content, list) or message.role != "user":
             continue
         for part, content in enumerate(message.content):
             if isinstance(content, ImagePart):
@@ -173,6 +221,7 @@ class Completion:
 
     def __init__(self, completion_id: str, model: str, chat: ChatRequest) -> None:
         self._chat = chat
+        self._begun: set[int] = set()
         self._head = {
             "id": f"chatcmpl-{completion_id}",
             "created": int(time.time()),
@@ -192,11 +241,15 @@ class Completion:
             }
             for draw in answer.draws
         ]
-        return self._head | {"object": "chat.completion", "choices": choices, "usage": _usage(planned)}
+        told = {"choices": choices, "usage": self._usage(planned), "looktwice": _outcome(answer)}
+        return self._head | {"object": "chat.completion"} | told
 
     def delta(self, index: int, text: str) -> dict[str, Any]:
         """More of one choice."""
-        return self._chunk([{"index": index, "delta": {"role": "assistant", "content": text}}])
+        # Clients join deltas field by field, so the role is told once.
+        role = {} if index in self._begun else {"role": "assistant"}
+        self._begun.add(index)
+        return self._chunk([{"index": index, "delta": role | {"content": text}}])
 
     def last(self, planned: Planned) -> list[dict[str, Any]]:
         """What ends a stream."""
@@ -205,10 +258,10 @@ class Completion:
             {"index": draw.index, "delta": self._extra(draw), "finish_reason": "stop"}
             for draw in answer.draws
         ]
-        chunks = [self._chunk(choices)]
+        chunks = [self._chunk(choices) | {"looktwice": _outcome(answer)}]
         options = self._chat.stream_options
         if options is not None and options.include_usage:
-            chunks.append(self._chunk([]) | {"usage": _usage(planned)})
+            chunks.append(self._chunk([]) | {"usage": self._usage(planned)})
         return chunks
 
     def _chunk(self, choices: list[dict[str, Any]]) -> dict[str, Any]:
@@ -217,6 +270,19 @@ class Completion:
     def _extra(self, draw: wire.Draw) -> dict[str, Any]:
         assumed = [] if self._chat.looktwice.history is not None else ["history"]
         return {"looktwice": draw.model_dump() | {"assumed": assumed}}
+
+    def _usage(self, planned: Planned) -> dict[str, int]:
+        written = sum(sum(draw.tokens.values()) for draw in planned.draws)
+        given = {"route": self._chat.looktwice.route, "tracks": self._chat.looktwice.tracks}
+        lacking = [name for name, value in given.items() if value is None]
+        card = planned.card
+        prompt = card.prompt_tokens - sum(card.input_tokens.get(name, 0) for name in lacking)
+        return {"prompt_tokens": prompt, "completion_tokens": written, "total_tokens": prompt + written}
+
+
+def _outcome(answer: wire.PlanResponse) -> dict[str, Any]:
+    """What an answer says beside its draws."""
+    return answer.model_dump(include={"deadline", "agreed", "timing"})
 
 
 def text_of(draw: wire.Draw) -> str:
@@ -232,9 +298,3 @@ def trajectory_text(trajectory: list[list[float]]) -> str:
     told = trajectory[_EVERY - 1 :: _EVERY]
     rows = [[round(x, 2), round(y, 2), round(heading, 3)] for x, y, _, heading in told]
     return f"Trajectory: {json.dumps(rows)}\n"
-
-
-def _usage(planned: Planned) -> dict[str, int]:
-    written = sum(sum(draw.tokens.values()) for draw in planned.draws)
-    prompt = planned.card.prompt_tokens
-    return {"prompt_tokens": prompt, "completion_tokens": written, "total_tokens": prompt + written}

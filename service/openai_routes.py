@@ -8,20 +8,27 @@ from contextlib import aclosing
 from typing import Any, Final
 
 from fastapi import APIRouter, Request
-from fastapi.exceptions import RequestValidationError
-from pydantic import ValidationError
 from starlette.responses import JSONResponse
 
 import clients.wire as wire
 from service.callers import while_connected
-from service.errors import from_validation, problem_document
-from service.openai_chat import THINKING, ChatRequest, Completion, plan_request, trajectory_text
+from service.errors import validated
+from service.openai_chat import (
+    THINKING,
+    ChatPlaces,
+    ChatRequest,
+    Completion,
+    check_model,
+    plan_document,
+    trajectory_text,
+)
+from service.openai_errors import dialect_error
 from service.openapi import Responses, problems
 from service.parts import Parts
 from service.payloads import payload_route
 from service.planning import Planned, last
 from service.planning_routes import REFUSALS, arrival_of
-from service.problems import ProblemError
+from service.problems import DRAINING, ENGINE_FAILED, NOT_READY, UNAUTHORIZED, UNKNOWN_MODEL, ProblemError
 from service.streaming import Told, Written, streamed
 
 _ANSWERS: Final[Responses] = {
@@ -55,24 +62,31 @@ def openai_router(parts: Parts) -> APIRouter:
         """Planning in OpenAI's dialect: pictures as image parts, a message per draw; see docs/http.md."""
         arrival = arrival_of(request)
         card = parts.lifecycle.card
-        try:
-            asked = plan_request(chat, card)
-        except ValidationError as error:
-            raise from_validation(RequestValidationError(error.errors())) from None
         completion = Completion(arrival.request_id, card.name, chat)
-        events = parts.planning.events(asked, arrival)
-        if not chat.stream:
-            return JSONResponse(completion.whole(await while_connected(request, last(events))))
-        return await streamed(
-            request, events, lambda told: _chunks(told, completion, arrival.request_id), parts.metrics
-        )
+        try:
+            asked = validated(wire.PlanRequest, plan_document(chat, card))
+            events = parts.planning.events(asked, arrival)
+            if not chat.stream:
+                return JSONResponse(completion.whole(await while_connected(request, last(events))))
+            return await streamed(request, events, lambda told: _chunks(told, completion), parts.metrics)
+        except ProblemError as problem:
+            raise ChatPlaces(chat).problem(problem) from problem
+
+    @router.get(
+        "/v1/models/{name}",
+        responses=problems(UNAUTHORIZED, UNKNOWN_MODEL, NOT_READY, DRAINING, ENGINE_FAILED),
+    )
+    async def model(name: str) -> wire.NamedModel:
+        """One model, in OpenAI's dialect."""
+        parts.lifecycle.check_ready()
+        card = parts.lifecycle.card
+        check_model(name, card)
+        return wire.NamedModel(id=card.name, created=parts.began_s)
 
     return router
 
 
-async def _chunks(
-    told: AsyncGenerator[Told], completion: Completion, request_id: str
-) -> AsyncGenerator[bytes]:
+async def _chunks(told: AsyncGenerator[Told], completion: Completion) -> AsyncGenerator[bytes]:
     async with aclosing(told):
         try:
             async for event in told:
@@ -82,7 +96,7 @@ async def _chunks(
                 elif (text := _text(*event)) is not None:
                     yield _data(completion.delta(event[1].index, text))
         except ProblemError as error:
-            yield _data({"error": problem_document(error, request_id).model_dump()})
+            yield _data({"error": dialect_error(error)})
     yield b"data: [DONE]\n\n"
 
 

@@ -9,16 +9,15 @@ from typing import Annotated, Any, Final
 
 import structlog
 from fastapi import APIRouter, Body, Header, Request
-from fastapi.exceptions import RequestValidationError
 from fastapi.openapi.models import Example
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 from starlette.responses import Response
 
 import clients.wire as wire
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from service.answers import plan_answer, reflect_answer
 from service.callers import while_connected
-from service.errors import from_validation, problem_document
+from service.errors import problem_document, validated
 from service.examples import example_reflection, example_request
 from service.idempotency import NotKept
 from service.openapi import PACKED, Responses, payloads, problems
@@ -236,11 +235,9 @@ async def _once(
 def _scene_of_batch(given: Any) -> wire.PlanRequest | ProblemError:
     """A request of a batch, or what is wrong with it."""
     try:
-        return wire.PlanRequest.model_validate(given)
-    except ValidationError as error:
-        # As FastAPI tells them, so that a scene is told the same alone and in a batch.
-        told = [fault | {"loc": ("body", *fault["loc"])} for fault in error.errors(include_url=False)]
-        return from_validation(RequestValidationError(told, body=given))
+        return validated(wire.PlanRequest, given)
+    except ProblemError as problem:
+        return problem
 
 
 async def _result(parts: Parts, asked: wire.PlanRequest | ProblemError, arrival: Arrival) -> wire.BatchResult:

@@ -6,8 +6,8 @@ import asyncio
 import time
 from typing import Any, Final
 
-import prometheus_client
 from fastapi import APIRouter, Request
+from prometheus_client.exposition import choose_encoder
 from starlette.responses import Response
 
 import clients.wire as wire
@@ -62,7 +62,12 @@ from service.views import BundledScenes, view
 _FILES_AT_ONCE: Final = 1
 """Scene files that are unpacked, which may take much memory; others wait."""
 NOT_NOW = (NOT_READY, DRAINING, ENGINE_FAILED)
-METRICS_TEXT: Responses = {200: {"description": "Prometheus text", "content": {"text/plain": {}}}}
+METRICS_TEXT: Responses = {
+    200: {
+        "description": "Prometheus text",
+        "content": {"text/plain": {}, "application/openmetrics-text": {}},
+    }
+}
 
 
 def make_router(parts: Parts) -> APIRouter:
@@ -174,10 +179,10 @@ def _add_probes(router: APIRouter, parts: Parts) -> None:
         response_class=Response,
         responses=problems(UNAUTHORIZED) | METRICS_TEXT,
     )
-    async def metrics() -> Response:
-        """What Prometheus scrapes."""
-        content = prometheus_client.generate_latest(parts.metrics.registry)
-        return Response(content, media_type=prometheus_client.CONTENT_TYPE_LATEST)
+    async def metrics(request: Request) -> Response:
+        """What Prometheus scrapes; in OpenMetrics' format where it is asked for."""
+        encode, media_type = choose_encoder(request.headers.get("accept", ""))
+        return Response(encode(parts.metrics.registry), headers={"Content-Type": media_type})
 
 
 def _add_scenes(router: APIRouter, parts: Parts) -> None:

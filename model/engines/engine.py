@@ -204,6 +204,7 @@ class ModelCard:
         parameters: how many weights.
         inputs: what it takes of a scene beside pictures and history: ``route``, ``tracks``.
         prompt_tokens: of a scene that brings all of these.
+        input_tokens: of them, how many each of ``inputs`` takes.
         details: anything else worth showing, JSON-like.
     """
 
@@ -216,6 +217,7 @@ class ModelCard:
     parameters: int
     inputs: tuple[str, ...] = ("route",)
     prompt_tokens: int = 0
+    input_tokens: Mapping[str, int] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -161,7 +161,10 @@ def read_parts(folder: Path) -> Parts:
             image_size=(settings.image_width, settings.image_height),
             parameters=card["parameters"],
             inputs=settings.inputs,
-            prompt_tokens=len(inputs.longest_prompt(settings.formats[0]).ids),
+            prompt_tokens=inputs.prompt_tokens(settings.inputs),
+            input_tokens={
+                name: inputs.prompt_tokens((name,)) - inputs.prompt_tokens(()) for name in settings.inputs
+            },
             details=card["details"],
         ),
     )

@@ -143,6 +143,11 @@ class InputBuilder:
         """The prompt of a scene that has all that the network can be given."""
         return self.prompt(format, route=self.settings.with_route, tracks=self.settings.with_tracks)
 
+    def prompt_tokens(self, inputs: Sequence[str]) -> int:
+        """Length of the first format's prompt for a scene that brings ``inputs``: ``route``, ``tracks``."""
+        prompt = self.prompt(self.settings.formats[0], route="route" in inputs, tracks="tracks" in inputs)
+        return len(prompt.ids)
+
 
 def rotary_positions(is_video: npt.NDArray[np.bool_], settings: VlaSettings) -> IntArray:
     """Rotary positions int64 [3, t] of a sequence whose video placeholders are marked.

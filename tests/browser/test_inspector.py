@@ -311,7 +311,7 @@ def test_a_problem_is_told_and_goes_away(inspector: Page, engine: ScriptedEngine
     plan(inspector)
     alert = inspector.get_by_role("alert")
     expect(alert).to_contain_text("The engine failed")
-    expect(alert).to_contain_text("out of memory")
+    expect(alert).to_contain_text("the log has why")
     expect(alert).to_contain_text("request ")
     engine.failure = None
     plan(inspector)

@@ -278,10 +278,10 @@ def test_a_stream_that_fails_raises_what_the_service_said() -> None:
         engine.failure_later = EngineError("broke")
         stream = planner.stream(asked)
         assert next(stream)[0] == "plan"
-        with pytest.raises(ServiceBusy, match="broke"):
+        with pytest.raises(ServiceBusy, match="the log has why"):
             list(stream)
         engine.failure_later, engine.failure = None, EngineError("at once")
-        with pytest.raises(ServiceBusy, match="at once"):
+        with pytest.raises(ServiceBusy, match="the log has why"):
             next(planner.stream(asked))
 
 

@@ -106,7 +106,7 @@ def replica_that_answers(url: str) -> float:
     """When the replica was made whose metrics these are, in s since 1970: no two have the same."""
     told = httpx.get(f"{url}/metrics", timeout=120).raise_for_status().text
     samples = (sample for family in text_string_to_metric_families(told) for sample in family.samples)
-    return next(each.value for each in samples if each.name == "looktwice_engine_restarts_created")
+    return next(each.value for each in samples if each.name == "process_start_time_seconds")
 
 
 def test_a_replica_plans_over_http(serving: tuple[str, psutil.Process], scene: Scene) -> None:

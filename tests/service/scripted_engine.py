@@ -35,6 +35,8 @@ CARD: Final = ModelCard(
     cameras=("front_wide_120", "front_tele_30"),
     image_size=(224, 128),
     parameters=0,
+    prompt_tokens=100,
+    input_tokens={"route": 5},
 )
 KEEP_ON: Final = parse_plan(
     "- longitudinal\n  - 0.0s-2.1s: Keep Speed\n  - 2.1s-6.4s: Accelerate\n"

@@ -262,6 +262,7 @@ def test_types_are_stable() -> None:
         "invalid-body": 400,
         "unauthorized": 401,
         "forbidden": 403,
+        "unknown-model": 404,
         "unknown-checkpoint": 404,
         "body-timeout": 408,
         "swap-under-way": 409,

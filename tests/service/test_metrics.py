@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from prometheus_client.openmetrics import parser as openmetrics
+from prometheus_client.parser import text_string_to_metric_families
+
 from service.metrics import LATENCY_BUCKETS_S
 from tests.service.serving import Served, body
 
@@ -42,3 +45,22 @@ def test_labels_do_not_come_from_callers(served: Served) -> None:
     text = served.http.get("/metrics").text
     assert "BREW" not in text
     assert "made-up-name" not in text
+
+
+def test_metrics_come_in_both_formats_without_when_each_began(served: Served) -> None:
+    assert served.http.post("/v1/plan", json=body()).is_success
+    plain = served.http.get("/metrics")
+    assert plain.headers["content-type"].startswith("text/plain; version=0.0.4")
+    asked = "application/openmetrics-text;version=1.0.0;q=0.8,text/plain;version=0.0.4;q=0.3"
+    opened = served.http.get("/metrics", headers={"Accept": asked})
+    assert opened.headers["content-type"].startswith("application/openmetrics-text; version=1.0.0")
+    names = [
+        {family.name for family in parse(text)}
+        for parse, text in (
+            (text_string_to_metric_families, plain.text),
+            (openmetrics.text_string_to_metric_families, opened.text),
+        )
+    ]
+    assert names[0] == names[1]
+    assert {"looktwice_requests", "process_resident_memory_bytes", "process_open_fds"} <= names[0]
+    assert "_created" not in plain.text + opened.text

@@ -41,6 +41,10 @@ def extra(**fields: Any) -> dict[str, Any]:
 def test_models_are_listed(client: openai.OpenAI) -> None:
     (model,) = client.models.list().data
     assert (model.id, model.object, model.owned_by) == ("scripted", "model", "looktwice")
+    assert client.models.retrieve("scripted") == model
+    with pytest.raises(openai.NotFoundError) as error:
+        client.models.retrieve("gpt-4")
+    assert error.value.code == "unknown-model"
 
 
 def test_a_chat_is_a_plan_request(client: openai.OpenAI, served: Served, engine: ScriptedEngine) -> None:
@@ -99,6 +103,33 @@ def test_a_stream_adds_up_to_the_message(client: openai.OpenAI) -> None:
     assert usage == whole.usage
 
 
+def test_the_streaming_helper_puts_the_message_together(client: openai.OpenAI) -> None:
+    whole = client.chat.completions.create(model="scripted", messages=messages(), n=2, seed=3)
+    with client.chat.completions.stream(model="scripted", messages=messages(), n=2, seed=3) as stream:
+        stream.until_done()
+        streamed = stream.get_final_completion()
+    for one, other in zip(streamed.choices, whole.choices, strict=True):
+        assert (one.message.role, one.message.content) == ("assistant", other.message.content)
+
+
+def test_what_became_of_the_deadline_is_said(client: openai.OpenAI) -> None:
+    chat = client.chat.completions.create(
+        model="scripted", messages=messages(), extra_body=extra(deadline_ms=60_000)
+    )
+    assert chat.model_extra is not None
+    assert chat.model_extra["looktwice"]["deadline"] == {"met": True, "cut": []}
+
+
+def test_the_prompt_is_counted_as_it_was_given(client: openai.OpenAI) -> None:
+    without, with_route = (
+        client.chat.completions.create(model="scripted", messages=messages(), extra_body=body)
+        for body in ({}, extra())
+    )
+    assert without.usage is not None
+    assert with_route.usage is not None
+    assert with_route.usage.prompt_tokens - without.usage.prompt_tokens == 5
+
+
 def test_what_was_assumed_is_said(client: openai.OpenAI, engine: ScriptedEngine) -> None:
     chat = client.chat.completions.create(model="scripted", messages=messages())
     extras = chat.choices[0].message.model_extra
@@ -109,27 +140,50 @@ def test_what_was_assumed_is_said(client: openai.OpenAI, engine: ScriptedEngine)
 
 
 @pytest.mark.parametrize(
-    ("change", "slug"),
+    ("change", "slug", "param"),
     [
-        ({"model": "gpt-4"}, "invalid-request"),
-        ({"messages": [{"role": "user", "content": "no pictures"}]}, "invalid-clip"),
-        ({"stop": ["."]}, "invalid-request"),
-        ({"tools": [{"type": "function"}]}, "invalid-request"),
-        ({"logprobs": True}, "invalid-request"),
-        ({"n": 65}, "invalid-request"),
-        ({"frequency_penalty": 0.5}, "invalid-request"),
-        ({"top_k": 20}, "invalid-request"),
-        ({"logit_bias": {"50": 1}}, "invalid-request"),
-        ({"looktwice": {"speed": 3}}, "unknown-field"),
-        ({"looktwice": {"thinking": "never", "think_threshold": 0.5}}, "invalid-controls"),
+        ({"messages": [{"role": "user", "content": "no pictures"}]}, "invalid-clip", "messages"),
+        ({"stop": ["."]}, "invalid-request", "stop"),
+        ({"tools": [{"type": "function"}]}, "invalid-request", "tools"),
+        ({"tool_choice": "required"}, "invalid-request", "tool_choice"),
+        ({"logprobs": True}, "invalid-request", "logprobs"),
+        ({"n": 65}, "invalid-request", "n"),
+        ({"frequency_penalty": 0.5}, "invalid-request", "frequency_penalty"),
+        ({"top_k": 20}, "invalid-request", "top_k"),
+        ({"logit_bias": {"50": 1}}, "invalid-request", "logit_bias"),
+        ({"response_format": {"type": "json_object"}}, "invalid-request", "response_format"),
+        ({"guided_json": {"type": "object"}}, "invalid-request", "guided_json"),
+        ({"structured_outputs": {"json": {}}}, "invalid-request", "structured_outputs"),
+        ({"min_tokens": 5}, "invalid-request", "min_tokens"),
+        ({"best_of": 4}, "invalid-request", "best_of"),
+        ({"looktwice": {"speed": 3}}, "unknown-field", "looktwice.speed"),
+        ({"looktwice": {"thinking": "never", "think_threshold": 0.5}}, "invalid-controls", "looktwice"),
+        ({"looktwice": {"format": "haiku"}}, "unknown-format", "looktwice.format"),
+        ({"looktwice": {"history": [[9.0, 0.0, 0.0, 0.0]] * 16}}, "invalid-history", "looktwice.history"),
     ],
 )
-def test_what_cannot_be_obeyed_is_refused(
-    served: Served, engine: ScriptedEngine, change: dict[str, Any], slug: str
+def test_what_cannot_be_obeyed_is_refused_as_openai_does(
+    client: openai.OpenAI, engine: ScriptedEngine, change: dict[str, Any], slug: str, param: str
 ) -> None:
-    document = {"model": "scripted", "messages": messages()} | change
-    problem(served.http.post("/v1/chat/completions", json=document), slug)
+    document: dict[str, Any] = {"model": "scripted", "messages": messages(), "extra_body": change}
+    with pytest.raises(openai.BadRequestError) as refused:
+        client.chat.completions.create(**document)
+    assert (refused.value.code, refused.value.type) == (slug, "invalid_request_error")
+    assert refused.value.param is not None
+    assert refused.value.param.startswith(param)
+    assert refused.value.body["message"]  # type: ignore[index]
     assert engine.submitted == []
+
+
+def test_a_picture_that_is_none_is_pointed_at_where_it_stands(served: Served) -> None:
+    document: dict[str, Any] = {"messages": messages()}
+    document["messages"][1]["content"][6]["image_url"]["url"] = "data:image/jpeg;base64,AAAA"
+    answer = served.http.post("/v1/chat/completions", json=document)
+    assert answer.status_code == 400
+    found = problem(answer, "invalid-image")
+    assert found.errors[0].pointer == "/messages/1/content/6/image_url/url"
+    assert answer.json()["error"]["param"] == "messages[1].content[6].image_url.url"
+    assert "/scene" not in found.detail
 
 
 def test_nothing_is_fetched(served: Served, engine: ScriptedEngine) -> None:
@@ -141,8 +195,9 @@ def test_nothing_is_fetched(served: Served, engine: ScriptedEngine) -> None:
 
 
 def test_refusals_reach_the_client_as_its_own_errors(client: openai.OpenAI) -> None:
-    with pytest.raises(openai.UnprocessableEntityError) as error:
+    with pytest.raises(openai.NotFoundError) as error:
         client.chat.completions.create(model="gpt-4", messages=messages())
+    assert error.value.code == "unknown-model"
     assert "scripted" in str(error.value)
 
 
@@ -154,6 +209,14 @@ def test_what_says_nothing_is_let_pass(served: Served) -> None:
         "presence_penalty": 0.0,
         "top_k": -1,
         "logit_bias": {},
+        "stop": [],
+        "tools": [],
+        "tool_choice": "auto",
+        "response_format": {"type": "text"},
+        "stream": None,
+        "looktwice": None,
+        "guided_json": None,
+        "a field of tomorrow": 7,
     }
     document = {"model": "scripted", "messages": messages(), "user": "car-7", "max_tokens": 5} | said
     answer = served.http.post("/v1/chat/completions", json=document)
