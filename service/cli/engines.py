@@ -28,6 +28,15 @@ CacheMb = Annotated[
         min=0,
     ),
 ]
+Reproducible = Annotated[
+    bool | None,
+    typer.Option(
+        "--reproducible/--fast",
+        help="torch: the same request gets the same bytes, whatever else runs, or decode as fast as can be; "
+        "by default reproducible on a CPU and fast on a GPU.",
+        show_default=False,
+    ),
+]
 
 
 def make_engine(
@@ -38,10 +47,12 @@ def make_engine(
     device: Literal["cpu", "cuda"] = "cpu",
     vllm_arguments: str = "{}",
     cache_mb: int = 256,
+    reproducible: bool | None = None,
 ) -> Engine:
     """An engine over a checkpoint, not started yet.
 
-    ``cache_mb`` is for the vision tokens that the torch engine keeps, and as much for keys and values.
+    ``cache_mb`` is for the vision tokens that the torch engine keeps, and as much for keys and values;
+    ``reproducible`` None is what suits the device.
 
     Raises:
         CheckpointError: the folder is no usable checkpoint.
@@ -60,4 +71,6 @@ def make_engine(
     from model.engines.torch.engine import TorchEngine, TorchSettings
 
     settings = replace(TorchSettings.on(device, rows), clip_bytes=cache_mb << 20)
+    if reproducible is not None:
+        settings = replace(settings, reproducible=reproducible)
     return TorchEngine(checkpoint, settings)

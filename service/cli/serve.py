@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.engines import CacheMb, Device, EngineName, Rows, VllmArguments, make_engine
+from service.cli.engines import CacheMb, Device, EngineName, Reproducible, Rows, VllmArguments, make_engine
 from service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, told
 
 
@@ -20,6 +20,7 @@ def serve(
     device: Device = "cpu",
     vllm_arguments: VllmArguments = "{}",
     cache_mb: CacheMb = 256,
+    reproducible: Reproducible = None,
 ) -> None:
     """Serve a checkpoint over HTTP; the inspector page is at /."""
     from service.app import create_app
@@ -35,6 +36,7 @@ def serve(
             device=device,
             vllm_arguments=vllm_arguments,
             cache_mb=cache_mb,
+            reproducible=reproducible,
         )
         app = create_app(load(checkpoint), settings, teacher=TeacherSettings().teacher(), load=load)
         make_server(app, settings, host, port).run()

@@ -31,7 +31,7 @@ checks.positive_data_acceptance.expected-statuses = ["2xx", "400", "401", "403",
 # A scene of a batch that breaks the contract gets its 422 within an answer to the others.
 [[operations]]
 include-path = "/v1/plan/batch"
-checks.negative_data_rejection.expected-statuses = ["200", "400", "401", "403", "404", "413", "415", "422", "429"]
+checks.negative_data_rejection.expected-statuses = ["2xx", "400", "401", "404", "415", "422", "429"]
 """
 
 

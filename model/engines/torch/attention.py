@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from model.engines.torch.kv import KvRows
-from model.engines.torch.layout import Part, reached
+from model.engines.torch.layout import LEAST_QUERIES, InOrder, Part, reached, stretches
 
 
 class PromptPart(NamedTuple):
@@ -25,6 +26,43 @@ class PromptPart(NamedTuple):
     row: int
     held: int
     fed: int
+
+
+class PromptsInOrder:
+    """The next tokens of some prompts: as `PromptPass`, but what one is told depends on its prompt alone."""
+
+    def __init__(self, memory: KvRows, parts: Sequence[PromptPart]) -> None:
+        self._counts = [part.fed for part in parts]
+        self._parts = []
+        for row, held, fed in parts:
+            runs = []
+            for start, stop, span in stretches(held, held + fed, memory.length):
+                seen = torch.arange(span) <= torch.arange(start, max(stop, start + LEAST_QUERIES))[:, None]
+                runs.append((start - held, stop - held, _hiding(seen, memory.flat)))
+            self._parts.append((memory.row(row, runs[-1][2].shape[-1]), held, runs))
+
+    def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+        """Store ``key`` and ``value`` [t, g, d]; what ``query`` [t, h, d], scaled, sees: [t, h x d]."""
+        count = sum(self._counts)
+        fed = (torch.split(each[:count], self._counts) for each in (query, key, value))
+        attended = []
+        for (memory, held, runs), asked, *new in zip(self._parts, *fed, strict=True):
+            keys, values = memory[:, layer]
+            for place, written in zip((keys, values), new, strict=True):
+                place[:, held : held + len(asked)] = written.transpose(0, 1)
+            for start, stop, mask in runs:
+                lacking = mask.shape[0] - (stop - start)
+                queries = functional.pad(asked[start:stop].transpose(0, 1), (0, 0, 0, lacking))
+                seen = functional.scaled_dot_product_attention(
+                    queries[None],
+                    keys[None, :, : mask.shape[1]],
+                    values[None, :, : mask.shape[1]],
+                    attn_mask=mask,
+                    scale=1.0,
+                    enable_gqa=True,
+                )
+                attended.append(seen[0, :, : stop - start].transpose(0, 1).reshape(stop - start, -1))
+        return functional.pad(torch.cat(attended), (0, 0, 0, len(query) - count))
 
 
 class PromptPass:
@@ -110,3 +148,46 @@ class DrawPass:
             for queries, (part, mask) in zip(asked, self._parts, strict=True)
         ]
         return torch.cat(seen).index_select(0, self._back).view(len(query), -1)
+
+
+class DrawsInOrder:
+    """The next tokens of running draws: as `DrawPass`, but what one is told depends on its draw alone.
+
+    Sums of rounded numbers depend on their order. So each row looks by itself, at copies of keys and values
+    in the order of its text, and over as many places as its tokens' own places say, whatever else runs.
+    """
+
+    def __init__(self, memory: KvRows, layout: InOrder) -> None:
+        self._memory = memory
+        device = memory.flat.device
+        self._slots, self._back = (torch.from_numpy(each).to(device) for each in (layout.slots, layout.back))
+        rows, within = np.divmod(layout.slots, memory.heads * memory.length)
+        memory.reach(int(rows.max()) + 1, int((within % memory.length).max()) + 1)
+        self._askings = []
+        for keys, into, seen in layout.askings:
+            hidden = _hiding(torch.arange(keys.shape[-1]) < torch.from_numpy(seen)[..., None], memory.flat)
+            mask = hidden.repeat_interleave(into.shape[-1], dim=1)[:, None]
+            places, queries = (torch.from_numpy(each).to(device).view(-1) for each in (keys, into))
+            self._askings.append((keys.shape, places, queries, mask))
+
+    def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+        """Store ``key`` and ``value`` [t, g, d]; what ``query`` [t, h, d], scaled, sees: [t, h x d]."""
+        flat, width = self._memory.flat[:, layer], query.shape[-1]
+        count = len(self._slots) // self._memory.heads
+        for place, new in zip(flat, (key, value), strict=True):
+            place.index_copy_(0, self._slots, new[:count].reshape(-1, width))
+        queries, seen = query.reshape(-1, width), []
+        for (rows, groups, span), places, into, mask in self._askings:
+            keys, values = (
+                of.index_select(0, places).view(rows, groups, span, width) for of in flat.unbind()
+            )
+            asked = queries.index_select(0, into).view(rows, groups, -1, width)
+            told = functional.scaled_dot_product_attention(asked, keys, values, attn_mask=mask, scale=1.0)
+            seen.append(told.reshape(-1, width))
+        return torch.cat(seen).index_select(0, self._back).view(len(query), -1)
+
+
+def _hiding(seen: Tensor, like: Tensor) -> Tensor:
+    """What is added to scores so that only what is seen counts, of the type and on the device of ``like``."""
+    mask = torch.zeros(seen.shape, dtype=like.dtype, device=like.device)
+    return mask.masked_fill_(~seen.to(like.device), float("-inf"))

@@ -56,6 +56,8 @@ class TorchSettings:
         products: what matrix products are worked out in; by default bfloat16 on CPUs that have units for
             it (AMX, AVX-512 BF16) and the weights' own type elsewhere.
         device: ``cpu`` or ``cuda``.
+        reproducible: the same request gets the same answer to the last bit, whatever else runs and whatever
+            pictures were seen before; on a CPU, where that is cheap. Needs products in bfloat16 there.
         shortcuts: what makes decoding fast and changes no response.
     """
 
@@ -67,6 +69,7 @@ class TorchSettings:
         default_factory=lambda: torch.bfloat16 if bfloat16_is_fast() else None
     )
     device: str = "cpu"
+    reproducible: bool = True
     shortcuts: Shortcuts = field(default_factory=Shortcuts)
 
     @classmethod
@@ -74,7 +77,7 @@ class TorchSettings:
         """What a device does best: on a GPU everything is in bfloat16."""
         if device == "cpu":
             return cls(rows=rows)
-        return cls(rows=rows, dtype=torch.bfloat16, products=None, device=device)
+        return cls(rows=rows, dtype=torch.bfloat16, products=None, device=device, reproducible=False)
 
 
 def _worker() -> Worker:
@@ -201,6 +204,7 @@ class TorchEngine:
                     clip_bytes=settings.clip_bytes,
                     frames=self._frames,
                     products=settings.products,
+                    reproducible=settings.reproducible,
                     reuse=settings.shortcuts.reuse,
                     capture=CudaGraph if settings.shortcuts.capture and settings.device == "cuda" else None,
                 )

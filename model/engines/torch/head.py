@@ -13,9 +13,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 _WHOLE_SHARE: Final = 0.5
 """Of the vocabulary: for more allowed tokens than this the whole product is as fast."""
+_ALIKE: Final = 16
+"""Products have a multiple of so many rows and columns, so that each of their numbers is added up in the
+same order, whatever else is asked for."""
 
 Ids = npt.NDArray[np.int64]
 
@@ -42,7 +46,9 @@ class AllowedHead:
         for rows in rows_of.values():
             part = self._part(wanted[rows[0]])
             chosen = hidden if len(rows) == len(hidden) else hidden[rows]
-            products.append(torch.mm(chosen, self._weight if part is None else part))
+            chosen = functional.pad(chosen, (0, 0, 0, -len(rows) % _ALIKE))
+            product = torch.mm(chosen, self._weight if part is None else part)
+            products.append(product[: len(rows), : len(wanted[rows[0]]) if part is not None else None])
         # All at once: on a GPU every copy waits for what was asked before.
         every = torch.cat([product.flatten() for product in products]).double().cpu().numpy()
         ends = np.cumsum([product.numel() for product in products])
@@ -63,6 +69,6 @@ class AllowedHead:
             if len(ids) <= _WHOLE_SHARE * self._weight.shape[1]:
                 wanted = torch.from_numpy(ids).to(self._weight.device)
                 # Turned over in memory too: products of few rows read that faster.
-                part = self._weight.index_select(1, wanted)
+                part = functional.pad(self._weight.index_select(1, wanted), (0, -len(ids) % _ALIKE))
             self._parts[id(ids)] = (ids, part)
         return self._parts[id(ids)][1]

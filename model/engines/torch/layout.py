@@ -13,6 +13,10 @@ _SPAN: Final = 32
 """Places seen are a multiple of this: few sizes, few kernels."""
 _LONG_SPAN: Final = 128
 """The same for passes that are to be alike."""
+_STRETCH: Final = 128
+"""The same where what a token is told may depend on nothing but its draw: a step in what it looks at."""
+LEAST_QUERIES: Final = 4
+"""Of a call: for fewer, libraries have kernels that add up in another order."""
 _PADDING: Final = 6_000
 """Places looked at in vain, over all tokens, that take as long as a call of its own."""
 
@@ -97,6 +101,108 @@ def alike(shape: Shape, written: Written, size: int) -> Layout:
     return Layout(
         (part,), padded(slots, size, "edge").ravel(), into, padded(back, size, "edge").ravel(), hidden
     )
+
+
+class Walk(NamedTuple):
+    """The way of a draw's row through the places of its prompt's row.
+
+    Attributes:
+        prompt: the row of its prompt.
+        path: int64 [n], places of the prompt's tokens and of its own, in the order of the text.
+        fed: how many of the last of them come in the pass.
+    """
+
+    prompt: int
+    path: IntArray
+    fed: int
+
+
+class Stretch(NamedTuple):
+    """Tokens from ``start`` to ``stop`` of a text, which look at its first ``span`` places."""
+
+    start: int
+    stop: int
+    span: int
+
+
+class Asking(NamedTuple):
+    """Tokens that ask in one call, a row each stretch of a walk.
+
+    Attributes:
+        keys: int64 [rows, groups, span], where what they look at lies in the flat memory, in order.
+        into: int64 [rows, groups, width, heads of the group], which query of the pass [t x h] each one is.
+        seen: int64 [rows, width], how many of the first places a token sees.
+    """
+
+    keys: IntArray
+    into: IntArray
+    seen: IntArray
+
+
+class InOrder(NamedTuple):
+    """Where the tokens of a pass go, and how they ask when every walk looks by itself, in its text's order.
+
+    Attributes:
+        slots: int64 [k x groups], in the flat memory.
+        askings: in the order of what they ask.
+        back: int64 [t x h], for every query of the pass which of those of the askings it is.
+    """
+
+    slots: IntArray
+    askings: tuple[Asking, ...]
+    back: IntArray
+
+
+def in_order(shape: Shape, walks: Sequence[Walk], size: int) -> InOrder:
+    """A layout in which what a token looks at, and in which order, depends on its own text alone.
+
+    Args:
+        shape: see there.
+        walks: of the rows that feed tokens, in their order.
+        size: tokens of the pass; those behind the walks' are padding, and nothing becomes of them.
+    """
+    heads = np.arange(shape.heads).reshape(shape.groups, -1)
+    members = heads.shape[1]
+    group = np.arange(shape.groups)
+    together: dict[tuple[int, int], list[tuple[int, int, Stretch]]] = {}
+    slots, first = [], 0
+    for number, (prompt, path, fed) in enumerate(walks):
+        slots.append((prompt * shape.groups + group) * shape.length + path[-fed:, None])
+        begin = len(path) - fed
+        for stretch in stretches(begin, len(path), shape.length):
+            count = max(stretch.stop - stretch.start, -(-LEAST_QUERIES // members))
+            kind = (stretch.span, 1 << (count - 1).bit_length())
+            together.setdefault(kind, []).append((number, first + stretch.start - begin, stretch))
+        first += fed
+    back, askings, asked = np.zeros((size, shape.heads), np.int64), [], 0
+    for (span, width), pieces in sorted(together.items()):
+        keys = np.empty((len(pieces), shape.groups, span), np.int64)
+        into = np.zeros((len(pieces), shape.groups, width, members), np.int64)
+        seen = np.ones((len(pieces), width), np.int64)
+        for row, (number, token, (start, stop, _)) in enumerate(pieces):
+            prompt, path, _ = walks[number]
+            known = path[:span]
+            keys[row] = (prompt * shape.groups + group[:, None]) * shape.length
+            keys[row, :, : len(known)] += known
+            count = stop - start
+            tokens = np.arange(token, token + count)
+            seen[row, :count] = np.arange(start, stop) + 1
+            into[row, :, :count] = tokens[:, None] * shape.heads + heads[:, None]
+            within = (row * shape.groups + group[:, None]) * width * members + np.arange(members)
+            back[tokens] = asked + within.ravel() + np.arange(count)[:, None] * members
+        askings.append(Asking(keys, into, seen))
+        asked += into.size
+    return InOrder(np.concatenate(slots).ravel(), tuple(askings), back.ravel())
+
+
+def stretches(start: int, stop: int, length: int) -> list[Stretch]:
+    """The tokens from ``start`` to ``stop`` of a text, by how many of the ``length`` places they look at."""
+    found = []
+    while start < stop:
+        span = (start // _STRETCH + 1) * _STRETCH
+        found.append(Stretch(start, min(stop, span), min(span, length)))
+        start = found[-1].stop
+    return found
 
 
 def reached(parts: Sequence[Part]) -> tuple[int, int]:

@@ -57,6 +57,10 @@ class Places:
         """Make row ``target`` know the places that row ``source`` knows."""
         self._places[target] = self._places[source]
 
+    def path(self, row: int, count: int) -> IntArray:
+        """The places of a row's first ``count`` tokens, in order."""
+        return self._places[row, :count]
+
     def write(self, fed: Sequence[Fed], prompt_lengths: Sequence[int]) -> Written:
         """Find places for what some rows bring.
 

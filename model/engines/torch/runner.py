@@ -15,15 +15,15 @@ from torch.nn import functional
 
 from model.driving.scene import Scene
 from model.driving.trajectory import FloatArray
-from model.engines.torch.attention import DrawPass, PromptPart, PromptPass
+from model.engines.torch.attention import DrawPass, DrawsInOrder, PromptPart, PromptPass, PromptsInOrder
 from model.engines.torch.clips import ClipCache, digest
 from model.engines.torch.frames import Frames
 from model.engines.torch.graphs import Capture, Graphs, Numbers, Sizes
 from model.engines.torch.head import AllowedHead, Ids
 from model.engines.torch.kv import KvRows
-from model.engines.torch.layout import Shape, alike, lean, padded, pass_size, reached
-from model.engines.torch.packed import PackedDecoder, Rotation
-from model.engines.torch.places import Fed, Places
+from model.engines.torch.layout import Shape, Walk, alike, in_order, lean, padded, pass_size, reached
+from model.engines.torch.packed import Attention, PackedDecoder, Rotation
+from model.engines.torch.places import Fed, IntArray, Places, Written
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import Format
@@ -105,6 +105,8 @@ class Runner:
         clip_bytes: of vision tokens kept for pictures that come again, and as many of keys and values.
         frames: where pictures are decoded; by default a new one.
         products: what matrix products are worked out in; None for the weights' own type.
+        reproducible: whether a draw's numbers are the same to the last bit whatever else runs and whatever
+            is known already; takes longer.
         reuse: whether anything is kept from scene to scene at all.
         capture: how passes of draws are captured, to be replayed for passes of the same sizes; None for not
             at all, which is best where an operation costs no more than what it does.
@@ -123,6 +125,7 @@ class Runner:
         clip_bytes: int = 0,
         frames: Frames | None = None,
         products: torch.dtype | None = None,
+        reproducible: bool = False,
         reuse: bool = True,
         capture: Capture | None = None,
         formats: Mapping[str, Format] = FORMATS,
@@ -139,6 +142,7 @@ class Runner:
         self._products = products
         self._decoder = PackedDecoder(model.model.language_model, products)
         self._head = AllowedHead(model.lm_head.weight)
+        self._reproducible = reproducible
         self._reuse, clip_bytes = reuse, clip_bytes if reuse else 0
         self._clips, self._pictures = ClipCache(clip_bytes), ClipCache(clip_bytes)
         self._frames = frames or Frames(loaded.inputs)
@@ -203,7 +207,8 @@ class Runner:
             (prompt, slice(prompt.held, min(prompt.held + count, len(prompt.embeddings))))
             for prompt, count in parts
         ]
-        attention = PromptPass(
+        kind = PromptsInOrder if self._reproducible else PromptPass
+        attention = kind(
             self._memory,
             [PromptPart(prompt.row, span.start, span.stop - span.start) for prompt, span in spans],
         )
@@ -237,7 +242,6 @@ class Runner:
 
         Returns the logits that each wants, float64 [k].
         """
-        device = self.loaded.model.device
         counts = [len(feed.tokens) for feed in feeds]
         ids = np.concatenate([feed.tokens for feed in feeds]).astype(np.int64)
         places = np.concatenate(
@@ -263,29 +267,47 @@ class Runner:
             for place, ids in feed.wanted
         ]
         size, wanted = pass_size(len(ids)), np.array([place for _, place, _ in asked], np.int64)
-        layout = self._arrange(self._shape, written, size)
         numbers = [
             padded(ids, size, "edge"),
             padded(places, size, "edge"),
             padded(wanted, pass_size(len(asked)) if asked else 0, "edge"),
-            *(layout.slots, layout.into, layout.back),
         ]
-        # Before the pass, which may be a replay, in which nothing new is made zero.
-        self._memory.reach(*reached(layout.parts))
-        hidden = self._pass(
-            Sizes(layout.parts, tuple(map(len, numbers))),
-            Numbers(
-                # Few copies: on a GPU each costs as much as an operation.
-                torch.from_numpy(np.concatenate(numbers)).to(device),
-                torch.from_numpy(layout.hidden).to(device),
-            ),
-        )
+        if self._reproducible:
+            hidden = self._in_order(fed, lengths, numbers)
+        else:
+            hidden = self._together(written, numbers)
         found: list[list[npt.NDArray[np.float64]]] = [[] for _ in feeds]
         if asked:
             logits = self._head.logits(hidden[: len(asked)], [ids for _, _, ids in asked])
             for (number, _, _), values in zip(asked, logits, strict=True):
                 found[number].append(values)
         return found
+
+    def _in_order(self, fed: Sequence[Fed], lengths: Sequence[int], numbers: Sequence[IntArray]) -> Tensor:
+        """A pass in which each row looks by itself; ``numbers`` are ids, places and what is wanted."""
+        walks = []
+        for row, prompt, held, count in fed:
+            own = self._places.path(row, held + count)
+            walks.append(Walk(prompt, np.concatenate([np.arange(lengths[prompt]), own]), count))
+        attention = DrawsInOrder(self._memory, in_order(self._shape, walks, len(numbers[0])))
+        ids, places, wanted = map(torch.from_numpy, numbers)
+        return self._hidden(ids, places, wanted, attention)
+
+    def _together(self, written: Written, numbers: Sequence[IntArray]) -> Tensor:
+        """A pass in which the rows of a scene look together; ``numbers`` as there."""
+        device = self.loaded.model.device
+        layout = self._arrange(self._shape, written, len(numbers[0]))
+        every = [*numbers, layout.slots, layout.into, layout.back]
+        # Before the pass, which may be a replay, in which nothing new is made zero.
+        self._memory.reach(*reached(layout.parts))
+        return self._pass(
+            Sizes(layout.parts, tuple(map(len, every))),
+            Numbers(
+                # Few copies: on a GPU each costs as much as an operation.
+                torch.from_numpy(np.concatenate(every)).to(device),
+                torch.from_numpy(layout.hidden).to(device),
+            ),
+        )
 
     def _run_pass(self, sizes: Sizes, numbers: Numbers) -> Tensor:
         """Final hidden states of the tokens that are asked for, [k, hidden]."""
@@ -299,9 +321,13 @@ class Runner:
             back=back,
             hidden=numbers.hidden,
         )
-        embeddings = self.loaded.model.get_input_embeddings()(ids)
-        rotation = self._rotation.at(places)
-        return self._decoder(embeddings, rotation, attention, wanted if len(wanted) else None)
+        return self._hidden(ids, places, wanted, attention)
+
+    def _hidden(self, ids: Tensor, places: Tensor, wanted: Tensor, attention: Attention) -> Tensor:
+        device = self.loaded.model.device
+        embeddings = self.loaded.model.get_input_embeddings()(ids.to(device))
+        rotation = self._rotation.at(places.to(device))
+        return self._decoder(embeddings, rotation, attention, wanted.to(device) if len(wanted) else None)
 
     def _open(self, scene: Scene) -> _Opened | Exception:
         """A scene's pictures: what is kept of them, and the patches of the others."""
@@ -323,10 +349,15 @@ class Runner:
         if not patches:
             return {}
         loaded = self.loaded
-        grid = torch.tensor([[1, *loaded.settings.grid[1:]]] * len(patches))
-        pixels = torch.from_numpy(np.concatenate(list(patches.values()))).to(loaded.model.device)
-        tokens = loaded.model.vision(pixels, grid, self._tower)
-        return dict(zip(patches, tokens.view(len(patches), -1, tokens.shape[-1]).unbind(), strict=True))
+        at_once = 1 if self._reproducible else len(patches)
+        grid = torch.tensor([[1, *loaded.settings.grid[1:]]] * at_once)
+        tokens = [
+            loaded.model.vision(
+                torch.from_numpy(np.concatenate(some)).to(loaded.model.device), grid, self._tower
+            )
+            for some in _batches(list(patches.values()), at_once)
+        ]
+        return dict(zip(patches, torch.cat(tokens).tensor_split(len(patches)), strict=True))
 
     def _begin_prompt(
         self, scene: Scene, format: str, row: int, vision_tokens: Tensor, shown: bytes
@@ -377,3 +408,7 @@ class Runner:
 def _gathered_with(history: FloatArray, route: FloatArray | None) -> bytes:
     """What else decides what a resampler gathers from pictures."""
     return history.tobytes() + (b"" if route is None else route.tobytes())
+
+
+def _batches(patches: list[npt.NDArray[np.uint8]], count: int) -> list[list[npt.NDArray[np.uint8]]]:
+    return [patches[first : first + count] for first in range(0, len(patches), count)]

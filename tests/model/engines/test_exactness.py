@@ -84,6 +84,7 @@ class Mix:
     rows: int
     chunk: int
     row_s: float
+    reproducible: bool
 
 
 class Counted(Pace):
@@ -138,6 +139,7 @@ mixes = st.builds(
     st.sampled_from([7, 64, 256]),
     # Some have room for everybody beside the most urgent, and some make the others wait for it.
     st.sampled_from([0.0, 0.05, 0.1]),
+    st.booleans(),
 )
 
 
@@ -235,6 +237,7 @@ def test_nothing_that_makes_it_fast_changes_a_response(
             exact,
             mix.rows,
             clip_bytes=1 << 20,
+            reproducible=mix.reproducible,
             reuse=mix.shortcuts.reuse,
             capture=Again if mix.shortcuts.capture else None,
             formats=made_up,
