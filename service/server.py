@@ -28,10 +28,14 @@ class Server(uvicorn.Server):
     """uvicorn's, but the first signal drains: it goes on listening, so that callers are told why not."""
 
     def __init__(
-        self, config: uvicorn.Config, drain: Callable[[], Awaitable[None]], settings: Settings
+        self,
+        config: uvicorn.Config,
+        drain: Callable[[], Awaitable[None]],
+        settings: Settings,
+        announce: Callable[[str], None],
     ) -> None:
         super().__init__(config)
-        self._drain, self._settings = drain, settings
+        self._drain, self._settings, self._announce = drain, settings, announce
         self._loop: asyncio.AbstractEventLoop | None = None
         self._draining: asyncio.Task[None] | None = None
 
@@ -39,6 +43,14 @@ class Server(uvicorn.Server):
         """Serve until drained."""
         self._loop = asyncio.get_running_loop()
         await super().serve(sockets)
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen, and say where."""
+        await super().startup(sockets)
+        for server in self.servers:
+            for listening in server.sockets:
+                host, port, *_ = listening.getsockname()
+                self._announce(f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}")
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Drain; a second signal ends at once."""
@@ -75,8 +87,19 @@ def check_who_may_ask(settings: Settings, where: str) -> None:
         )
 
 
-def make_server(app: FastAPI, settings: Settings, host: str = "127.0.0.1", port: int = 8000) -> Server:
+def make_server(
+    app: FastAPI,
+    settings: Settings,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    announce: Callable[[str], None] = lambda _: None,
+) -> Server:
     """A server for an application that `create_app` made.
+
+    Args:
+        app, settings: what is served, and how.
+        host, port: where to listen; port 0 takes a free one.
+        announce: told the URL once it listens there.
 
     Raises:
         ValueError: everybody could ask from anywhere.
@@ -95,7 +118,7 @@ def make_server(app: FastAPI, settings: Settings, host: str = "127.0.0.1", port:
         timeout_graceful_shutdown=_LAST_WORDS_S,
         server_header=False,
     )
-    return Server(config, app.state.drain, settings)
+    return Server(config, app.state.drain, settings, announce)
 
 
 def _is_loopback(host: str) -> bool:

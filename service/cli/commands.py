@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
+from typing import Annotated
+
 import typer
 
 import service.cli.bench as bench
@@ -16,9 +19,26 @@ import service.cli.scenes as scenes
 import service.cli.serve as serve
 import service.cli.train as train
 
+
+def _told_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"looktwice {version('looktwice')}")
+        raise typer.Exit
+
+
+def _options(
+    _: Annotated[
+        bool,
+        typer.Option("--version", help="Say which version this is.", callback=_told_version, is_eager=True),
+    ] = False,
+) -> None:
+    """A server for driving models that look twice before they act."""
+
+
 app = typer.Typer(
     name="looktwice",
-    help="A server for driving models that look twice before they act.",
+    callback=_options,
+    context_settings={"help_option_names": ["-h", "--help"]},
     no_args_is_help=True,
     pretty_exceptions_show_locals=False,
 )

@@ -68,8 +68,12 @@ def make_engine(
         if not isinstance(arguments, dict):
             raise ValueError("--vllm-arguments must be a JSON object")
         return VllmEngine(checkpoint, VllmSettings(rows=rows, arguments=arguments))
+    import torch
+
     from model.engines.torch.engine import TorchEngine, TorchSettings
 
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("there is no CUDA device that this torch can use; leave out --device cuda")
     settings = replace(TorchSettings.on(device, rows), clip_bytes=cache_mb << 20)
     if reproducible is not None:
         settings = replace(settings, reproducible=reproducible)

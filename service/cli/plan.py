@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, told
 
+if TYPE_CHECKING:
+    from model.driving.scene import LabelledScene, Scene
+    from model.engines.engine import Draw
+
 
 def plan(
     scenes: Annotated[
-        list[Path] | None, typer.Argument(help="Scene files; the bundled test scenes without any.")
+        list[Path] | None,
+        typer.Argument(
+            help="Scene files, or requests for /v1/plan as .json; the bundled test scenes without any."
+        ),
     ] = None,
     checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
     limit: Annotated[int, typer.Option(help="Scenes to plan for, of each file.", min=1)] = 1,
@@ -34,18 +42,14 @@ def plan(
 ) -> None:
     """Plan for scenes and draw what was planned."""
     with told():
-        from model.driving.scene_store import read_scenes
-
-        labelled = [
-            scene
-            for file in scenes or [DEFAULT_SCENES]
-            for scene in islice(read_scenes(file, dense=False), skip, skip + limit)
+        found = [
+            scene for file in scenes or [DEFAULT_SCENES] for scene in islice(_read(file), skip, skip + limit)
         ]
-        if not labelled:
+        if not found:
             raise ValueError("there are no scenes to plan for")
         asyncio.run(
             _plan(
-                labelled,
+                found,
                 checkpoint,
                 out,
                 as_json,
@@ -55,8 +59,27 @@ def plan(
         )
 
 
+def _read(file: Path) -> Iterator[Scene | LabelledScene]:
+    """The scenes of a file; of a request, its one."""
+    if file.suffix != ".json":
+        from model.driving.scene_store import read_scenes
+
+        yield from read_scenes(file, dense=False)
+        return
+    import clients.wire as wire
+    from service.errors import validated
+    from service.intake import scene_of
+    from service.problems import ProblemError
+
+    try:
+        document = json.loads(file.read_bytes())
+        yield scene_of(validated(wire.PlanRequest, document).scene)
+    except (ProblemError, ValueError) as error:
+        raise ValueError(f"{file} is no request for /v1/plan: {error}") from None
+
+
 async def _plan(
-    labelled: list[Any],
+    scenes: list[Scene | LabelledScene],
     checkpoint: Path,
     out: Path,
     as_json: bool,
@@ -65,6 +88,7 @@ async def _plan(
 ) -> None:
     import numpy as np
 
+    from model.driving.scene import LabelledScene
     from model.driving.trajectory import agreed
     from model.engines.engine import Controls, DrawFinished, PlanRequest
     from model.engines.torch.engine import TorchEngine
@@ -73,8 +97,8 @@ async def _plan(
     engine = TorchEngine(checkpoint)
     await engine.start()
     try:
-        for scene in labelled:
-            asked = scene.given(**given)
+        for scene in scenes:
+            asked = scene.given(**given) if isinstance(scene, LabelledScene) else scene
             request = PlanRequest(asked.scene_id, asked, controls=Controls(**controls))
             draws = [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
             draws.sort(key=lambda draw: draw.index)
@@ -85,14 +109,34 @@ async def _plan(
             if as_json:
                 typer.echo(json.dumps(_as_json(asked.scene_id, draws, chosen, picture)))
             else:
-                draw = draws[chosen]
-                typer.echo(f"scene {asked.scene_id}, draw {chosen} of {len(draws)}\n\n{draw.text}\n")
-                if draw.think_probability is not None:
-                    typer.echo(f"branch {draw.branch}  think probability {draw.think_probability:.3f}")
-                end = draw.trajectory[-1]
-                typer.echo(f"in 6.4 s at x {end[0]:.1f} m, y {end[1]:.1f} m; picture {picture}")
+                typer.echo("\n".join(_told(asked.scene_id, draws, chosen)))
+                typer.echo(f"\npicture {picture}")
     finally:
         await engine.stop()
+
+
+def _told(scene_id: str, draws: list[Draw], chosen: int) -> list[str]:
+    """Each draw in a line, and what the one to drive by says."""
+    lines = [f"scene {scene_id}"]
+    for draw in draws:
+        x_m, y_m, *_ = draw.trajectory[-1]
+        branch = "thinks" if draw.thinking is not None else "acts  "
+        share = "" if draw.think_probability is None else f", think probability {draw.think_probability:.3f}"
+        mark = "*" if draw.index == chosen else " "
+        lines.append(f"{mark} draw {draw.index} {branch} in 6.4 s at x {x_m:.1f} m, y {y_m:.1f} m{share}")
+    draw = draws[chosen]
+    lines += ["", f"Draw {chosen} (*) lies nearest to the others: the one to drive by. It says:", ""]
+    if draw.plan is not None:
+        lines += ["Meta actions:", str(draw.plan).rstrip()]
+    if draw.thinking is not None:
+        lines += [
+            "",
+            f"Thinking: {draw.thinking}",
+            "",
+            "Revised meta actions:",
+            str(draw.revised_plan).rstrip(),
+        ]
+    return lines
 
 
 def _as_json(scene_id: str, draws: list[Any], chosen: int, picture: Path) -> dict[str, Any]:

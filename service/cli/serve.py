@@ -2,31 +2,45 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any, Final
 
 import typer
+from pydantic_settings import BaseSettings
 
 from service.cli.engines import CacheMb, Device, EngineName, Reproducible, Rows, VllmArguments, make_engine
 from service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, told
+
+_INDENTED: Final[Any] = {"initial_indent": "    ", "subsequent_indent": "    "}
 
 
 def serve(
     checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port to listen on; 0 takes a free one.")] = 8000,
+    port: Annotated[
+        int, typer.Option(help="Port to listen on; 0 takes a free one.", min=0, max=65535)
+    ] = 8000,
     rows: Rows = 64,
     engine: EngineName = "torch",
     device: Device = "cpu",
     vllm_arguments: VllmArguments = "{}",
     cache_mb: CacheMb = 256,
     reproducible: Reproducible = None,
+    list_settings: Annotated[
+        bool, typer.Option("--settings", help="Say what can be set by environment variables, and end.")
+    ] = False,
 ) -> None:
     """Serve a checkpoint over HTTP; the inspector page is at /."""
     from service.app import create_app
     from service.server import make_server
     from service.settings import Settings, TeacherSettings
 
+    if list_settings:
+        for kind in (Settings, TeacherSettings):
+            typer.echo("\n".join(_described(kind)))
+        return
     with told():
         settings = Settings()
         load = partial(
@@ -39,4 +53,22 @@ def serve(
             reproducible=reproducible,
         )
         app = create_app(load(checkpoint), settings, teacher=TeacherSettings().teacher(), load=load)
-        make_server(app, settings, host, port).run()
+        make_server(app, settings, host, port, announce=_announce).run()
+
+
+def _announce(url: str) -> None:
+    """Where to go; on stdout, since stderr is the log's."""
+    typer.echo(
+        f"LookTwice listens at {url}; the inspector page is {url}/, its API is described at {url}/docs"
+    )
+
+
+def _described(kind: type[BaseSettings]) -> list[str]:
+    """Each setting with its default and what its class says of it."""
+    lines = []
+    for names, meaning in re.findall(r"^ {8}([a-z_, \n]+): ((?:.|\n {12})+)", kind.__doc__ or "", re.M):
+        for name in re.split(r"[,\s]+", names.strip()):
+            default = kind.model_fields[name].get_default(call_default_factory=True)
+            lines.append(f"{kind.model_config.get('env_prefix', '')}{name}".upper() + f"={default}")
+        lines.append(textwrap.fill(" ".join(meaning.split()), 100, **_INDENTED))
+    return lines

@@ -97,9 +97,10 @@ def hold(tmp_path: Path, moments: list[dict[str, Any]]) -> None:
 
 
 def test_a_service_that_refuses_shows_what_is_scaled_by() -> None:
-    """By default nothing waits then, and few of the engine's rows are in use."""
+    """As the chart sets it, nothing waits then, and few of the engine's rows are in use."""
     engine = ScriptedEngine()
-    with serve(engine, Settings()) as served:
+    values = yaml.safe_load((CHART / "values.yaml").read_text())
+    with serve(engine, Settings(max_draws=values["settings"]["LOOKTWICE_MAX_DRAWS"])) as served:
         served.in_loop(engine.may_finish.clear)
         with waiting(served, DRAWS), waiting(served, DRAWS):
             assert served.http.post("/v1/plan", json=body(n=DRAWS)).status_code == 429

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from service.cli.commands import app
+from service.settings import Settings, TeacherSettings
+from tests.service.serving import body
+
+
+def ran(*arguments: str, code: int = 0) -> str:
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    assert ran("--version").split() == ["looktwice", "0.1.0"]
+
+
+@pytest.mark.parametrize("command", [(), ("serve",), ("build", "rollout"), ("scenes", "generate")])
+def test_help_has_a_short_name(command: tuple[str, ...]) -> None:
+    assert ran(*command, "-h") == ran(*command, "--help")
+
+
+def test_every_setting_is_told_with_its_meaning() -> None:
+    told = ran("serve", "--settings")
+    for kind, prefix in ((Settings, "LOOKTWICE_"), (TeacherSettings, "LOOKTWICE_TEACHER_")):
+        for name in kind.model_fields:
+            assert f"\n{prefix}{name.upper()}=" in f"\n{told}", name
+    lines = told.splitlines()
+    assert all(line.startswith("    ") or lines[at + 1 :] for at, line in enumerate(lines))
+    assert "sk-" not in told
+
+
+def test_what_cannot_be_listened_on_is_refused() -> None:
+    assert "65535" in ran("serve", "--port", "65536", code=2)
+
+
+def test_a_request_can_be_planned_for_without_a_service(tmp_path: Path) -> None:
+    request = tmp_path / "request.json"
+    request.write_text(json.dumps(body()))
+    told = ran("plan", str(request), "--n", "3", "--out", str(tmp_path))
+    lines = told.splitlines()
+    assert [line.split()[:2] for line in lines[1:4] if not line.startswith("*")] == [
+        ["draw", str(k)] for k in range(3) if f"* draw {k} " not in told
+    ]
+    assert sum(line.startswith("* draw") for line in lines) == 1
+    assert "Meta actions:\n- longitudinal" in told
+    assert "<" not in told, "codes say nothing to people"
+    assert list(tmp_path.glob("*.png"))
+
+
+@pytest.mark.parametrize("content", ["{}", "nothing", '{"scene": {"scene_id": "a"}}'])
+def test_what_is_no_request_is_told_in_a_line(tmp_path: Path, content: str) -> None:
+    (tmp_path / "request.json").write_text(content)
+    assert ran("plan", str(tmp_path / "request.json"), code=2).startswith("looktwice: ")
+
+
+def test_help_needs_neither_torch_nor_the_service() -> None:
+    code = (
+        "import sys; from service.cli.commands import app; "
+        "print([name for name in ('torch', 'fastapi', 'numpy') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
