@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from inspect import signature
 from typing import Any, Final
 
 import numpy as np
@@ -14,6 +15,7 @@ from clients.navsim.inputs import AgentInput, Cameras, InputError
 from clients.navsim.views import seen_as
 from clients.planner import Access, Patience, PlannerClient
 from model.driving.cameras import FRONT_CAMERAS, CameraSpec
+from model.driving.hashing import scene_hash
 from model.driving.images import encode_jpeg
 from model.driving.scene import Clip, Scene
 from model.driving.trajectory import STEP_S, FloatArray
@@ -23,6 +25,8 @@ POSES: Final = 8
 SPECS: Final[Mapping[str, CameraSpec]] = {spec.name: spec for spec in FRONT_CAMERAS}
 _EVERY: Final = round(PERIOD_S / STEP_S)
 _QUALITY: Final = 95
+_SEED_DIGITS: Final = 12
+"""Hexadecimal."""
 
 
 class NavsimMissing(ImportError):
@@ -34,13 +38,13 @@ class NavsimPlanner:
 
     Args:
         planner: a client of the service.
-        controls: of every request; the seed goes up by one from plan to plan.
+        controls: of every request; what is planned for decides the seed, beside the one given here, so that
+            the same input gets the same answer whichever worker asks, and in whichever order.
     """
 
     def __init__(self, planner: PlannerClient, controls: wire.Controls = wire.Controls()) -> None:
         self._planner, self._controls = planner, controls
         self._card: wire.ModelCard | None = None
-        self._asked = 0
 
     def poses(self, agent_input: AgentInput) -> FloatArray:
         """x, y in m and heading in rad, float32 [8, 3], in 0.5 s to 4.0 s, in the present ego frame.
@@ -51,9 +55,9 @@ class NavsimPlanner:
             InputError: instants, cameras or calibrations are missing.
             PlannerError: the service gave no plan.
         """
-        controls = self._controls.model_copy(update={"seed": self._controls.seed + self._asked})
-        self._asked += 1
-        result = self._planner.plan(self.scene(agent_input), controls)
+        scene = self.scene(agent_input)
+        seed = (self._controls.seed + int(scene_hash(scene)[:_SEED_DIGITS], 16)) % (wire.MAX_SEED + 1)
+        result = self._planner.plan(scene, self._controls.model_copy(update={"seed": seed}))
         rows = result.draws[result.agreed].trajectory[_EVERY - 1 : _EVERY * POSES : _EVERY]
         return np.ascontiguousarray(rows[:, [0, 1, 3]])
 
@@ -113,7 +117,9 @@ def make_agent(
         """`NavsimPlanner` as NAVSIM knows agents."""
 
         def __init__(self) -> None:
-            super().__init__(sampling)
+            # NAVSIM 2 asks for the sampling, NAVSIM 1.1 does not know it.
+            asks = "trajectory_sampling" in signature(AbstractAgent.__init__).parameters
+            super().__init__(*[sampling] * asks)
             self._client: PlannerClient | None = None
             self._planner: NavsimPlanner | None = None
 

@@ -144,15 +144,23 @@ def test_eight_poses_are_those_of_the_draw_that_the_others_agree_with() -> None:
     with serve(engine, Settings()) as served, PlannerClient(served.url) as client:
         planner = NavsimPlanner(client, wire.Controls(n=5, seed=4))
         poses = planner.poses(agent_input())
-        planner.poses(agent_input())
-        again = client.plan(planner.scene(agent_input()), wire.Controls(n=5, seed=4))
+        NavsimPlanner(client, wire.Controls(n=5, seed=4)).poses(agent_input())
+        NavsimPlanner(client, wire.Controls(n=5, seed=5)).poses(agent_input())
+        moving = agent_input()
+        moving.ego_statuses[-1].ego_velocity[0] += 1.0
+        planner.poses(moving)
+        seeds = [request.controls.seed for request in engine.submitted]
+        again = client.plan(planner.scene(agent_input()), wire.Controls(n=5, seed=seeds[0]))
     draws = np.stack([draw.trajectory for draw in again.draws])
     driven = draws[agreed(draws)]
     assert poses.shape == (8, 3)
     assert poses.dtype == np.float32
     np.testing.assert_array_equal(poses, driven[[4, 9, 14, 19, 24, 29, 34, 39]][:, [0, 1, 3]])
     asked = engine.submitted[0]
-    assert [request.controls.seed for request in engine.submitted] == [4, 5, 4]
+    assert seeds[:3] == [seeds[0], seeds[0], seeds[0] + 1], (
+        "the input decides it, and the seed that was given"
+    )
+    assert seeds[3] not in seeds[:3]
     assert [clip.camera for clip in asked.scene.clips] == ["front_wide_120", "front_tele_30"]
     assert check_image(asked.scene.clips[0].images[0]) == (224, 128)
     assert asked.scene.route is None
@@ -203,22 +211,31 @@ class Trajectory:
         assert self.poses.shape == (self.trajectory_sampling.num_poses, 3)
 
 
-class AbstractAgent:
+class AgentOfTwo:
     def __init__(self, trajectory_sampling: TrajectorySampling, requires_scene: bool = False) -> None:
         self.requires_scene = requires_scene
         self._trajectory_sampling = trajectory_sampling
 
 
-def test_inside_navsim_it_is_an_agent(monkeypatch: pytest.MonkeyPatch) -> None:
+class AgentOfOne:
+    def __init__(self, requires_scene: bool = False) -> None:
+        assert isinstance(requires_scene, bool)
+        self.requires_scene = requires_scene
+
+
+@pytest.mark.parametrize("base", [AgentOfOne, AgentOfTwo])
+def test_inside_navsim_it_is_an_agent(base: type[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """NAVSIM pins a Python and packages of its own: its names stand in for it here."""
     for name, members in {
-        "navsim.agents.abstract_agent": (AbstractAgent,),
-        "navsim.common.dataclasses": (SensorConfig, Trajectory),
-        "nuplan.planning.simulation.trajectory.trajectory_sampling": (TrajectorySampling,),
+        "navsim.agents.abstract_agent": {"AbstractAgent": base},
+        "navsim.common.dataclasses": {"SensorConfig": SensorConfig, "Trajectory": Trajectory},
+        "nuplan.planning.simulation.trajectory.trajectory_sampling": {
+            "TrajectorySampling": TrajectorySampling
+        },
     }.items():
         module = ModuleType(name)
-        for member in members:
-            setattr(module, member.__name__, member)
+        for member_name, member in members.items():
+            setattr(module, member_name, member)
         parts = name.split(".")
         for length in range(1, len(parts)):
             monkeypatch.setitem(sys.modules, ".".join(parts[:length]), ModuleType(".".join(parts[:length])))
@@ -228,7 +245,7 @@ def test_inside_navsim_it_is_an_agent(monkeypatch: pytest.MonkeyPatch) -> None:
         agent.initialize()
         trajectory = agent.compute_trajectory(agent_input())
         agent.close()
-    assert AbstractAgent in type(agent).__mro__
+    assert base in type(agent).__mro__
     assert not agent.requires_scene
     assert agent.name() == "looktwice"
     assert agent.get_sensor_config() == SensorConfig(True, True, True, False)
