@@ -157,9 +157,7 @@ def test_eight_poses_are_those_of_the_draw_that_the_others_agree_with() -> None:
     assert poses.dtype == np.float32
     np.testing.assert_array_equal(poses, driven[[4, 9, 14, 19, 24, 29, 34, 39]][:, [0, 1, 3]])
     asked = engine.submitted[0]
-    assert seeds[:3] == [seeds[0], seeds[0], seeds[0] + 1], (
-        "the input decides it, and the seed that was given"
-    )
+    assert seeds[:3] == [seeds[0], seeds[0], seeds[0] + 1], "the input decides, and the seed given"
     assert seeds[3] not in seeds[:3]
     assert [clip.camera for clip in asked.scene.clips] == ["front_wide_120", "front_tele_30"]
     assert check_image(asked.scene.clips[0].images[0]) == (224, 128)
@@ -226,13 +224,14 @@ class AgentOfOne:
 @pytest.mark.parametrize("base", [AgentOfOne, AgentOfTwo])
 def test_inside_navsim_it_is_an_agent(base: type[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """NAVSIM pins a Python and packages of its own: its names stand in for it here."""
-    for name, members in {
+    modules: dict[str, dict[str, type[Any]]] = {
         "navsim.agents.abstract_agent": {"AbstractAgent": base},
         "navsim.common.dataclasses": {"SensorConfig": SensorConfig, "Trajectory": Trajectory},
         "nuplan.planning.simulation.trajectory.trajectory_sampling": {
             "TrajectorySampling": TrajectorySampling
         },
-    }.items():
+    }
+    for name, members in modules.items():
         module = ModuleType(name)
         for member_name, member in members.items():
             setattr(module, member_name, member)
