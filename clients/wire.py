@@ -182,8 +182,7 @@ class ReflectControls(Asked):
         default=0,
         ge=0,
         le=MAX_SEED,
-        description="The same request and seed give the same draws, "
-        "but for rounding where the engine multiplies in bfloat16.",
+        description="The same request and seed give the same draws; on a CPU to the last byte.",
     )
     deadline_ms: int | None = Field(
         default=None,

@@ -14,25 +14,47 @@ async function answer(response) {
   throw new Problem(body || { title: `The service answered ${response.status}`, detail: "without a reason" });
 }
 
-const get = (path) => fetch(path).then(answer);
+async function ask(path, options) {
+  let response;
+  try {
+    response = await fetch(path, options);
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new Problem({ title: "The service does not answer", detail: "Is it still running? Then try again." });
+  }
+  return answer(response);
+}
+
+const get = (path) => ask(path);
+const post = (path, document, signal) => ask(path, {
+  method: "POST",
+  headers: { "Content-Type": "application/json" },
+  body: JSON.stringify(document),
+  signal,
+});
 
 export const models = () => get("/v1/models").then((body) => body.models);
 export const sceneList = () => get("/v1/scenes").then((body) => body.scenes);
 export const bundledScene = (id) => get(`/v1/scenes/${encodeURIComponent(id)}`);
 
-export function plan(scene, controls, signal) {
-  return fetch("/v1/plan", {
-    method: "POST",
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify({ scene, controls }),
-    signal,
-  }).then(answer);
+export const plan = (scene, controls, signal) => post("/v1/plan", { scene, controls }, signal);
+
+// Looks at a plan, as text, answered in the shape of planned draws.
+export async function reflect(scene, text, controls, signal) {
+  const body = await post("/v1/reflect", { scene, plan: text, controls }, signal);
+  const draws = body.draws.map((draw) => ({
+    ...draw,
+    plan: body.plan,
+    branch: draw.thinking === null ? "Action:" : "Thinking:",
+    think_probability: body.think_probability,
+  }));
+  return { ...body, draws };
 }
 
 // A labelled scene per scene in the file. Parquet is read by the service, JSON here.
 export async function scenesOfFile(file) {
   if (!file.name.toLowerCase().endsWith(".json")) {
-    const body = await answer(await fetch("/v1/scenes:read", { method: "POST", body: file }));
+    const body = await ask("/v1/scenes:read", { method: "POST", body: file });
     return body.scenes;
   }
   let content;

@@ -38,6 +38,7 @@ function forgetDraws() {
   byId("draws").hidden = true;
   byId("timeline").replaceChildren();
   byId("plan-title").textContent = "Plan";
+  byId("link").hidden = true;
   for (const empty of document.querySelectorAll(".empty")) empty.hidden = false;
 }
 
@@ -108,30 +109,70 @@ function controls() {
   };
 }
 
-async function plan() {
+const given = () => ({
+  ...state.view.scene,
+  route: byId("with-route").checked ? state.view.scene.route : null,
+  tracks: byId("with-tracks").checked && !byId("with-tracks").disabled ? state.view.tracks : null,
+});
+
+const plan = () => ask("Planning …", (signal) => api.plan(given(), controls(), signal)).then(showLink);
+const lookTwice = () => ask("Looking twice …", (signal) =>
+  api.reflect(given(), byId("proposal").value, controls(), signal));
+
+async function ask(doing, request) {
   if (!state.view) return;
   state.running?.abort();
   const running = state.running = new AbortController();
-  const scene = {
-    ...state.view.scene,
-    route: byId("with-route").checked ? state.view.scene.route : null,
-    tracks: byId("with-tracks").checked && !byId("with-tracks").disabled ? state.view.tracks : null,
-  };
-  say("Planning …");
-  byId("plan").disabled = true;
+  const buttons = [byId("plan"), byId("look-twice")];
+  say(doing);
+  for (const button of buttons) button.disabled = true;
   const began = performance.now();
   try {
-    const body = await api.plan(scene, controls(), running.signal);
-    showDraws(body.draws, body.agreed);
+    const body = await request(running.signal);
+    showDraws(body.draws, body.agreed ?? null);
     const { total_ms: total, engine_ms: engine } = body.timing;
+    const deadline = body.deadline ? `, deadline ${body.deadline.met ? "met" : "missed"}` : "";
     say(`${body.draws.length} draws in ${total.toFixed(0)} ms (engine ${engine.toFixed(0)} ms, `
-      + `with the network ${(performance.now() - began).toFixed(0)} ms), request ${body.request_id}`);
+      + `with the network ${(performance.now() - began).toFixed(0)} ms)${deadline}, request ${body.request_id}`);
   } catch (error) {
     if (state.running === running) say("No plan.");
     throw error;
   } finally {
-    if (state.running === running || !state.running) byId("plan").disabled = false;
+    if (state.running === running || !state.running) for (const button of buttons) button.disabled = false;
   }
+}
+
+// What decides a plan of a bundled scene stands behind the address's #, so that it can be sent to others.
+const LINKED = ["scene", "thinking", "n", "temperature", "seed", "deadline"];
+
+function showLink() {
+  const shared = Boolean(state.view) && !state.opened.has(byId("scene").value);
+  byId("link").hidden = !shared;
+  if (!shared) return;
+  const values = new URLSearchParams(LINKED.map((id) => [id, byId(id).value]));
+  if (usesThreshold()) values.set("threshold", byId("threshold").value);
+  history.replaceState(null, "", `#${values}`);
+  byId("link").href = location.href;
+}
+
+function followLink() {
+  const values = new URLSearchParams(location.hash.slice(1));
+  for (const id of LINKED) if (values.has(id)) byId(id).value = values.get(id);
+  if (values.has("threshold")) {
+    byId("with-threshold").checked = true;
+    byId("threshold").value = values.get("threshold");
+  }
+  showThreshold();
+  return values.has("scene");
+}
+
+// Where the first plan would have led: under a deadline the service keeps that, otherwise it is asked for.
+async function showDraft(draw) {
+  if (draw.thinking === null || !draw.plan || draw.draft_trajectory || controls().deadline_ms !== null) return;
+  const asked = { ...controls(), thinking: "never", think_threshold: null, prefill: draw.plan.text, n: 1 };
+  const body = await api.plan(given(), asked, state.running?.signal);
+  draw.draft_trajectory = body.draws[0].trajectory;
+  redraw();
 }
 
 function averageError(trajectory, expert) {
@@ -147,7 +188,7 @@ function showDraws(draws, agreed) {
   byId("draws").hidden = draws.length === 0;
   for (const empty of document.querySelectorAll(".empty")) empty.hidden = true;
   byId("draws").tBodies[0].replaceChildren(...draws.map(drawRow));
-  if (draws.length) choose(agreed);
+  if (draws.length) choose(agreed ?? 0);
 }
 
 function drawRow(draw, index) {
@@ -159,7 +200,8 @@ function drawRow(draw, index) {
   const row = element("tr", {},
     element("td", {}, element("label", {}, radio, `draw ${draw.index}`),
       index === state.agreed ? element("span", { className: "agreed", textContent: "agreed", title: "nearest to all other draws: the one to drive by" }) : ""),
-    element("td", {}, draw.branch === null ? "–" : branch),
+    element("td", {}, draw.branch === null ? "–" : branch,
+      draw.cut ? element("span", { className: "cut", textContent: draw.cut, title: "what the deadline did to the second look" }) : ""),
     element("td", {}, draw.think_probability === null ? "–" : probability(draw.think_probability)),
     element("td", { className: "number", textContent: tokens }),
     element("td", { className: "number", textContent: averageError(draw.trajectory, state.view.future) }));
@@ -182,7 +224,9 @@ function choose(index) {
   });
   byId("plan-title").textContent = `Plan of draw ${state.draws[index].index}`;
   showDraw(state.draws[index]);
+  if (state.draws[index].plan) byId("proposal").value = state.draws[index].plan.text;
   redraw();
+  attempt(() => showDraft(state.draws[index]));
 }
 
 function listen() {
@@ -190,6 +234,10 @@ function listen() {
   byId("controls").addEventListener("submit", (event) => {
     event.preventDefault();
     attempt(plan);
+  });
+  byId("look").addEventListener("submit", (event) => {
+    event.preventDefault();
+    attempt(lookTwice);
   });
   byId("thinking").addEventListener("change", showThreshold);
   byId("with-threshold").addEventListener("change", replan);
@@ -220,7 +268,10 @@ async function begin() {
   const [scenes] = await Promise.all([api.sceneList(), showModel()]); // the model says what it takes
   byId("scene").replaceChildren(...scenes.map(({ scene_id: id, tags }) =>
     element("option", { value: id, textContent: tags.length ? `${id} · ${tags.join(", ").replaceAll("_", " ")}` : id })));
+  const linked = followLink();
+  if (!byId("scene").value && scenes.length) throw new Error("The link names a scene that is not here.");
   if (scenes.length) await chooseScene();
+  if (linked) await plan();
 }
 
 async function showModel() {

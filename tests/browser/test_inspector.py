@@ -192,6 +192,7 @@ def test_a_draft_is_shown_beside_what_came_of_the_second_look(
     deadline_ms = engine.submitted[-1].controls.deadline_ms
     assert deadline_ms is not None
     assert deadline_ms < 3000  # of which some is gone
+    inspector.get_by_label("Thinking", exact=True).select_option("never")
     inspector.get_by_label("Deadline").fill("")
     plan(inspector)
     expect(inspector.locator("#birdseye")).not_to_have_attribute("aria-label", re.compile("draft"))
@@ -317,6 +318,74 @@ def test_a_problem_is_told_and_goes_away(inspector: Page, engine: ScriptedEngine
     plan(inspector)
     expect(alert).to_be_hidden()
     expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+
+
+def test_a_plan_can_be_edited_and_looked_at_twice(inspector: Page, engine: ScriptedEngine) -> None:
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+    proposal = inspector.get_by_label("A plan to look at twice")
+    edited = proposal.input_value().replace("Accelerate", "Decelerate")
+    assert edited != proposal.input_value()
+    proposal.fill(edited)
+    engine.submitted.clear()
+    inspector.get_by_role("button", name="Look twice").click()
+    expect(inspector.get_by_role("status")).to_contain_text("6 draws in")
+    asked = engine.submitted[0]
+    assert str(asked.controls.prefill) == edited
+    expect(inspector.locator("blockquote")).to_have_text(REASONING)
+    proposal.fill("- nonsense")
+    inspector.get_by_role("button", name="Look twice").click()
+    expect(inspector.get_by_role("alert")).to_contain_text("plan")
+    expect(inspector.get_by_role("button", name="Look twice")).to_be_enabled()
+
+
+def test_without_a_deadline_the_first_plan_is_followed_too(inspector: Page, engine: ScriptedEngine) -> None:
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
+    inspector.get_by_label("Deadline, ms").fill("")
+    plan(inspector)
+    expect(inspector.locator("#birdseye")).to_have_attribute("aria-label", re.compile("its draft ended"))
+    first, second = engine.submitted
+    assert (first.controls.thinking, second.controls.thinking) == ("always", "never")
+    assert second.controls.prefill is not None
+    assert second.controls.n == 1
+
+
+def test_a_link_leads_to_the_same_plan(inspector: Page, served: Served, engine: ScriptedEngine) -> None:
+    inspector.get_by_label("Scene", exact=True).select_option("second/scene")
+    expect(inspector.get_by_role("status")).to_contain_text("second/scene")
+    inspector.get_by_label("Seed").fill("77")
+    inspector.get_by_role("spinbutton", name="Draws").fill("2")
+    plan(inspector)
+    link = inspector.get_by_role("link", name="Link to this plan").get_attribute("href")
+    assert link is not None
+    (asked,) = engine.submitted
+    inspector.goto("about:blank")
+    inspector.goto(link)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(2)
+    again = engine.submitted[-1]
+    assert again.scene.scene_id == "second/scene"
+    assert (again.controls.seed, again.controls.n) == (asked.controls.seed, asked.controls.n) == (77, 2)
+    inspector.goto("about:blank")
+    inspector.goto(f"{served.url}/#scene=nowhere")
+    expect(inspector.get_by_role("alert")).to_contain_text("not here")
+
+
+def test_what_became_of_the_deadline_is_shown(inspector: Page) -> None:
+    plan(inspector)
+    expect(inspector.get_by_role("status")).to_contain_text("deadline met")
+
+
+def test_a_service_that_is_gone_is_told(browser: Browser, tmp_path: Path) -> None:
+    page = browser.new_page()
+    path = tmp_path / "scenes.parquet"
+    write_scenes(path, [labelled("slow-leader")])
+    with serve(ScriptedEngine(), Settings(bundled_scenes=path)) as served:
+        page.goto(served.url)
+        expect(page.locator("#clips img")).to_have_count(2)
+    plan(page)
+    expect(page.get_by_role("alert")).to_contain_text("The service does not answer")
+    page.close()
 
 
 def test_needs_nothing_from_elsewhere(page: Page, served: Served) -> None:
