@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -64,3 +65,14 @@ def test_fields_say_their_units(description: dict[str, Any]) -> None:
     assert "rad" in history["items"]["description"]
     assert "4 m" in str(schemas["Scene"]["properties"]["route"])
     assert schemas["PlanRequest"]["additionalProperties"] is False
+
+
+def test_its_page_needs_nothing_from_elsewhere(served: Served) -> None:
+    page = served.http.get("/docs")
+    assert page.status_code == 200
+    for source in re.findall(r'(?:src|href)="([^"]+)"', page.text):
+        if not source.startswith("data:"):
+            assert source.startswith("/docs/"), source
+            assert served.http.get(source).status_code == 200
+    assert "/openapi.json" in page.text
+    assert "//cdn" not in page.text
