@@ -82,6 +82,17 @@ def test_an_image_pins_what_the_constraints_pin(image: str) -> None:
         assert pinned[name] == version
 
 
+@pytest.mark.parametrize("dockerfile", DOCKERFILES, ids=lambda path: str(path.stem))
+def test_an_image_has_ray_only_where_its_label_says_so(dockerfile: Path) -> None:
+    """Ray Serve brings HAProxy, which is under the GPL."""
+    build, last = dockerfile.read_text().rsplit("\nFROM ", 1)
+    assert re.findall(r"\[([a-z,]+)(.*?)\]\"", build) == [
+        ("otel,serve" if dockerfile.stem == "cpu" else "otel,serve,vllm", "${RAY:+,ray}")
+    ]
+    assert 'image.licenses="Apache-2.0${RAY:+ AND GPL-2.0-or-later}"' in last
+    assert build.count('ARG RAY=""') == last.count('ARG RAY=""') == 1
+
+
 def test_the_constraints_for_gpus_admit_what_the_package_asks_for() -> None:
     pinned = pins(CONSTRAINTS["cuda"])
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
