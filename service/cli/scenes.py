@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from service.cli.options import DEFAULT_SCENES, Json, told
+
+if TYPE_CHECKING:
+    from clients.recordings import Source
+    from model.driving.cameras import CameraSpec
 
 app = typer.Typer(help="Make, count and look at driving scenes.", no_args_is_help=True)
 _Scenes = Annotated[Path, typer.Argument(help="Scene file or folder; the bundled test scenes without one.")]
@@ -40,6 +44,63 @@ def generate(
         )
         report = generate(out, range(first_seed, first_seed + episodes), workers=workers, config=config)
         typer.echo(str(report))
+
+
+@app.command("import")
+def import_(
+    folder: Annotated[Path, typer.Argument(help="A drive: poses.csv, and a folder of pictures a camera.")],
+    out: Annotated[Path, typer.Argument(help="Scene file to write.")],
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="CAMERA=FOLDER:DEGREES[:HORIZON], once for each camera: where its pictures are, what they "
+            "show from side to side, and where the horizon lies (0.5 is half-way down).",
+            show_default="folders named like the model's two cameras",
+        ),
+    ] = None,
+    stride: Annotated[float, typer.Option(help="Seconds from scene to scene.", min=0.1)] = 0.5,
+    route: Annotated[bool, typer.Option(help="Take the way that was driven for the route.")] = False,
+    width: Annotated[int, typer.Option(help="Width of the pictures in pixels, twice their height.")] = 336,
+) -> None:
+    """Make scenes of a drive of your own; docs/own-cameras.md tells how."""
+    with told():
+        from clients.recordings import Recording, RecordingError, doubts
+        from model.driving.scene_store import write_scenes
+
+        cameras = _played(camera or [], width)
+        recording = Recording.read(folder, list(cameras.values()))
+        for doubt in doubts(recording, cameras):
+            typer.echo(f"looktwice: {doubt}", err=True)
+        count = write_scenes(out, recording.scenes(cameras, stride_s=stride, route=route))
+        if not count:
+            out.unlink()
+            raise RecordingError(
+                f"{folder} holds no scene: that takes four pictures of each camera half a second apart, and "
+                "poses from 1.5 s before the last of them to 6.4 s after it"
+            )
+        typer.echo(f"{count} scenes in {out}")
+
+
+def _played(told: list[str], width: int) -> dict[CameraSpec, Source]:
+    from clients.recordings import RecordingError, Source
+    from model.driving.cameras import FRONT_CAMERAS
+
+    specs = {spec.name: spec.resized(width) for spec in FRONT_CAMERAS}
+    if not told:
+        return {spec: Source(name, spec.hfov_degrees, spec.horizon) for name, spec in specs.items()}
+    found = {}
+    for each in told:
+        name, _, source = each.partition("=")
+        parts = source.split(":")
+        try:
+            folder, degrees, *horizon = parts
+            found[specs[name]] = Source(folder, float(degrees), *map(float, horizon[:1]))
+        except (KeyError, ValueError) as error:
+            if isinstance(error, RecordingError):
+                raise
+            known = ", ".join(specs)
+            raise ValueError(f"{each!r} is no CAMERA=FOLDER:DEGREES[:HORIZON]; known are {known}") from None
+    return found
 
 
 @app.command("stats")

@@ -73,7 +73,7 @@ def test_anything_else_is_asked(tmp_path: Path) -> None:
         replace(ASKED, controls=replace(ASKED.controls, prefill=None)),
         replace(ASKED, controls=replace(ASKED.controls, seed=1)),
         replace(ASKED, scene=replace(SCENE, clips=(other_pictures, *SCENE.clips[1:]))),
-        replace(ASKED, scene=replace(SCENE, route=np.zeros((20, 2), np.float32))),
+        replace(ASKED, scene=replace(SCENE, route=np.full((20, 2), np.arange(20)[:, None], np.float32))),
     ]
     ask(KeptDraws(engine, tmp_path / "draws.sqlite"), ASKED, *others)
     assert len(engine.requests) == 1 + len(others)
