@@ -113,6 +113,9 @@ def rollout(
 @app.command("filter")
 def choose(
     folder: Folder,
+    scenes: Annotated[
+        Path | None, typer.Argument(help="Keep scenes of this file or folder only.", show_default="all")
+    ] = None,
     epsilon: Annotated[float, typer.Option(help="minADE of free draws must be above it, m.", min=0)] = 0.5,
     gain: Annotated[float, typer.Option(help="By which the expert's plan must help, m.", min=0)] = 0.0,
     plan_iou: Annotated[
@@ -129,11 +132,16 @@ def choose(
     from clients.labelling.filtering import Thresholds, filtered, summary
     from clients.labelling.ledger import Ledger
     from clients.labelling.scatter import scatter
+    from model.driving.scene_store import row_groups, scene_files
 
     thresholds = Thresholds(epsilon, gain, plan_iou, everything)
     with told(), Ledger(folder) as ledger:
         rollout = ledger.the_run("rollout", run)
-        found = filtered(ledger.entries(rollout), thresholds)
+        entries = ledger.entries(rollout)
+        if scenes is not None:
+            wanted = {name for file in scene_files(scenes) for group in row_groups(file) for name in group}
+            entries = (entry for entry in entries if entry.scene_id in wanted)
+        found = filtered(entries, thresholds)
         ledger.keep(rollout, ((scene.entry.key, scene.draws) for scene in found if scene.kept))
         scatter(found, thresholds, folder / "filter.png")
         result = summary(found)

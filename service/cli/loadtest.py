@@ -19,7 +19,12 @@ def loadtest(
     service: Annotated[str, typer.Option(help="URL of a running service.")] = "http://127.0.0.1:8000",
     scenario: Annotated[Scenario, typer.Option(help="What is done; docs/load-tests.md tells.")] = "poisson",
     rate: Annotated[
-        float, typer.Option(help="Requests offered per second; where a sweep begins.", min=0.2)
+        float,
+        typer.Option(
+            help="Requests offered per second, on average: they come by chance, so 60 s at 1 offer 60 "
+            "give or take 8. Where a sweep begins.",
+            min=0.2,
+        ),
     ] = 1.0,
     seconds: Annotated[float, typer.Option(help="Of the measured run, or of each of its steps.", min=1)] = 60,
     warm_up: Annotated[float, typer.Option(help="Seconds before, left out of all figures.", min=0)] = 5.0,

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from clients.labelling.ledger import Run
 from clients.labelling.teachers.patience import TryLater, patiently
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.reflection_store import read_reflections
+from model.driving.scene_store import read_scenes, write_scenes
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from service.cli.build import _progress
 from service.cli.commands import app
@@ -64,6 +66,16 @@ def test_rolled_out_once_and_for_all(rolled: Path, url: str) -> None:
     again = told("rollout", rolled, SCENES, "--service", url, "--n", 2, "--json")
     assert (again["done"], again["earlier"]) == (0, COUNT)
     assert (rolled / "filter.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_of_some_scenes_only(rolled: Path, tmp_path: Path) -> None:
+    some = tmp_path / "some.parquet"
+    write_scenes(some, islice(read_scenes(SCENES), 3))
+    build = tmp_path / "build"
+    shutil.copytree(rolled, build)
+    kept = told("filter", build, some, "--everything", "--json")
+    assert (kept["scenes"], kept["kept"]) == (3, 3)
+    assert "does not exist" in ran("filter", build, tmp_path / "none", code=2)
 
 
 def test_labelled_and_exported_in_every_form(rolled: Path, tmp_path: Path) -> None:
