@@ -26,8 +26,12 @@ _SIDE: Final = 2000
 
 
 def costly_calls(polite: Call) -> list[Call]:
-    """Requests in which one thing is dear; the rest is of ``polite``, a call in JSON for one scene."""
+    """Requests in which one thing is dear to read; the rest is of ``polite``, a call in JSON for one scene.
+
+    They ask for one draw: that many draws are much to plan, is for admission and rates to bound.
+    """
     document = json.loads(polite.body)
+    document["controls"] = {"n": 1}
     many = {f"unknown-{number}": 0 for number in range(_MEMBERS)}
     return [
         _with_pictures("scans", document, scans(_SCANS)),

@@ -61,7 +61,7 @@ class Settings(BaseSettings):
     open: bool = False
     hosts: frozenset[str] | None = None
     rate_limit: str | None = None
-    max_draws: int = Field(default=48, gt=0)
+    max_draws: int = Field(default=24, gt=0)
     max_scenes: int = Field(default=64, gt=0)
     max_connections: int = Field(default=1024, gt=0)
     queue_timeout_s: float = Field(default=10.0, gt=0)
