@@ -71,8 +71,9 @@ def questions(
         if kept is None:
             continue
         entry, draws = kept
+        annotations = annotations_hash(labelled)
         for text in predicted_plans(entry, draws, plans_per_scene, seed):
-            yield Asked(entry, _question(labelled, entry, text, seed), annotations_hash(labelled))
+            yield Asked(entry, _question(labelled, entry, text, seed), annotations)
 
 
 def predicted_plans(entry: Entry, draws: Sequence[int], count: int, seed: int) -> list[str]:

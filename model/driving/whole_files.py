@@ -31,8 +31,6 @@ def _has_ended(pid: str) -> bool:
         return False
     try:
         os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return True
-    except OSError:  # it runs for somebody else
-        return False
+    except OSError as error:  # otherwise it runs, for somebody else
+        return isinstance(error, ProcessLookupError)
     return False

@@ -57,7 +57,7 @@ class TorchSettings:
             it (AMX, AVX-512 BF16) and the weights' own type elsewhere.
         device: ``cpu`` or ``cuda``.
         reproducible: the same request gets the same answer to the last bit, whatever else runs and whatever
-            pictures were seen before; on a CPU, where that is cheap. Needs products in bfloat16 there.
+            pictures were seen before; on a CPU, where that is cheap.
         shortcuts: what makes decoding fast and changes no response.
     """
 
