@@ -34,13 +34,21 @@ def generate(
         bool, typer.Option(help="The expert brakes late now and then; scenes show how it brakes then.")
     ] = False,
     width: Annotated[int, typer.Option(help="Width of the pictures in pixels, twice their height.")] = 224,
+    dense: Annotated[
+        bool, typer.Option(help="Store classes, ranges and motion of every picture cell, which `ground` needs.")
+    ] = True,
 ) -> None:
     """Drive episodes in MetaDrive and store their scenes; run again after a kill, it resumes."""
     with told():
         from clients.metadrive.generate import GenerateConfig, generate
 
         config = GenerateConfig(
-            stride_s=stride, surround=surround, drifts=drifts, lapses=lapses, width_px=width
+            stride_s=stride,
+            surround=surround,
+            dense=dense,
+            drifts=drifts,
+            lapses=lapses,
+            width_px=width,
         )
         report = generate(out, range(first_seed, first_seed + episodes), workers=workers, config=config)
         typer.echo(str(report))
