@@ -108,7 +108,7 @@ def _read(loaded: Loaded, heads: PerceptionHeads, batch: list[LabelledScene]) ->
     )
     clips = len(batch) * len(loaded.settings.cameras)
     tokens = model.vision(torch.from_numpy(patches), torch.tensor([loaded.settings.grid] * clips))
-    gathered = model.resampler(
+    gathered = model.resampler.gather(
         tokens.view(len(batch), loaded.settings.vision_tokens, -1),
         torch.from_numpy(np.stack([each.scene.history for each in batch])),
         torch.from_numpy(np.stack([np.asarray(each.scene.route) for each in batch])),

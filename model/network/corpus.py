@@ -10,9 +10,9 @@ import random
 from collections.abc import Iterator
 from typing import Final
 
-from model.driving.plan import GROUPS, TICKS, WORDS, Plan, track_from_words
+from model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, track_from_words
 from model.driving.scene import CAMERAS
-from model.network.prompts import TASKS, prompt_text
+from model.network.prompts import SYSTEM, TASKS, prompt_text
 from model.network.settings import VlaSettings
 
 _SLOTS: Final[dict[str, tuple[str, ...]]] = {
@@ -180,6 +180,53 @@ their he she we our you your in on at to from into onto of for with without by a
 across along around through within about per hour kilometers ahead, vehicle. lane. road.
 """
 
+_PLAN_START: Final = "Meta Actions:\n"
+_KINDS: Final = ("vehicle", "pedestrian", "traffic cone", "barrier")
+_PHRASES: Final = tuple(
+    """
+ is in my lane
+ is in the left lane
+ is in the right lane
+ is on the left side
+ is on the right side
+ is oncoming
+ in my lane
+ in the left lane
+ in the right lane
+ right ahead
+The road bends left
+The road bends right
+The junction lets me go left
+The junction lets me go right
+My lane is clear
+My lane ends
+There is room in the left lane
+There is room in the right lane
+ Going on like this
+ would bring me too close
+ would leave no time to react
+ would carry too much speed into the curve
+ would get me stuck
+ would carry me out of the lane
+ would be needlessly cautious
+ would be unnecessary
+ would miss the way
+, so I should brake and stop
+, so I should slow down sooner
+, so I should pick up speed
+, so I should turn left
+, so I should turn right
+, so I should steer straight for longer
+, so I should stay in my lane
+, so I should move to the left lane
+, so I should move to the right lane
+s:
+Action:
+Thinking:
+""".strip("\n").splitlines()
+)
+"""Phrases of reflections: what is seen and where, what would come of it, what is better."""
+
 
 def driving_sentences(per_template: int = 12, seed: int = 0) -> Iterator[str]:
     """Sentences about scenes, hazards and corrections; the same for the same arguments.
@@ -224,13 +271,29 @@ def response_texts(count: int = 300, seed: int = 0) -> Iterator[str]:
         yield f"Meta Actions:\n{first}Thinking:\n{thinking}\nMeta Actions:\n{second}Action:\n"
 
 
+def nano_phrases() -> tuple[str, ...]:
+    """Runs of text that the nano tokenizer has a token for: what prompts, plans and reflections are made of.
+
+    A small model spends its passes on choices, then, not on spelling.
+    """
+    objects = [f"A {state}{kind}" for kind in _KINDS for state in ("", "standing ", "slower ", "braking ")]
+    distances = [f" some {metres} metres ahead" for metres in range(5, 105, 5)]
+    words = [f" {word}" for words in WORDS.values() for word in words]
+    groups = [f"- {group}\n" for group in GROUPS]
+    return (SYSTEM, *TASKS.values(), _PLAN_START, *groups, *words, *objects, *distances, *_PHRASES)
+
+
 def nano_corpus() -> Iterator[str]:
     """Everything the nano tokenizer is trained on."""
+    for phrase in nano_phrases():
+        yield from [phrase] * 50
+    for tick in range(TICKS + 1):
+        yield from [f"{format_tick(tick)}  - {format_tick(tick)}s-"] * 50
     yield from driving_sentences()
     yield from response_texts()
     for format in TASKS:
         for route in (False, True):
             # Often enough that the prompt's own words become single tokens.
-            for tokens in (0, 1):
+            for tokens in (0, 3):
                 settings = VlaSettings(cameras=CAMERAS, scene_tokens=tokens)
                 yield from [prompt_text(format, settings, route=route, tracks=route)] * 20

@@ -1,4 +1,4 @@
-"""The continuous tokens: an ego history, a route and each track as one embedding."""
+"""The continuous tokens of an ego history and of a route."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS, ROUTE_SPACING_M, STEP_S
-from model.network.track_features import TRACK_FEATURES
 
 # Typical sizes, so that what the networks see is of order one: metres, metres, metres, radians.
 _POSE_SCALE: Final = (10.0, 2.0, 1.0, 0.3)
@@ -54,22 +53,6 @@ class RouteEncoder(nn.Module):
         """One token [b, hidden] for each route [b, 20, 2]."""
         features = (route.float() / _ROUTE_SCALE_M).flatten(1)
         embedding: Tensor = self.layers(features.to(next(self.parameters()).dtype))
-        return embedding
-
-
-class TrackEncoder(nn.Module):
-    """An MLP from each of a scene's tracks [b, 16, features] to one token [b, 16, hidden].
-
-    The features are `model.network.track_features`; the rows of nobody share one learned token.
-    """
-
-    def __init__(self, hidden_size: int) -> None:
-        super().__init__()
-        self.layers = _mlp(len(TRACK_FEATURES), hidden_size)
-
-    def forward(self, tracks: Tensor) -> Tensor:
-        """One token for each track, [b, 16, hidden]."""
-        embedding: Tensor = self.layers(tracks.to(next(self.parameters()).dtype))
         return embedding
 
 

@@ -25,11 +25,11 @@ from model.driving.facts import (
     WALKERS,
 )
 from model.network.codec import TrajectoryCodec
+from model.network.intent import IntentTrunk
 from model.network.trajectory_head import TrajectoryHead
 
 PERCEPTION_FILE: Final = "perception.safetensors"
-_VERSION: Final = 1
-_PLAN_WIDTH: Final = 256
+_VERSION: Final = 2
 
 QUERY_FIELDS: Final = (
     *((LEAD_FIELDS,) * (len(LANES) * RANKS)),
@@ -49,24 +49,21 @@ class PerceptionHeads(nn.Module):
 
     Args:
         hidden: width of the tokens.
-        scene_tokens: how many there are; at least `len(QUERY_FIELDS)`.
+        queries: how many there are; at least `len(QUERY_FIELDS)`.
         codec: whose space trajectories are told in.
     """
 
-    def __init__(self, hidden: int, scene_tokens: int, codec: TrajectoryCodec) -> None:
+    def __init__(self, hidden: int, queries: int, codec: TrajectoryCodec) -> None:
         super().__init__()
-        if scene_tokens < len(QUERY_FIELDS):
+        if queries < len(QUERY_FIELDS):
             raise ValueError(
-                f"grounding needs a resampler of at least {len(QUERY_FIELDS)} tokens, got {scene_tokens}"
+                f"grounding needs a resampler of at least {len(QUERY_FIELDS)} queries, got {queries}"
             )
         self.facts = nn.ModuleList(nn.Linear(hidden, len(fields)) for fields in QUERY_FIELDS)
-        self.plan = nn.Sequential(
-            nn.Flatten(), nn.Dropout(0.3), nn.Linear(scene_tokens * hidden, _PLAN_WIDTH), nn.SiLU()
-        )
-        self.trajectory = TrajectoryHead(_PLAN_WIDTH, codec)
+        self.trajectory = TrajectoryHead(IntentTrunk.width, codec)
 
     def read(self, gathered: Tensor) -> Tensor:
-        """Facts [b, len(FACTS)], as logits or values, from gathered tokens [b, scene_tokens, hidden]."""
+        """Facts [b, len(FACTS)], as logits or values, from gathered tokens [b, queries, hidden]."""
         return torch.cat([head(gathered[:, place]) for place, head in enumerate(self.facts)], dim=1).float()
 
     def save(self, folder: Path) -> None:
@@ -75,7 +72,7 @@ class PerceptionHeads(nn.Module):
         save_file(state, folder / PERCEPTION_FILE, metadata={"looktwice": json.dumps({"version": _VERSION})})
 
 
-def load_heads(folder: Path, hidden: int, scene_tokens: int, codec: TrajectoryCodec) -> PerceptionHeads:
+def load_heads(folder: Path, hidden: int, queries: int, codec: TrajectoryCodec) -> PerceptionHeads:
     """The heads of a checkpoint's folder, for evaluation; raises `PerceptionError`."""
     path = folder / PERCEPTION_FILE
     if not path.is_file():
@@ -85,7 +82,7 @@ def load_heads(folder: Path, hidden: int, scene_tokens: int, codec: TrajectoryCo
             version = json.loads((file.metadata() or {}).get("looktwice", "{}")).get("version")
         if version != _VERSION:
             raise PerceptionError(f"{path} has version {version}; this LookTwice reads {_VERSION}")
-        heads = PerceptionHeads(hidden, scene_tokens, codec)
+        heads = PerceptionHeads(hidden, queries, codec)
         heads.load_state_dict(load_file(path))
     except (SafetensorError, json.JSONDecodeError, RuntimeError) as error:
         raise PerceptionError(f"{path} does not fit this checkpoint: {error}") from error

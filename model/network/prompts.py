@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from model.driving.tracks import MAX_TRACKS
+from model.network.intent import INTENT_TOKENS
 from model.network.settings import VlaSettings
 from model.network.vocabulary import (
     HISTORY,
@@ -30,7 +30,8 @@ TASKS: Final = {
 }
 """What is asked for, by response format."""
 
-_SYSTEM: Final = "You plan how this car drives."
+SYSTEM: Final = "You plan how this car drives."
+"""What the model is told it is."""
 
 
 class PromptError(ValueError):
@@ -55,7 +56,7 @@ def prompt_text(format: str, settings: VlaSettings, *, route: bool, tracks: bool
     if format not in TASKS:
         raise PromptError(f"no prompt is known for format {format!r}; known are {', '.join(TASKS)}")
     return (
-        f"{IM_START}system\n{_SYSTEM}{IM_END}\n"
+        f"{IM_START}system\n{SYSTEM}{IM_END}\n"
         f"{IM_START}user\n{TASKS[format]}\n"
         f"{_seen(settings)}"
         f"{motion_text(route=route, tracks=tracks)}"
@@ -73,5 +74,5 @@ def _seen(settings: VlaSettings) -> str:
 def motion_text(*, route: bool, tracks: bool = False) -> str:
     """The prompt's lines about the ego's motion and that of tracks: all there is without pictures."""
     way = f"route:{ROUTE_START}{ROUTE}{ROUTE_END}\n" if route else ""
-    around = f"tracks:{TRACKS_START}{TRACK * MAX_TRACKS}{TRACKS_END}\n" if tracks else ""
+    around = f"tracks:{TRACKS_START}{TRACK * INTENT_TOKENS}{TRACKS_END}\n" if tracks else ""
     return f"history:{HISTORY_START}{HISTORY}{HISTORY_END}\n{way}{around}"

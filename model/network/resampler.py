@@ -14,10 +14,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model.network.encoders import HistoryEncoder, RouteEncoder
+from model.network.intent import INTENT_TOKENS, IntentTrunk
 
 _HEADS: Final = 4
 _LAYERS: Final = 2
 _EPSILON: Final = 1e-6
+_AROUND: Final = 192
+"""What the gathered tokens are brought down to, to be planned by."""
 
 
 class SceneResampler(nn.Module):
@@ -26,12 +29,12 @@ class SceneResampler(nn.Module):
     Args:
         hidden_size: of vision tokens and of what comes out.
         vision_tokens: of a scene, all cameras together.
-        scene_tokens: how many come out.
+        scene_tokens: how many come out: one for each query, and `INTENT_TOKENS` that say what to do about it.
     """
 
     def __init__(self, hidden_size: int, vision_tokens: int, scene_tokens: int) -> None:
         super().__init__()
-        self.queries = nn.Parameter(0.3 * torch.randn(scene_tokens, hidden_size))
+        self.queries = nn.Parameter(0.3 * torch.randn(scene_tokens - INTENT_TOKENS, hidden_size))
         self.places = nn.Parameter(0.02 * torch.randn(vision_tokens, hidden_size))
         self.history_encoder = HistoryEncoder(hidden_size)
         self.route_encoder = RouteEncoder(hidden_size)
@@ -39,9 +42,15 @@ class SceneResampler(nn.Module):
         self.vision_norm = nn.RMSNorm(hidden_size, eps=_EPSILON)
         self.layers = nn.ModuleList(_CrossLayer(hidden_size) for _ in range(_LAYERS))
         self.norm = nn.RMSNorm(hidden_size, eps=_EPSILON)
+        self.intent = _SceneIntent(hidden_size, len(self.queries))
 
     def forward(self, vision_tokens: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
-        """What the queries gather, [b, scene_tokens, hidden].
+        """What stands in the prompt, [b, scene_tokens, hidden]; see `gather`."""
+        gathered = self.gather(vision_tokens, history, route, has_route)
+        return torch.cat([gathered, self.intent(gathered, history, route, has_route)], dim=1)
+
+    def gather(self, vision_tokens: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
+        """What the queries gather, [b, queries, hidden].
 
         Args:
             vision_tokens: [b, vision_tokens, hidden].
@@ -57,6 +66,26 @@ class SceneResampler(nn.Module):
             x = layer(x, seen)
         gathered: Tensor = self.norm(x)
         return gathered
+
+
+class _SceneIntent(nn.Module):
+    """What to do about what was gathered."""
+
+    def __init__(self, hidden_size: int, queries: int) -> None:
+        super().__init__()
+        self.around = nn.Sequential(nn.Linear(queries * hidden_size, _AROUND), nn.SiLU())
+        self.trunk = IntentTrunk(_AROUND)
+        self.tokens = nn.Linear(IntentTrunk.width, INTENT_TOKENS * hidden_size)
+
+    def state(self, gathered: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
+        """What to do, [b, 256], from gathered tokens [b, queries, hidden]; see `SceneResampler.gather`."""
+        state: Tensor = self.trunk(history, route, has_route, self.around(gathered.flatten(1)))
+        return state
+
+    def forward(self, gathered: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
+        """Tokens [b, INTENT_TOKENS, hidden]; see `state`."""
+        tokens: Tensor = self.tokens(self.state(gathered, history, route, has_route))
+        return tokens.unflatten(1, (INTENT_TOKENS, -1))
 
 
 class _CrossLayer(nn.Module):

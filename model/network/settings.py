@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from model.driving.scene import CAMERAS, CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE
+from model.network.intent import INTENT_TOKENS
 
 CONFIG_KEY: Final = "looktwice"
 """Where these settings lie in a checkpoint's ``config.json``."""
@@ -27,7 +28,7 @@ class VlaSettings:
         image_width, image_height: pixels that pictures are resized to; multiples of a merged patch.
         codec_size: trajectory codes per stage.
         with_route: whether it has a route encoder.
-        with_tracks: whether it has an encoder of tracks.
+        with_tracks: whether it has a reader of tracks.
         scene_tokens: 0 where every vision token stands in the prompt, as in Qwen2.5-VL; otherwise a
             resampler brings those of all cameras down to so many.
         patch_size, temporal_patch_size, spatial_merge_size, tokens_per_second: as in the backbone's
@@ -58,8 +59,10 @@ class VlaSettings:
             raise SettingsError(f"temporal_patch_size {self.temporal_patch_size} must divide {CLIP_FRAMES}")
         if unknown := [camera for camera in self.cameras if camera not in CAMERAS]:
             raise SettingsError(f"unknown camera {', '.join(unknown)}; known are {', '.join(CAMERAS)}")
-        if self.scene_tokens < 0:
-            raise SettingsError(f"scene_tokens must not be negative, got {self.scene_tokens}")
+        if self.scene_tokens and self.scene_tokens <= INTENT_TOKENS:
+            raise SettingsError(
+                f"scene_tokens must be 0 or more than the intent's {INTENT_TOKENS}, got {self.scene_tokens}"
+            )
         if not self.cameras or not self.formats:
             raise SettingsError("a checkpoint needs at least one camera and one response format")
 
@@ -82,6 +85,11 @@ class VlaSettings:
     def vision_tokens(self) -> int:
         """Vision tokens of all clips."""
         return len(self.cameras) * self.clip_tokens
+
+    @property
+    def scene_queries(self) -> int:
+        """Queries of the resampler: scene tokens but for those of the intent."""
+        return max(0, self.scene_tokens - INTENT_TOKENS)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -121,6 +129,6 @@ class VlaSettings:
 
 
 NANO_SETTINGS: Final = VlaSettings(
-    image_width=336, image_height=168, temporal_patch_size=4, with_tracks=True, scene_tokens=16
+    image_width=336, image_height=168, temporal_patch_size=4, with_tracks=True, scene_tokens=18
 )
 """Of the model that is trained from scratch: motion is seen within one patch, over all four frames."""

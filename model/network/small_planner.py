@@ -22,27 +22,16 @@ from torch import Tensor, nn
 
 from model.driving.facts import FACTS
 from model.driving.scene import Scene, SceneError
-from model.driving.tracks import MAX_TRACKS
-from model.driving.trajectory import (
-    FUTURE_STEPS,
-    HISTORY_STEPS,
-    ROUTE_POINTS,
-    ROUTE_SPACING_M,
-    STEP_S,
-    FloatArray,
-)
+from model.driving.trajectory import FUTURE_STEPS, FloatArray
 from model.network.codec import CodecError, TrajectoryCodec
-from model.network.track_features import TRACK_FEATURES, track_features
+from model.network.intent import IntentTrunk, TrackPool, present_speeds
+from model.network.track_features import track_features
 from model.network.trajectory_head import Guesses, TrajectoryHead
 
 SmallKind = Literal["blind", "teacher", "facts"]
 DRIVING_KINDS: Final[tuple[SmallKind, ...]] = ("blind", "teacher")
 WEIGHTS_FILE: Final = "planner.safetensors"
-_VERSION: Final = 1
-_TRACK_WIDTH: Final = 96
-_WIDTH: Final = 256
-_POSE_SCALE: Final = (10.0, 2.0, 0.3)
-_OUTLIER: Final = 6.0
+_VERSION: Final = 2
 
 
 class SmallPlannerError(ValueError):
@@ -72,7 +61,7 @@ class SmallInputs:
     @property
     def speeds_ms(self) -> Tensor:
         """Present speeds [b]."""
-        return -self.history[:, -4, 0] / (3 * STEP_S)
+        return present_speeds(self.history)
 
 
 class SmallPlanner(nn.Module):
@@ -87,43 +76,21 @@ class SmallPlanner(nn.Module):
     def __init__(self, kind: SmallKind, codec: TrajectoryCodec, dropout: float = 0.2) -> None:
         super().__init__()
         self.kind, self.codec = kind, codec
-        inputs = 3 * (2 * HISTORY_STEPS - 1) + 2 * 2 * ROUTE_POINTS
-        self.tracks: nn.Sequential | None = None
-        if kind == "teacher":
-            self.tracks = nn.Sequential(
-                nn.Linear(len(TRACK_FEATURES) + 1, _TRACK_WIDTH),
-                nn.SiLU(),
-                nn.Linear(_TRACK_WIDTH, _TRACK_WIDTH),
-                nn.SiLU(),
-                nn.Linear(_TRACK_WIDTH, _TRACK_WIDTH),
-            )
-            inputs += 2 * _TRACK_WIDTH
-        if kind == "facts":
-            inputs += len(FACTS)
-        layers: list[nn.Module] = []
-        for width in (inputs, _WIDTH, _WIDTH):
-            layers += [nn.Linear(width, _WIDTH), nn.LayerNorm(_WIDTH), nn.SiLU(), nn.Dropout(dropout)]
-        self.trunk = nn.Sequential(*layers[:-1])
-        self.head = TrajectoryHead(_WIDTH, codec)
+        self.pool = TrackPool() if kind == "teacher" else None
+        around = {"blind": 0, "teacher": TrackPool.size, "facts": len(FACTS)}[kind]
+        self.trunk = IntentTrunk(around, dropout)
+        self.head = TrajectoryHead(IntentTrunk.width, codec)
 
     def forward(self, inputs: SmallInputs) -> Guesses:
         """Guesses for a batch."""
-        poses = inputs.history[..., [0, 1, 3]]
-        scale = poses.new_tensor(_POSE_SCALE)
-        straight = ROUTE_SPACING_M * torch.arange(1, ROUTE_POINTS + 1, device=poses.device)
-        aside = inputs.route - torch.stack([straight, torch.zeros_like(straight)], dim=1)
-        parts = [poses / scale, poses.diff(dim=1) / STEP_S / scale, inputs.route / 40, aside / 4]
-        features = torch.cat([part.flatten(1) for part in parts], dim=1).clamp(-_OUTLIER, _OUTLIER)
-        if self.tracks is not None:
-            speeds = (inputs.speeds_ms / 20)[:, None, None].expand(-1, MAX_TRACKS, 1)
-            each = self.tracks(torch.cat([inputs.tracks, speeds], dim=2))
-            there = inputs.tracks[..., :1]
-            most = each.masked_fill(there == 0, -5.0).amax(dim=1)
-            features = torch.cat([features, most, (each * there).sum(dim=1) / 4], dim=1)
-        if self.kind == "facts":
+        around = None
+        if self.pool is not None:
+            around = self.pool(inputs.tracks, inputs.history)
+        elif self.kind == "facts":
             assert inputs.facts is not None, "this planner needs facts"
-            features = torch.cat([features, inputs.facts], dim=1)
-        guesses: Guesses = self.head(self.trunk(features))
+            around = inputs.facts
+        has_route = torch.ones(len(inputs.route), dtype=torch.bool, device=inputs.route.device)
+        guesses: Guesses = self.head(self.trunk(inputs.history, inputs.route, has_route, around))
         return guesses
 
     @torch.inference_mode()

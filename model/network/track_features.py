@@ -37,6 +37,7 @@ MIRRORED: Final = tuple(
     TRACK_FEATURES.index(name) for name in ("y", "sin_heading", "left", "speed_left", "indicator")
 )
 """Columns that change sign where left and right are swapped."""
+_OF_ROUTE: Final = slice(TRACK_FEATURES.index("on_route"), TRACK_FEATURES.index("speed_left") + 1)
 _STANDING_MS: Final = 0.3
 
 
@@ -78,3 +79,10 @@ def track_features(tracks: Sequence[Track], route: FloatArray | None) -> FloatAr
             abs(track.speed_ms) < _STANDING_MS,
         )
     return features
+
+
+def without_route(features: FloatArray) -> FloatArray:
+    """A copy of what `track_features` gave for a route, as it gives it for none."""
+    copied = features.copy()
+    copied[..., _OF_ROUTE] = 0.0
+    return copied

@@ -15,8 +15,9 @@ from torch import Tensor, nn
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
 from model.driving.trajectory import ROUTE_POINTS, FloatArray
-from model.network.encoders import HistoryEncoder, RouteEncoder, TrackEncoder
+from model.network.encoders import HistoryEncoder, RouteEncoder
 from model.network.inputs import ModelInputs, Prompt, rotary_positions
+from model.network.intent import TrackReader
 from model.network.resampler import SceneResampler
 from model.network.settings import CONFIG_KEY, VlaSettings
 from model.network.vision import attends_to_whole_pictures, encode_pictures, normalised
@@ -67,7 +68,7 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         hidden_size = config.text_config.hidden_size
         self.history_encoder = HistoryEncoder(hidden_size)
         self.route_encoder = RouteEncoder(hidden_size) if self.settings.with_route else None
-        self.track_encoder = TrackEncoder(hidden_size) if self.settings.with_tracks else None
+        self.track_reader = TrackReader(hidden_size) if self.settings.with_tracks else None
         self.track_token_id: int | None = extra.get("track_token_id")
         self.resampler = (
             SceneResampler(hidden_size, self.settings.vision_tokens, self.settings.scene_tokens)
@@ -118,7 +119,7 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         embeddings: Tensor = self.get_input_embeddings()(input_ids)
         if vision_tokens is not None and self.resampler is not None:
             assert history is not None, "the resampler needs the history"
-            vision_tokens = self.resample(vision_tokens, history, route, input_ids)
+            vision_tokens = self.resample(vision_tokens, *self._way(history, route, input_ids))
         if vision_tokens is not None:
             here = (input_ids == self.config.video_token_id)[..., None]
             embeddings = embeddings.masked_scatter(here, vision_tokens.to(embeddings.dtype))
@@ -129,28 +130,27 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
             if values is not None and encoder is not None:
                 here = (input_ids == token_id)[..., None]
                 embeddings = torch.where(here, encoder(values)[:, None].to(embeddings.dtype), embeddings)
-        if tracks is not None and self.track_encoder is not None:
+        if tracks is not None and self.track_reader is not None:
+            assert history is not None, "the reader of tracks needs the history"
             places = torch.eq(input_ids, self.track_token_id or 0)
-            tokens = self.track_encoder(tracks[places.any(dim=1)]).to(embeddings.dtype)
+            rows = places.any(dim=1)
+            way = (part[rows] for part in self._way(history, route, input_ids))
+            tokens = self.track_reader(tracks[rows], *way).to(embeddings.dtype)
             embeddings = embeddings.masked_scatter(places[..., None], tokens)
         return embeddings
 
-    def resample(
-        self, vision_tokens: Tensor, history: Tensor, route: Tensor | None, input_ids: Tensor
-    ) -> Tensor:
-        """What the resampler gathers from the clips of whole scenes, [b x scene_tokens, hidden].
-
-        A row looks along its route where its prompt [b, t] has the route's token.
-        """
+    def resample(self, vision_tokens: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
+        """What the resampler makes of the clips of whole scenes, [b x scene_tokens, hidden]."""
         assert self.resampler is not None
-        rows = len(input_ids)
+        tokens = vision_tokens.view(len(history), self.settings.vision_tokens, -1)
+        resampled: Tensor = self.resampler(tokens, history, route, has_route)
+        return resampled.flatten(0, 1)
+
+    def _way(self, history: Tensor, route: Tensor | None, input_ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """History, route and which rows have one: those whose prompt [b, t] has the route's token."""
         if route is None:
-            route, has_route = history.new_zeros(rows, ROUTE_POINTS, 2), input_ids.new_zeros(rows).bool()
-        else:
-            has_route = (input_ids == self.route_token_id).any(dim=1)
-        tokens = vision_tokens.view(rows, self.settings.vision_tokens, -1)
-        gathered: Tensor = self.resampler(tokens, history, route, has_route)
-        return gathered.flatten(0, 1)
+            route = history.new_zeros(len(input_ids), ROUTE_POINTS, 2)
+        return history, route, (input_ids == self.route_token_id).any(dim=1)
 
     def encode_prompt_embeddings(self, inputs: ModelInputs) -> PromptEmbeddings:
         """One scene's prompt, ready to be prefilled."""

@@ -19,7 +19,7 @@ from model.network.codec import TrajectoryCodec
 from model.network.inputs import InputBuilder
 from model.network.patches import patchify
 from model.network.prompts import motion_text
-from model.network.track_features import MIRRORED
+from model.network.track_features import MIRRORED, without_route
 from model.network.vocabulary import Vocabulary
 from model.training.examples import Examples, example_frames
 from model.training.soft_codes import SoftCodes
@@ -129,9 +129,9 @@ class ResponseDataset(Dataset[Sample]):
         history, future = examples.history[index], examples.future[index]
         route, tracks = np.nan_to_num(examples.route[index]), examples.tracks[index]
         plan = examples.plan(index)
+        tracks = tracks.copy() if item.route else without_route(tracks)
         if item.mirror:
             history, future, route = history * _MIRROR, future * _MIRROR, route * _MIRROR[:2]
-            tracks = tracks.copy()
             tracks[:, MIRRORED] *= -1
             plan = plan.mirrored()
         if item.blur:

@@ -165,21 +165,21 @@ class GroundingLearner(nn.Module):
         text: Any = vla.config.text_config
         hidden = text.hidden_size
         self.dense_head = nn.Linear(hidden * slices, self._cell[0] * self._cell[1] * (_CLASSES + 3))
-        self.heads = PerceptionHeads(hidden, settings.scene_tokens, codec)
-        self.register_buffer("fact_weights", torch.tensor([_weight(name) for name in FACTS]))
+        self.heads = PerceptionHeads(hidden, len(self.resampler.queries), codec)
+        self.register_buffer("fact_weights", fact_weights())
 
     fact_weights: Tensor
 
     def gather(
         self, patches: Tensor, history: Tensor, route: Tensor, has_route: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Vision tokens [b, v, hidden] and gathered tokens [b, scene_tokens, hidden] of scenes."""
+        """Vision tokens [b, v, hidden] and gathered tokens [b, queries, hidden] of scenes."""
         vla = self._vla[0]
         settings = vla.settings
         clips = len(history) * len(settings.cameras)
         tokens = vla.vision(patches, torch.tensor([settings.grid] * clips))
         tokens = tokens.view(len(history), settings.vision_tokens, -1)
-        return tokens, self.resampler(tokens, history, route, has_route)
+        return tokens, self.resampler.gather(tokens, history, route, has_route)
 
     def forward(
         self,
@@ -211,7 +211,8 @@ class GroundingLearner(nn.Module):
         motion_loss = (moved * agents).sum() / agents.sum().clamp_min(1)
         of_facts = fact_loss(self.heads.read(gathered), facts, self.fact_weights)
         speeds = -history[:, -4, 0] / (3 * STEP_S)
-        guesses = self.heads.trajectory(self.heads.plan(gathered).float())
+        state = self.resampler.intent.state(gathered, history, route, has_route)
+        guesses = self.heads.trajectory(state.float())
         planned = self.heads.trajectory.loss(guesses, speeds, futures)
         loss = class_loss + range_loss + _MOTION_WEIGHT * motion_loss + of_facts
         return {
@@ -232,6 +233,11 @@ class GroundingLearner(nn.Module):
         dense: Tensor = self.dense_head(beside).float()
         dense = dense.view(*dense.shape[:-1], *self._cell, _CLASSES + 3)
         return dense.permute(0, 1, 2, 4, 3, 5, 6).reshape(*shape, _CLASSES + 3)
+
+
+def fact_weights() -> Tensor:
+    """How much each fact counts, [facts]."""
+    return torch.tensor([_weight(name) for name in FACTS])
 
 
 def _weight(name: str) -> float:

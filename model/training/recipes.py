@@ -14,7 +14,7 @@ from typing import Final, Literal
 
 from model.training.targets import PAPER_WEIGHTS, SectionWeights, Task
 
-Goal = Literal["ground", "respond"]
+Goal = Literal["ground", "read", "respond"]
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,8 @@ class Recipe:
 
     Attributes:
         name: as the command line gives it.
-        goal: ``ground`` trains the vision tower alone, ``respond`` trains everything on responses.
+        goal: ``ground`` trains the vision tower alone, ``read`` what to do about tracks or, with pictures,
+            about what was gathered from them, ``respond`` trains everything on responses.
         pictures: whether responses are learned with pictures.
         tasks: share of the examples for each response format.
         route_share: share of the examples whose route is given.
@@ -91,6 +92,18 @@ _NANO: Final = Recipe(
     head_weight=0.25,
 )
 
+_READ: Final = Recipe(
+    "read",
+    "read",
+    steps=6000,
+    batch_size=256,
+    learning_rate=1e-3,
+    warmup_steps=200,
+    route_share=0.85,
+    vision_rate=0.0,
+    mirror_share=0.5,
+)
+
 NANO: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe
     for recipe in _with_control(
@@ -101,8 +114,11 @@ NANO: Final[Mapping[str, Recipe]] = {
             learning_rate=1e-3,
             pictures=False,
             tasks={"traj_only": 0.65, "cf_vla": 0.35},
+            tracks_share=0.75,
         ),
         Recipe("ground", "ground", steps=6000, batch_size=24, learning_rate=1e-3, warmup_steps=200),
+        replace(_READ, name="read-tracks", pictures=False, steps=6000, batch_size=256),
+        replace(_READ, name="read-scene", steps=4000, batch_size=64),
         replace(_NANO, name="traj-only", steps=3000, tasks={"traj_only": 1.0}),
         replace(_NANO, name="meta-act"),
         replace(_NANO, name="counterfactual", steps=3000, learning_rate=2.5e-4, reflections="learned"),

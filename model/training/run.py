@@ -21,7 +21,7 @@ from model.driving.scene import LabelledScene
 from model.network.attention import MATMUL_ATTENTION
 from model.network.checkpoint import Loaded, create_nano, load, save
 from model.network.codec import TrajectoryCodec
-from model.network.corpus import nano_corpus
+from model.network.corpus import nano_corpus, nano_phrases
 from model.network.perception import PERCEPTION_FILE
 from model.network.settings import NANO_SETTINGS
 from model.network.vla import LookTwiceVla
@@ -30,6 +30,7 @@ from model.training.batches import ResponseDataset, TaskSampler, collate
 from model.training.dense import DENSE_SHAPE
 from model.training.examples import Examples, load_examples
 from model.training.grounding import GroundingDataset, GroundingLearner, collate_grounding
+from model.training.intents import IntentDataset, IntentLearner, Source, collate_intents
 from model.training.learner import ResponseLearner
 from model.training.recipes import Recipe
 from model.training.reflections import OnExamples, reflections_on
@@ -66,7 +67,7 @@ def create(
     """Write an untrained nano checkpoint whose codec is fitted to ``scenes``; returns the codec's error."""
     examples = load_examples(scenes, cache, NANO_SETTINGS.cameras)
     codec = TrajectoryCodec.fit(examples.history, examples.future, size=codec_size, seed=seed)
-    vocabulary = Vocabulary(build_nano_tokenizer(nano_corpus(), codec_size))
+    vocabulary = Vocabulary(build_nano_tokenizer(nano_corpus(), codec_size, phrases=nano_phrases()))
     create_nano(target, codec, vocabulary, seed, replace(NANO_SETTINGS, codec_size=codec_size))
     return codec.reconstruction_error(examples.history, examples.future)
 
@@ -188,6 +189,11 @@ def _prepare(
     vision = None
     if recipe.pictures and recipe.vision_rate == 0:
         vision = open_vision(loaded, examples, settings.cache, mirrored=recipe.mirror_share > 0)
+    if recipe.goal == "read":
+        source: Source = "scene" if recipe.pictures else "tracks"
+        reading = IntentLearner(loaded.model, loaded.codec, source)
+        read = IntentDataset(examples, vision, recipe.route_share, recipe.seed)
+        return reading, read, None, collate_intents
     responses = ResponseDataset(
         examples,
         loaded.codec,
@@ -215,6 +221,8 @@ def _prepare(
     )
     for part in vision_parts(loaded.model):
         part.requires_grad_(recipe.vision_rate > 0)
+    if loaded.model.resampler is not None:
+        loaded.model.resampler.intent.requires_grad_(True)
     learner = ResponseLearner(
         loaded.model,
         loaded.vocabulary,

@@ -132,8 +132,8 @@ class LearnerTrainer(Trainer):
 
 
 def is_vision(name: str) -> bool:
-    """Whether a weight of a response learner belongs to the tower or the resampler."""
-    return ".visual." in name or ".resampler." in name
+    """Whether a weight of a response learner belongs to the tower or to the resampler's queries."""
+    return ".visual." in name or (".resampler." in name and ".intent." not in name)
 
 
 class _Frugal(TrainerCallback):

@@ -35,7 +35,9 @@ def tell_perception(
     """
     loaded = load(checkpoint)
     config: VlaConfig = loaded.model.config
-    heads = load_heads(checkpoint, config.text_config.hidden_size, loaded.settings.scene_tokens, loaded.codec)
+    heads = load_heads(
+        checkpoint, config.text_config.hidden_size, loaded.settings.scene_queries, loaded.codec
+    )
 
     def reading(what: str, of: Iterable[LabelledScene], count: int) -> Reading:
         # Progress goes to stderr, so that stdout holds nothing but the table.

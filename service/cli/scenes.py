@@ -35,7 +35,8 @@ def generate(
     ] = False,
     width: Annotated[int, typer.Option(help="Width of the pictures in pixels, twice their height.")] = 224,
     dense: Annotated[
-        bool, typer.Option(help="Store classes, ranges and motion of every picture cell, which `ground` needs.")
+        bool,
+        typer.Option(help="Store what each picture cell shows, which `ground` needs."),
     ] = True,
 ) -> None:
     """Drive episodes in MetaDrive and store their scenes; run again after a kill, it resumes."""

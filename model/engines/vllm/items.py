@@ -11,6 +11,7 @@ import numpy.typing as npt
 from model.driving.tracks import MAX_TRACKS
 from model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS
 from model.network.inputs import ModelInputs
+from model.network.intent import INTENT_TOKENS
 from model.network.settings import VlaSettings
 from model.network.track_features import TRACK_FEATURES
 from model.network.vocabulary import HISTORY, ROUTE, TRACK, VIDEO_PAD
@@ -73,8 +74,13 @@ def kinds_of(settings: VlaSettings) -> dict[str, Kind]:
     if settings.with_route:
         kinds["route"] = Kind(1, 1, {"route": route})
     if settings.with_tracks:
-        tracks: dict[str, Form] = {"tracks": ((MAX_TRACKS, len(TRACK_FEATURES)), np.float32)}
-        kinds["tracks"] = Kind(MAX_TRACKS, 1, tracks)
+        tracks: dict[str, Form] = {
+            "tracks": ((MAX_TRACKS, len(TRACK_FEATURES)), np.float32),
+            "tracks_history": history,
+            "tracks_route": route,
+            "tracks_has_route": ((), np.bool_),
+        }
+        kinds["tracks"] = Kind(INTENT_TOKENS, 1, tracks)
     return kinds
 
 
@@ -84,8 +90,8 @@ Arrays = dict[str, npt.NDArray[Any]]
 def items_of(inputs: ModelInputs, settings: VlaSettings) -> dict[str, Arrays]:
     """A scene's arrays [items, ...] by modality and name."""
     items: dict[str, Arrays] = {}
+    route = np.zeros((ROUTE_POINTS, 2), np.float32) if inputs.route is None else inputs.route
     if settings.scene_tokens:
-        route = np.zeros((ROUTE_POINTS, 2), np.float32) if inputs.route is None else inputs.route
         items[SCENE] = {
             "scene_patches": inputs.patches[None],
             "scene_history": inputs.history[None],
@@ -103,5 +109,10 @@ def items_of(inputs: ModelInputs, settings: VlaSettings) -> dict[str, Arrays]:
     if inputs.route is not None:
         items["route"] = {"route": inputs.route[None]}
     if inputs.tracks is not None:
-        items["tracks"] = {"tracks": inputs.tracks[None]}
+        items["tracks"] = {
+            "tracks": inputs.tracks[None],
+            "tracks_history": inputs.history[None],
+            "tracks_route": route[None],
+            "tracks_has_route": np.array([inputs.route is not None]),
+        }
     return items

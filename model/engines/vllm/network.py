@@ -25,7 +25,8 @@ from vllm.multimodal.processing import (
 )
 
 from model.engines.vllm.items import CLIPS, PLACEHOLDERS, kinds_of
-from model.network.encoders import HistoryEncoder, RouteEncoder, TrackEncoder
+from model.network.encoders import HistoryEncoder, RouteEncoder
+from model.network.intent import TrackReader
 from model.network.resampler import SceneResampler
 from model.network.settings import VlaSettings
 from model.network.vision import normalised
@@ -139,7 +140,7 @@ class LookTwiceForVllm(Qwen2_5_VLForConditionalGeneration):
             if settings.with_route:
                 self.route_encoder = RouteEncoder(hidden_size)
             if settings.with_tracks:
-                self.track_encoder = TrackEncoder(hidden_size)
+                self.track_reader = TrackReader(hidden_size)
             if settings.scene_tokens:
                 self.resampler = SceneResampler(hidden_size, settings.vision_tokens, settings.scene_tokens)
 
@@ -168,7 +169,8 @@ class LookTwiceForVllm(Qwen2_5_VLForConditionalGeneration):
                 encoder = getattr(self, f"{kind}_encoder")
                 embeddings += tuple(encoder(values.to(device))[:, None])
         if (values := kwargs.get("tracks")) is not None:
-            embeddings += tuple(self.track_encoder(values.to(device)))
+            way = (kwargs[f"tracks_{name}"].to(device) for name in ("history", "route", "has_route"))
+            embeddings += tuple(self.track_reader(values.to(device), *way))
         return embeddings
 
     def _vision(self, patches: Tensor, clips: int) -> Tensor:

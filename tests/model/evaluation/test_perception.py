@@ -95,7 +95,7 @@ def test_facts_are_read_from_pictures(resampling_checkpoint: Path) -> None:
     config: VlaConfig = loaded.model.config
     hidden = config.text_config.hidden_size
     torch.manual_seed(0)
-    heads = PerceptionHeads(hidden, loaded.settings.scene_tokens, loaded.codec).eval()
+    heads = PerceptionHeads(hidden, loaded.settings.scene_queries, loaded.codec).eval()
     done: list[int] = []
     routed = [labelled for labelled in BUNDLED if labelled.scene.route is not None]
     unrouted = replace(routed[0], scene=replace(routed[0].scene, route=None))

@@ -108,5 +108,5 @@ def test_heads_are_read_back_and_foreign_ones_refused(loaded: Loaded, tmp_path: 
 
 
 def test_too_few_gathered_tokens_are_refused(loaded: Loaded) -> None:
-    with pytest.raises(ValueError, match="at least 12 tokens, got 4"):
+    with pytest.raises(ValueError, match="at least 12 queries, got 4"):
         PerceptionHeads(256, 4, loaded.codec)

@@ -80,7 +80,9 @@ def test_perception_needs_a_grounded_checkpoint_and_tells_facts_and_gate(
     shutil.copytree(resampling_checkpoint, grounded)
     loaded = load(grounded)
     config: VlaConfig = loaded.model.config
-    PerceptionHeads(config.text_config.hidden_size, loaded.settings.scene_tokens, loaded.codec).save(grounded)
+    PerceptionHeads(config.text_config.hidden_size, loaded.settings.scene_queries, loaded.codec).save(
+        grounded
+    )
     gate = ["--limit", "4", "--gate-scenes", str(SCENES), "--gate-steps", "20"]
     result = CliRunner().invoke(app, [*asked, str(grounded), *gate])
     assert result.exit_code == 0, result.output

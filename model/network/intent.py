@@ -1,0 +1,129 @@
+"""What to do about what is known, in a vector: a small planner inside the network.
+
+A decoder learns from a few responses a second; a multilayer perceptron over history, route and what is
+around learns from thousands, and plans in metres far better than a decoder that starts from nothing. So
+this trunk learns first (recipes ``read-tracks`` and ``read-scene``), and its state stands in the prompt as
+continuous tokens: the decoder only has to put it into words and codes.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+
+from model.driving.tracks import MAX_TRACKS
+from model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS, ROUTE_SPACING_M, STEP_S
+from model.network.track_features import TRACK_FEATURES
+
+INTENT_TOKENS: Final = 2
+"""Tokens of the prompt that one state becomes."""
+_TRACK_WIDTH: Final = 96
+_WIDTH: Final = 256
+_POSE_SCALE: Final = (10.0, 2.0, 0.3)
+_OUTLIER: Final = 6.0
+MOTION_FEATURES: Final = 3 * (2 * HISTORY_STEPS - 1) + 2 * 2 * ROUTE_POINTS + 1
+
+
+def motion_features(history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
+    """History and route as numbers of order one, [b, MOTION_FEATURES].
+
+    Args:
+        history: [b, 16, 4].
+        route: [b, 20, 2]; rows without one are ignored.
+        has_route: bool [b].
+    """
+    poses = history[..., [0, 1, 3]].float()
+    scale = poses.new_tensor(_POSE_SCALE)
+    straight = ROUTE_SPACING_M * torch.arange(1, ROUTE_POINTS + 1, device=poses.device)
+    aside = route.float() - torch.stack([straight, torch.zeros_like(straight)], dim=1)
+    known = has_route[:, None].float()
+    parts = [(poses / scale).flatten(1), (poses.diff(dim=1) / STEP_S / scale).flatten(1)]
+    parts += [(route.float() / 40).flatten(1) * known, (aside / 4).flatten(1) * known, known]
+    return torch.cat(parts, dim=1).clamp(-_OUTLIER, _OUTLIER)
+
+
+def present_speeds(history: Tensor) -> Tensor:
+    """Metres a second [b] at the end of histories [b, 16, 4]."""
+    return -history[:, -4, 0] / (3 * STEP_S)
+
+
+class TrackPool(nn.Module):
+    """A set of tracks [b, 16, features] as one vector [b, 2 x 96], whatever their order."""
+
+    size: Final = 2 * _TRACK_WIDTH
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.each = nn.Sequential(
+            nn.Linear(len(TRACK_FEATURES) + 1, _TRACK_WIDTH),
+            nn.SiLU(),
+            nn.Linear(_TRACK_WIDTH, _TRACK_WIDTH),
+            nn.SiLU(),
+            nn.Linear(_TRACK_WIDTH, _TRACK_WIDTH),
+        )
+
+    def forward(self, tracks: Tensor, history: Tensor) -> Tensor:
+        """The vector of each set; ``history`` [b, 16, 4] tells how fast the ego is."""
+        speeds = (present_speeds(history) / 20)[:, None, None].expand(-1, MAX_TRACKS, 1)
+        numbers = torch.cat([tracks, speeds.to(tracks.dtype)], dim=2)
+        each = self.each(numbers.to(next(self.parameters()).dtype))
+        there = tracks[..., :1].to(each.dtype)
+        most = each.masked_fill(there == 0, -5.0).amax(dim=1)
+        return torch.cat([most, (each * there).sum(dim=1) / 4], dim=1)
+
+
+class IntentTrunk(nn.Module):
+    """A multilayer perceptron from history, route and a vector of what is around to a state [b, 256].
+
+    Args:
+        around: size of the vector of what is around; 0 where nothing but history and route is known.
+        dropout: in training.
+    """
+
+    width: Final = _WIDTH
+
+    def __init__(self, around: int, dropout: float = 0.0) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for width in (MOTION_FEATURES + around, _WIDTH, _WIDTH):
+            layers += [nn.Linear(width, _WIDTH), nn.LayerNorm(_WIDTH), nn.SiLU(), nn.Dropout(dropout)]
+        self.layers = nn.Sequential(*layers[:-1])
+
+    def forward(
+        self, history: Tensor, route: Tensor, has_route: Tensor, around: Tensor | None = None
+    ) -> Tensor:
+        """States of a batch; see `motion_features`. ``around`` [b, size]."""
+        features = motion_features(history, route, has_route)
+        if around is not None:
+            features = torch.cat([features, around.float()], dim=1)
+        state: Tensor = self.layers(features.to(next(self.parameters()).dtype))
+        return state
+
+
+class TrackReader(nn.Module):
+    """A scene's tracks as tokens of the prompt, read with the ego's history and route in mind."""
+
+    def __init__(self, hidden_size: int) -> None:
+        super().__init__()
+        self.pool = TrackPool()
+        self.trunk = IntentTrunk(TrackPool.size)
+        self.tokens = nn.Linear(IntentTrunk.width, INTENT_TOKENS * hidden_size)
+
+    def state(self, tracks: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
+        """What to do, [b, 256]; see `forward`."""
+        state: Tensor = self.trunk(history, route, has_route, self.pool(tracks, history))
+        return state
+
+    def forward(self, tracks: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
+        """Tokens [b, INTENT_TOKENS, hidden].
+
+        Args:
+            tracks: [b, 16, features] of `track_features`.
+            history: [b, 16, 4].
+            route: [b, 20, 2]; rows without one are ignored.
+            has_route: bool [b].
+        """
+        tokens: Tensor = self.tokens(self.state(tracks, history, route, has_route))
+        return tokens.unflatten(1, (INTENT_TOKENS, -1))

@@ -1,0 +1,180 @@
+"""Learning what to do about what is known, thousands of scenes a second: before a decoder puts it into words.
+
+The reader of tracks and the intent of the gathered tokens (`model.network.intent`) learn the expert's
+trajectory in metres, its plan's words bin by bin, and the facts that decide them, with heads that are thrown
+away afterwards. Tower and queries stay as they are.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.utils.data import Dataset
+
+from model.driving.facts import FACTS, mirrored
+from model.driving.plan import GROUPS, TICKS, WORDS
+from model.network.codec import TrajectoryCodec
+from model.network.intent import IntentTrunk, present_speeds
+from model.network.track_features import MIRRORED, without_route
+from model.network.trajectory_head import TrajectoryHead
+from model.network.vla import LookTwiceVla
+from model.training.examples import Examples
+from model.training.grounding import fact_loss, fact_weights
+from model.training.vision_cache import VisionCache
+
+Source = Literal["tracks", "scene"]
+_DROPOUT: Final = 0.2
+_WORDS_WEIGHT: Final = 2.0
+_FACTS_WEIGHT: Final = 0.5
+_MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
+"""Of poses (x, y, z, heading)."""
+
+
+class IntentSample(NamedTuple):
+    """One scene; shapes as in `Examples`, for one example."""
+
+    history: npt.NDArray[np.float32]
+    route: npt.NDArray[np.float32]
+    has_route: npt.NDArray[np.bool_]
+    tracks: npt.NDArray[np.float32]
+    futures: npt.NDArray[np.float32]
+    plan_bins: npt.NDArray[np.int8]
+    facts: npt.NDArray[np.float32]
+    seen: npt.NDArray[np.float16]
+
+
+class IntentDataset(Dataset[IntentSample]):
+    """All examples, each time mirrored or not and with or without its route, by chance.
+
+    Args:
+        examples: to learn from.
+        vision: what a frozen tower sees in them and in their mirror images; None to learn from tracks alone.
+        route_share: share that is given its route.
+        seed: of what is left to chance.
+    """
+
+    def __init__(
+        self, examples: Examples, vision: VisionCache | None, route_share: float, seed: int = 0
+    ) -> None:
+        self._examples, self._vision, self._route_share = examples, vision, route_share
+        self._random = np.random.default_rng(seed)
+        self._mirrored_bins = np.stack([examples.plan(i).mirrored().bins() for i in range(len(examples))])
+        self._nothing = np.zeros((0, 0), np.float16)
+
+    def __len__(self) -> int:
+        return len(self._examples)
+
+    def __getitem__(self, index: int) -> IntentSample:
+        chance = self._random.random(2)
+        return self.look(index, mirror=bool(chance[0] < 0.5), route=bool(chance[1] < self._route_share))
+
+    def look(self, index: int, *, mirror: bool, route: bool) -> IntentSample:
+        """One example as it is asked for."""
+        examples = self._examples
+        has_route = route and bool(np.isfinite(examples.route[index]).all())
+        history, future = examples.history[index], examples.future[index]
+        way, facts = np.nan_to_num(examples.route[index]), examples.facts[index]
+        tracks, bins = examples.tracks[index].copy(), examples.plan_bins[index]
+        if not has_route:
+            tracks = without_route(tracks)
+        if mirror:
+            history, future, way = history * _MIRROR, future * _MIRROR, way * _MIRROR[:2]
+            tracks[:, MIRRORED] *= -1
+            bins, facts = self._mirrored_bins[index], mirrored(facts)
+        seen = self._nothing if self._vision is None else self._vision.tokens(index, mirror)
+        return IntentSample(history, way, np.array(has_route), tracks, future, bins, facts, seen)
+
+
+def collate_intents(samples: list[IntentSample]) -> dict[str, Tensor]:
+    """Stack samples."""
+    columns = dict(zip(IntentSample._fields, zip(*samples, strict=True), strict=True))
+    return {name: torch.from_numpy(np.stack(values)) for name, values in columns.items()}
+
+
+class IntentLearner(nn.Module):
+    """One source's trunk with its heads; outputs the loss and its parts.
+
+    Args:
+        vla: its reader of tracks, or its resampler's intent, is trained in place.
+        codec: in whose space trajectories are drawn.
+        source: what is read.
+
+    Raises:
+        ValueError: the checkpoint has no such part.
+    """
+
+    def __init__(self, vla: LookTwiceVla, codec: TrajectoryCodec, source: Source) -> None:
+        super().__init__()
+        if (vla.track_reader if source == "tracks" else vla.resampler) is None:
+            raise ValueError(f"this checkpoint reads no {source}")
+        self._source = source
+        # Kept out of the registered modules: only the part that learns is trained and saved with the state.
+        self._vla: list[LookTwiceVla] = [vla]
+        part: Any = vla.track_reader if source == "tracks" else vla.resampler.intent  # type: ignore[union-attr]
+        self.part = part
+        width = IntentTrunk.width
+        self.trajectory = TrajectoryHead(width, codec)
+        self.words = nn.Linear(width, TICKS * sum(len(WORDS[group]) for group in GROUPS))
+        self.facts = nn.Linear(width, len(FACTS))
+        self.register_buffer("fact_weights", fact_weights())
+
+    fact_weights: Tensor
+
+    def forward(
+        self,
+        history: Tensor,
+        route: Tensor,
+        has_route: Tensor,
+        tracks: Tensor,
+        futures: Tensor,
+        plan_bins: Tensor,
+        facts: Tensor,
+        seen: Tensor,
+    ) -> dict[str, Tensor]:
+        """The loss of a batch from `collate_intents`, and its parts without gradients."""
+        for layer in self.part.trunk.layers:
+            if isinstance(layer, nn.Dropout):
+                layer.p = _DROPOUT if self.training else 0.0
+        state = self._state(history, route, has_route, tracks, seen).float()
+        planned = self.trajectory.loss(self.trajectory(state), present_speeds(history), futures)
+        words = self._word_loss(state, plan_bins.long())
+        of_facts = fact_loss(self.facts(state), facts, self.fact_weights)
+        loss = planned["loss"] + _WORDS_WEIGHT * words + _FACTS_WEIGHT * of_facts
+        return {
+            "loss": loss,
+            "plan_ade_m": planned["ade_m"],
+            "word_loss": words.detach(),
+            "fact_loss": of_facts.detach(),
+        }
+
+    def _state(
+        self, history: Tensor, route: Tensor, has_route: Tensor, tracks: Tensor, seen: Tensor
+    ) -> Tensor:
+        vla = self._vla[0]
+        if self._source == "tracks":
+            assert vla.track_reader is not None
+            return vla.track_reader.state(tracks, history, route, has_route)
+        assert vla.resampler is not None
+        with torch.no_grad():
+            gathered = vla.resampler.gather(seen.float(), history, route, has_route)
+        if self.training:
+            gathered = F.dropout(gathered, _DROPOUT)
+        state: Tensor = vla.resampler.intent.state(gathered, history, route, has_route)
+        return state
+
+    def _word_loss(self, state: Tensor, plan_bins: Tensor) -> Tensor:
+        """Nats a bin of plans int64 [b, 3, 64]; bins of absent groups count nothing."""
+        logits = self.words(state).view(len(state), TICKS, -1)
+        losses, first = [], 0
+        for number, group in enumerate(GROUPS):
+            share = logits[..., first : first + len(WORDS[group])]
+            first += len(WORDS[group])
+            losses.append(
+                F.cross_entropy(share.flatten(0, 1), plan_bins[:, number].flatten(), ignore_index=-1)
+            )
+        return torch.stack(losses).mean()

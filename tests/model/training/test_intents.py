@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from model.driving.facts import mirrored
+from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from model.network.checkpoint import Loaded, load
+from model.network.intent import INTENT_TOKENS
+from model.network.track_features import TRACK_FEATURES
+from model.training.examples import Examples
+from model.training.intents import IntentDataset, IntentLearner, Source, collate_intents
+from model.training.vision_cache import open_vision
+from tests.model.training.scenes import training_scene
+
+SCENES = [training_scene(index) for index in range(6)]
+ON_ROUTE = TRACK_FEATURES.index("on_route")
+
+
+@pytest.fixture(scope="module")
+def loaded(resampling_checkpoint: Path) -> Loaded:
+    return load(resampling_checkpoint)
+
+
+@pytest.fixture(scope="module")
+def examples() -> Examples:
+    return Examples.from_scenes(SCENES, (FRONT_WIDE, FRONT_TELE))
+
+
+@pytest.fixture(scope="module")
+def data(loaded: Loaded, examples: Examples, tmp_path_factory: pytest.TempPathFactory) -> IntentDataset:
+    vision = open_vision(loaded, examples, tmp_path_factory.mktemp("vision"), mirrored=True)
+    return IntentDataset(examples, vision, route_share=1.0)
+
+
+def test_a_mirrored_look_swaps_everything_it_knows(data: IntentDataset, examples: Examples) -> None:
+    plain, swapped = (data.look(1, mirror=mirror, route=True) for mirror in (False, True))
+    np.testing.assert_array_equal(swapped.history[:, 1], -plain.history[:, 1])
+    np.testing.assert_array_equal(swapped.futures[:, [1, 3]], -plain.futures[:, [1, 3]])
+    np.testing.assert_array_equal(swapped.route[:, 1], -plain.route[:, 1])
+    np.testing.assert_array_equal(swapped.facts, mirrored(plain.facts))
+    np.testing.assert_array_equal(swapped.plan_bins, examples.plan(1).mirrored().bins())
+    assert not np.array_equal(swapped.seen, plain.seen)
+
+
+def test_tracks_tell_nothing_of_a_route_that_is_not_given(data: IntentDataset) -> None:
+    given, kept_back = (data.look(1, mirror=False, route=route) for route in (True, False))
+    assert given.has_route
+    assert not kept_back.has_route
+    assert given.tracks[:, ON_ROUTE].any()
+    assert not kept_back.tracks[:, ON_ROUTE].any()
+
+
+@pytest.mark.parametrize("source", ["tracks", "scene"])
+def test_a_few_steps_learn_to_plan_from_a_source_and_leave_the_rest_alone(
+    resampling_checkpoint: Path, data: IntentDataset, source: Source
+) -> None:
+    loaded = load(resampling_checkpoint)
+    before = {name: value.clone() for name, value in loaded.model.state_dict().items()}
+    torch.manual_seed(0)
+    learner = IntentLearner(loaded.model, loaded.codec, source).train()
+    optimizer = torch.optim.AdamW(learner.parameters(), 3e-3)
+    batch = collate_intents([data.look(index, mirror=False, route=True) for index in range(len(data))])
+    losses = []
+    for _ in range(40):
+        outputs = learner(**batch)
+        optimizer.zero_grad()
+        outputs["loss"].backward()
+        optimizer.step()
+        losses.append({name: float(value.detach()) for name, value in outputs.items()})
+    assert losses[-1]["plan_ade_m"] < 0.6 * losses[0]["plan_ade_m"]
+    assert losses[-1]["word_loss"] < 0.6 * losses[0]["word_loss"]
+    changed = {name for name, value in loaded.model.state_dict().items() if not value.equal(before[name])}
+    learned = "track_reader." if source == "tracks" else "resampler.intent."
+    assert changed
+    assert all(name.startswith(learned) for name in changed)
+
+
+def test_a_checkpoint_without_the_source_is_refused(untrained_checkpoint: Path) -> None:
+    loaded = load(untrained_checkpoint)
+    with pytest.raises(ValueError, match="reads no tracks"):
+        IntentLearner(loaded.model, loaded.codec, "tracks")
+
+
+def test_readers_of_tracks_ignore_order_and_rows_of_nobody(loaded: Loaded, data: IntentDataset) -> None:
+    reader = loaded.model.track_reader
+    assert reader is not None
+    sample = data.look(1, mirror=False, route=True)
+    history, route, tracks = (
+        torch.from_numpy(part)[None] for part in (sample.history, sample.route, sample.tracks)
+    )
+    way = (history, route, torch.ones(1, dtype=torch.bool))
+    with torch.inference_mode():
+        tokens = reader(tracks, *way)
+        turned = reader(tracks.flip(1), *way)
+        nobody = reader(torch.zeros_like(tracks), *way)
+        none = reader(tracks[:0], *(part[:0] for part in way))
+    assert tokens.shape[1] == INTENT_TOKENS
+    assert none.shape == (0, *tokens.shape[1:])
+    torch.testing.assert_close(turned, tokens)
+    assert not torch.allclose(nobody, tokens)
