@@ -48,11 +48,11 @@ from clients.answers import (
     told,
     unreachable,
 )
-from clients.labelling.teachers.view import Surroundings
 from clients.requests import label_request, plan_request, reflect_request
 from clients.wire_values import with_pictures
 from model.driving.plan import Plan
 from model.driving.scene import Scene
+from model.driving.view import Surroundings
 
 __all__ = [
     "Access",

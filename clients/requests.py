@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from clients import wire
-from clients.labelling.teachers.view import Surroundings
 from clients.wire_values import rows, wire_agents, wire_scene
 from model.driving.plan import Plan
 from model.driving.scene import Scene
+from model.driving.view import Surroundings
 
 
 def plan_request(

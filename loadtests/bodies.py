@@ -12,7 +12,6 @@ import httpx
 import msgpack
 
 from clients import wire
-from clients.labelling.teachers.view import Surroundings
 from clients.planner import label_request, plan_request, reflect_request
 from loadtests.call import Call
 from loadtests.mix import BATCH_SCENES, Kind, Mix, Payload, Work
@@ -21,6 +20,7 @@ from model.driving.labeller import expert_plan
 from model.driving.plan import Plan, parse_plan
 from model.driving.scene import LabelledScene
 from model.driving.variations import fresh
+from model.driving.view import Surroundings
 
 PATHS: Final[dict[Work, str]] = {
     "plan": "/v1/plan",

@@ -22,8 +22,8 @@ from clients.labelling.teachers.teacher import (
     TeacherError,
     ask,
 )
-from clients.labelling.teachers.view import Surroundings
 from model.driving.scene import AGENT_KINDS, Agent
+from model.driving.view import Surroundings
 from service.intake import plan_of, scene_of
 from service.metrics import Metrics
 from service.problems import (

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import Final, Literal, NamedTuple
 
-from clients.labelling.direction import CORRECTION, agrees
 from clients.labelling.leaks import find_leaks
+from model.driving.direction import CORRECTION, agrees
 from model.driving.plan import Plan
 
 MOST_WORDS: Final = 80

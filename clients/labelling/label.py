@@ -23,11 +23,11 @@ from clients.labelling.teachers.teacher import (
     TeacherError,
     ask,
 )
-from clients.labelling.teachers.view import Surroundings
 from model.driving.hashing import annotations_hash, hash_of
 from model.driving.plan import parse_plan
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
+from model.driving.view import Surroundings
 
 CHECKS_VERSION: Final = 2
 """Of `clients.labelling.checks` and what they are made of; raised when they ask for something else."""

@@ -1,7 +1,7 @@
 """The built-in teacher: says what is wrong with a plan from a scene's annotations, as far as cameras show it.
 
 It knows which plan is better and uses that to choose what to talk about; what it says is in the view of the
-front cameras (`view.py`), or about the plan itself. Wordings vary by scene and draw, and by nothing else.
+front cameras (`model.driving.view`), or about the plan itself. Wordings vary by scene and draw, and by nothing else.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from typing import Final
 
 from clients.labelling.checks import FailedCheck
-from clients.labelling.direction import Change, wanted_changes
 from clients.labelling.teachers.teacher import AnnotationsMissing, Answer, NothingInView, Question
-from clients.labelling.teachers.view import Sight, View, view_of
+from model.driving.direction import Change, wanted_changes
 from model.driving.plan import Group, Plan, format_tick
 from model.driving.scene import AgentKind
+from model.driving.view import Sight, View, view_of
 
 _NAMES: Final[dict[AgentKind, tuple[str, ...]]] = {
     "vehicle": ("vehicle", "car"),

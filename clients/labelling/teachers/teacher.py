@@ -8,9 +8,9 @@ from typing import Final, NamedTuple, Protocol
 
 from clients.labelling.checks import FailedCheck, check_reflection
 from clients.labelling.teachers.patience import TryLater
-from clients.labelling.teachers.view import Surroundings
 from model.driving.plan import Plan
 from model.driving.scene import Scene
+from model.driving.view import Surroundings
 
 ATTEMPTS: Final = 3
 

@@ -11,12 +11,12 @@ import pytest
 from clients.labelling.checks import check_reflection
 from clients.labelling.teachers.rules import RuleTeacher
 from clients.labelling.teachers.teacher import Question, TeacherError
-from clients.labelling.teachers.view import Surroundings
 from model.bundled import SCENES
 from model.driving.labeller import expert_plan
 from model.driving.plan import WORDS, Plan, track_from_words
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
+from model.driving.view import Surroundings
 
 BUNDLED = list(read_scenes(SCENES, dense=False))
 PLANS = [expert_plan(each) for each in BUNDLED]

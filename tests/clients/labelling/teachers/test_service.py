@@ -20,7 +20,7 @@ from clients.labelling.teachers.teacher import (
     TeacherClosed,
     TeacherError,
 )
-from clients.labelling.teachers.view import Surroundings
+from model.driving.view import Surroundings
 from service.settings import Settings
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer
 from tests.service.scenes import labelled

@@ -15,10 +15,10 @@ from clients.labelling.teachers.teacher import (
     TeacherBusy,
     ask,
 )
-from clients.labelling.teachers.view import Surroundings
 from model.bundled import SCENES
 from model.driving.labeller import expert_plan
 from model.driving.scene_store import read_scenes
+from model.driving.view import Surroundings
 
 SCENE, OTHER = list(read_scenes(SCENES, dense=False))[:2]
 QUESTION = Question(
