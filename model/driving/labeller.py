@@ -186,16 +186,18 @@ def _absorb_short(words: list[str]) -> list[str]:
 
 def _hysteresis(signal: Array, enter: float, leave: float) -> BoolArray:
     """True from where ``signal`` exceeds ``enter`` until it falls below ``leave``."""
-    on = np.zeros(len(signal), np.bool_)
+    on: list[bool] = []
     state = False
-    for i, value in enumerate(signal):
+    for value in signal.tolist():  # Python's own floats compare several times faster than numpy's.
         state = value > (leave if state else enter)
-        on[i] = state
-    return on
+        on.append(state)
+    return np.array(on, np.bool_)
 
 
 def _runs(on: BoolArray) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
+    framed = np.zeros(len(on) + 2, np.bool_)
+    framed[1:-1] = on
+    edges = np.flatnonzero(framed[1:] != framed[:-1])
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 

@@ -1,7 +1,8 @@
 """The built-in teacher: says what is wrong with a plan from a scene's annotations, as far as cameras show it.
 
 It knows which plan is better and uses that to choose what to talk about; what it says is in the view of the
-front cameras (`model.driving.view`), or about the plan itself. Wordings vary by scene and draw, and by nothing else.
+front cameras (`model.driving.view`), or about the plan itself. Wordings vary by scene and draw, and by
+nothing else.
 """
 
 from __future__ import annotations
