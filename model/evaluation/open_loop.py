@@ -11,7 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.labeller import expert_plan, label_plan
+from model.driving.agreement import reason_and_change, reason_and_view, trajectory_iou
+from model.driving.labeller import expert_plan
 from model.driving.lead import lead_within
 from model.driving.metrics import collides, displacement_errors, leaves_road
 from model.driving.plan import Plan, plan_iou
@@ -24,7 +25,9 @@ from model.driving.trajectory import (
     path_length,
     present_speed,
 )
+from model.driving.view import Surroundings, view_of
 from model.engines.engine import Draw
+from model.evaluation.words import unknown_words
 
 MEASURES: Final = (
     "agreed_ade_m",
@@ -39,6 +42,9 @@ MEASURES: Final = (
     "collision_rate",
     "off_road_rate",
     "agreement_plan_trajectory",
+    "agreement_reason_change",
+    "agreement_reason_view",
+    "unknown_words",
     "plan_iou_first",
     "plan_iou_best",
     "plan_iou_revised",
@@ -78,7 +84,10 @@ class SceneResult:
         collision_rate: share of draws that meet another agent or obstacle within 5 s.
         off_road_rate: share of draws that leave the road; None where no drivable area is known.
         agreement_plan_trajectory: IOU of the plan that a draw ends with and the plan that its trajectory
-            carries out (`label_plan`; lanes cannot be told from it), mean; None without plans.
+            carries out (`model.driving.agreement`), mean; None without plans.
+        agreement_reason_change: share of the reasonings whose revised plan changes as they ask for.
+        agreement_reason_view: share of the reasonings that name nothing but what is in view, in its place.
+        unknown_words: words of a reasoning that are none (`model.evaluation.words`), mean.
         plan_iou_first: IOU of the first plan with the expert's, mean over draws; None without plans.
         plan_iou_best: the same, best of the draws.
         plan_iou_revised: IOU of the plan a draw ends with (the first one, where it did not reflect), mean.
@@ -105,6 +114,9 @@ class SceneResult:
     off_road_rate: float | None
     greedy_ade_m: float | None = None
     agreement_plan_trajectory: float | None = None
+    agreement_reason_change: float | None = None
+    agreement_reason_view: float | None = None
+    unknown_words: float | None = None
     plan_iou_first: float | None = None
     plan_iou_best: float | None = None
     plan_iou_revised: float | None = None
@@ -165,9 +177,8 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw], greedy: Draw 
         if draw.plan is not None and draw.revised_plan is not None
     ]
     followed = [
-        iou_with_expert(plan, label_plan(draw.trajectory, labelled.scene.history, None))
+        trajectory_iou(draw.revised_plan or draw.plan, draw.trajectory, labelled.scene.history)
         for draw in draws
-        if (plan := draw.revised_plan or draw.plan) is not None
     ]
     branches = [draw.branch for draw in draws if draw.branch is not None]
     return replace(
@@ -175,7 +186,8 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw], greedy: Draw 
         greedy_ade_m=None
         if greedy is None
         else displacement_errors(greedy.trajectory[None], labelled.future).min_ade_m,
-        agreement_plan_trajectory=_mean(followed),
+        agreement_plan_trajectory=_mean([iou for iou in followed if iou is not None]),
+        **_words(labelled, draws),
         plan_iou_first=_mean(first),
         plan_iou_best=max(first, default=None),
         plan_iou_revised=_mean(last),
@@ -184,6 +196,25 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw], greedy: Draw 
         thought_iou_first=_mean([first for first, _ in thought]),
         thought_iou_revised=_mean([revised for _, revised in thought]),
     )
+
+
+def _words(labelled: LabelledScene, draws: Sequence[Draw]) -> dict[str, float | None]:
+    """What the reasonings of some draws are worth; nothing where none reasoned."""
+    reasonings = [draw for draw in draws if draw.thinking is not None]
+    if not reasonings:
+        return {}
+    view = view_of(labelled.scene, Surroundings.of(labelled))
+    change = [
+        reason_and_change(draw.thinking, draw.plan, draw.revised_plan)
+        for draw in reasonings
+        if draw.thinking is not None and draw.plan is not None and draw.revised_plan is not None
+    ]
+    seen = [reason_and_view(draw.thinking or "", view) for draw in reasonings]
+    return {
+        "agreement_reason_change": _mean([float(each) for each in change if each is not None]),
+        "agreement_reason_view": _mean([float(each) for each in seen if each is not None]),
+        "unknown_words": _mean([float(len(unknown_words(draw.thinking or ""))) for draw in reasonings]),
+    }
 
 
 def evaluate_baselines(scenes: Iterable[LabelledScene]) -> dict[str, list[SceneResult]]:

@@ -114,6 +114,21 @@ def test_a_trajectory_that_does_what_its_plan_says_agrees_with_it() -> None:
     assert evaluate_draws(steady, [revised]).agreement_plan_trajectory == pytest.approx(1.0, abs=0.1)
 
 
+def test_reasonings_are_held_against_the_change_and_the_view() -> None:
+    braking = labelled_scene(10.0 - 1.2 * np.maximum(MIDDLES_S, 0), agents=(agent(30, 0.0),))
+    keeps, brakes = expert_plan(labelled_scene(10.0)), expert_plan(braking)
+    right = replace(
+        draw_of(braking.future, keeps, revised=brakes),
+        thinking="A car stands in my lane, some 25 metres ahead, so I should slow down.",
+    )
+    wrong = replace(right, index=1, thinking="A cone frumbles in my lane, so I should accelerate.")
+    result = evaluate_draws(braking, [right, wrong, draw_of(braking.future, keeps, index=2)])
+    assert (result.agreement_reason_change, result.agreement_reason_view) == (0.5, 0.5)
+    assert result.unknown_words == 0.5
+    direct = evaluate_draws(braking, [draw_of(braking.future, keeps)])
+    assert (direct.agreement_reason_change, direct.unknown_words) == (None, None)
+
+
 def test_a_lead_is_soon_met_by_who_drives_fast() -> None:
     lead = agent(45.0, 0.0, speed=5.0)
     draws = [draw_of(labelled_scene(10.0).future)]
