@@ -85,6 +85,8 @@ class PlannedDraw:
         draft_trajectory: where the first plan would have led; None without a second look or a deadline.
         tokens: tokens per section.
         cut: what the deadline did to the second look: skipped, shortened, replaced; else None.
+        consistent: whether the parts of the draw agree; None where nothing can be said.
+        disagreements: which do not: ``plan_trajectory``, ``reason_change``.
     """
 
     index: int
@@ -97,6 +99,8 @@ class PlannedDraw:
     draft_trajectory: FloatArray | None
     tokens: dict[str, int]
     cut: wire.Cut | None = None
+    consistent: bool | None = None
+    disagreements: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +131,7 @@ class LookedAt:
         changes: the stretches in which they differ.
         trajectory: float32 [64, 4]: x, y, z in m and heading in rad at 10 Hz, ego frame, first row at +0.1 s.
         tokens: tokens per section.
+        consistent, disagreements: as of a `PlannedDraw`.
     """
 
     index: int
@@ -137,6 +142,8 @@ class LookedAt:
     changes: tuple[wire.PlanChange, ...]
     trajectory: FloatArray
     tokens: dict[str, int]
+    consistent: bool | None = None
+    disagreements: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,6 +310,8 @@ def _looked_at(draw: wire.Reflection) -> LookedAt:
         changes=tuple(draw.changes),
         trajectory=check_trajectory(np.asarray(draw.trajectory, np.float32)),
         tokens=draw.tokens,
+        consistent=draw.consistent,
+        disagreements=tuple(draw.disagreements),
     )
 
 
@@ -320,4 +329,6 @@ def _draw(draw: wire.Draw) -> PlannedDraw:
         else check_trajectory(np.asarray(draw.draft_trajectory, np.float32)),
         tokens=draw.tokens,
         cut=draw.cut,
+        consistent=draw.consistent,
+        disagreements=tuple(draw.disagreements),
     )

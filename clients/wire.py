@@ -239,6 +239,15 @@ class Draw(Answered):
         default=None,
         description="What the deadline did to the second look: skipped, shortened, or replaced by the draft.",
     )
+    consistent: bool | None = Field(
+        default=None,
+        description="Whether the parts of the draw agree; null where nothing can be said.",
+    )
+    disagreements: list[str] = Field(
+        default_factory=list,
+        description="Which parts do not: plan_trajectory (the trajectory does something else than the plan "
+        "it follows), reason_change (the revised plan does not change as the reasoning asks for).",
+    )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
 
 
@@ -328,6 +337,15 @@ class Reflection(Answered):
     cut: Cut | None = Field(
         default=None,
         description="What the deadline did to the second look: skipped, shortened, or replaced by the draft.",
+    )
+    consistent: bool | None = Field(
+        default=None,
+        description="Whether the parts of the draw agree; null where nothing can be said.",
+    )
+    disagreements: list[str] = Field(
+        default_factory=list,
+        description="Which parts do not: plan_trajectory (the trajectory does something else than the plan "
+        "it follows), reason_change (the revised plan does not change as the reasoning asks for).",
     )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
 
@@ -547,10 +565,12 @@ class ThinkingWritten(Answered):
 
 
 class TrajectoryWritten(Answered):
-    """Data of the events `draft_trajectory` and `trajectory`."""
+    """Data of the events `draft_trajectory` and `trajectory`; whether parts agree is not said of a draft."""
 
     index: int
     trajectory: Trajectory
+    consistent: bool | None = Field(default=None, description="As in the finished draw.")
+    disagreements: list[str] = Field(default_factory=list, description="As in the finished draw.")
 
 
 Event = PlanWritten | BranchTaken | TrajectoryWritten | ThinkingWritten | Problem

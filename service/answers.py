@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 import clients.wire as wire
+from model.driving.agreement import Agreement
 from model.driving.plan import Plan, plan_changes, plan_iou
 from model.driving.trajectory import agreed
 from model.engines.engine import Draw, ModelCard
@@ -22,7 +23,10 @@ def plan_answer(planned: Planned, request_id: str) -> wire.PlanResponse:
     return wire.PlanResponse(
         request_id=request_id,
         model=_model(planned.card),
-        draws=[_draw(draw, planned.drafts.get(draw.index)) for draw in planned.draws],
+        draws=[
+            _draw(draw, planned.agreements[draw.index], planned.drafts.get(draw.index))
+            for draw in planned.draws
+        ],
         agreed=agreed(np.stack([draw.trajectory for draw in planned.draws])),
         timing=planned.timing,
         deadline=planned.deadline,
@@ -39,7 +43,7 @@ def reflect_answer(planned: Planned, request_id: str) -> wire.ReflectResponse:
         model=_model(planned.card),
         plan=wire_plan(first.plan),
         think_probability=first.think_probability,
-        draws=[_reflection(first.plan, draw) for draw in planned.draws],
+        draws=[_reflection(first.plan, draw, planned.agreements[draw.index]) for draw in planned.draws],
         timing=planned.timing,
         deadline=planned.deadline,
     )
@@ -82,7 +86,7 @@ def _model(card: ModelCard) -> wire.ModelName:
     return wire.ModelName(name=card.name, revision=card.revision)
 
 
-def _draw(draw: Draw, draft: Draw | None) -> wire.Draw:
+def _draw(draw: Draw, agreement: Agreement, draft: Draw | None) -> wire.Draw:
     return wire.Draw(
         index=draw.index,
         plan=None if draw.plan is None else wire_plan(draw.plan),
@@ -93,11 +97,13 @@ def _draw(draw: Draw, draft: Draw | None) -> wire.Draw:
         trajectory=wire_trajectory(draw),
         draft_trajectory=None if draft is None or draw.thinking is None else wire_trajectory(draft),
         cut=draw.cut,
+        consistent=agreement.consistent,
+        disagreements=list(agreement.disagreements),
         tokens=dict(draw.tokens),
     )
 
 
-def _reflection(given: Plan, draw: Draw) -> wire.Reflection:
+def _reflection(given: Plan, draw: Draw, agreement: Agreement) -> wire.Reflection:
     revised = draw.revised_plan or given
     changes = [
         wire.PlanChange(
@@ -118,5 +124,7 @@ def _reflection(given: Plan, draw: Draw) -> wire.Reflection:
         changes=changes,
         trajectory=wire_trajectory(draw),
         cut=draw.cut,
+        consistent=agreement.consistent,
+        disagreements=list(agreement.disagreements),
         tokens=dict(draw.tokens),
     )

@@ -14,6 +14,7 @@ from prometheus_client import (
     disable_created_metrics,
 )
 
+from model.driving.agreement import PARTS, Agreement
 from model.driving.plan import plan_iou
 from model.engines.engine import Draw, Load, ModelCard, Thinking
 from service.admission import Admission
@@ -140,6 +141,15 @@ class Metrics:
             buckets=PROBABILITY_BUCKETS,
             registry=registry,
         )
+        self._disagreements = Counter(
+            "looktwice_disagreements",
+            "Draws with parts that do not agree, by which do not.",
+            ["parts", "endpoint"],
+            registry=registry,
+        )
+        for parts in PARTS:
+            for endpoint in ("plan", "reflect"):
+                self._disagreements.labels(parts, endpoint)
         self._labels = Counter(
             "looktwice_labels", "Reflections written by a teacher.", ["teacher"], registry=registry
         )
@@ -253,6 +263,11 @@ class Metrics:
         self._teacher_tokens.labels(teacher, "input").inc(input_tokens)
         self._teacher_tokens.labels(teacher, "output").inc(output_tokens)
         self._teacher_cost.labels(teacher).inc(cost_usd)
+
+    def draw_judged(self, agreement: Agreement, endpoint: str) -> None:
+        """Count what does not agree in one draw."""
+        for parts in agreement.disagreements:
+            self._disagreements.labels(parts, endpoint).inc()
 
     def draw_finished(self, draw: Draw, thinking: Thinking, endpoint: str) -> None:
         """Count one draw."""

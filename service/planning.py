@@ -13,6 +13,7 @@ from typing import Final, TypeVar
 import structlog
 
 import clients.wire as wire
+from model.driving.agreement import Agreement, agreement
 from model.driving.images import ImageError
 from model.driving.plan import PlanError
 from model.driving.scene import SceneError
@@ -70,11 +71,20 @@ class Arrival:
 
 
 @dataclass(frozen=True)
+class Judged:
+    """A draw that is finished, and whether its parts agree."""
+
+    draw: Draw
+    agreement: Agreement
+
+
+@dataclass(frozen=True)
 class Planned:
     """A scene that was planned for.
 
     Attributes:
         draws: in order.
+        agreements: whether the parts of each draw agree, by index.
         drafts: direct trajectories that were ready before the reflections of their draws, by index.
         card: the model that answered.
         timing: where the time went.
@@ -82,10 +92,15 @@ class Planned:
     """
 
     draws: tuple[Draw, ...]
+    agreements: dict[int, Agreement]
     drafts: dict[int, Draw]
     card: ModelCard
     timing: wire.Timing
     deadline: wire.Deadline | None
+
+
+Told = Event | Judged | Planned
+"""What a scene's events are here: the engine's, and what is made of them."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +146,10 @@ class Planning:
             wait_s = None if error.retry_after_s is None else whole_seconds(error.retry_after_s)
             raise ProblemError(RATE_LIMITED, str(error), retry_after_s=wait_s) from None
 
-    async def events(self, asked: Asked, arrival: Arrival) -> AsyncGenerator[Event | Planned]:
+    async def events(self, asked: Asked, arrival: Arrival) -> AsyncGenerator[Told]:
         """What happens to a scene, at last the whole of it; closing it early frees everything.
+
+        Finished draws are told as `Judged`.
 
         Raises:
             ProblemError: at the first iteration where it is not let in; later where it fails.
@@ -148,9 +165,9 @@ class Planning:
         async with self._admission.place_in_turn(asked.controls.n) as place:
             return await last(self._plan(asked, arrival, place))
 
-    async def _plan(self, asked: Asked, arrival: Arrival, place: Place) -> AsyncGenerator[Event | Planned]:
+    async def _plan(self, asked: Asked, arrival: Arrival, place: Place) -> AsyncGenerator[Told]:
         endpoint = "reflect" if isinstance(asked, wire.ReflectRequest) else "plan"
-        draws, drafts = list[Draw](), dict[int, Draw]()
+        draws, drafts, agreements = list[Draw](), dict[int, Draw](), dict[int, Agreement]()
         with self._lifecycle.engine() as engine, self._traces.planning(asked, engine.card) as span:
             checking_s = time.monotonic()
             request = await self._checked(asked, engine.card, arrival)
@@ -165,7 +182,11 @@ class Planning:
                             elif isinstance(event, DraftFinished):
                                 drafts[event.draw.index] = event.draw
                             elif isinstance(event, DrawFinished):
-                                draws.append(event.draw)
+                                draw = event.draw
+                                draws.append(draw)
+                                agreements[draw.index] = _judged(draw, request)
+                                yield Judged(draw, agreements[draw.index])
+                                continue
                             yield event
             except ProblemError as error:
                 if asked.controls.deadline_ms is not None and error.kind in (QUEUE_TIMEOUT, DECODE_TIMEOUT):
@@ -176,6 +197,7 @@ class Planning:
             deadline_met = _met(asked.controls.deadline_ms, arrival)
             for draw in draws:
                 self._metrics.draw_finished(draw, request.controls.thinking, endpoint)
+                self._metrics.draw_judged(agreements[draw.index], endpoint)
             queue_s = place.waited_s + began_s - submitted_s
             self._metrics.answered(endpoint, queue_s, finished_s - submitted_s)
             if deadline_met is not None:
@@ -191,7 +213,7 @@ class Planning:
             if deadline_met is not None:
                 cut = [draw.index for draw in draws if draw.cut is not None]
                 deadline = wire.Deadline(met=deadline_met, cut=cut)
-            yield Planned(tuple(draws), drafts, engine.card, timing, deadline)
+            yield Planned(tuple(draws), agreements, drafts, engine.card, timing, deadline)
 
     async def _checked(self, asked: Asked, card: ModelCard, arrival: Arrival) -> PlanRequest:
         engine_id = f"{arrival.request_id}/{secrets.token_hex(4)}"
@@ -229,7 +251,7 @@ class Planning:
             raise ProblemError(ENGINE_FAILED, "decoding failed; the log has why") from error
 
 
-async def last(events: AsyncGenerator[Event | Planned]) -> Planned:
+async def last(events: AsyncGenerator[Told]) -> Planned:
     """The whole of a scene, once it is there."""
     async with aclosing(events):
         async for event in events:
@@ -254,6 +276,10 @@ def let_in(place: AbstractContextManager[_Held]) -> Generator[_Held]:
         with full_as_problem():
             held = stack.enter_context(place)
         yield held
+
+
+def _judged(draw: Draw, request: PlanRequest) -> Agreement:
+    return agreement(draw.plan, draw.thinking, draw.revised_plan, draw.trajectory, request.scene.history)
 
 
 def _met(deadline_ms: int | None, arrival: Arrival) -> bool | None:

@@ -16,8 +16,6 @@ import clients.wire as wire
 from model.driving.plan import parse_plan
 from model.engines.engine import (
     DraftFinished,
-    DrawFinished,
-    Event,
     SectionFinished,
     TextWritten,
 )
@@ -26,7 +24,8 @@ from service.answers import wire_plan, wire_trajectory
 from service.callers import CallerLeft, while_connected
 from service.errors import problem_document
 from service.metrics import Metrics
-from service.planning import Planned
+from service.planning import Judged, Planned
+from service.planning import Told as Happened
 from service.problems import ProblemError, unforeseen
 
 log = structlog.stdlib.get_logger()
@@ -41,7 +40,7 @@ Told = tuple[str, Written] | Planned
 
 
 async def told_events(
-    first: Event | Planned, events: AsyncGenerator[Event | Planned], metrics: Metrics
+    first: Happened, events: AsyncGenerator[Happened], metrics: Metrics
 ) -> AsyncGenerator[Told]:
     """What happens to a scene in the wire's words; closing it early frees everything.
 
@@ -56,7 +55,7 @@ async def told_events(
     told: dict[int, str] = {}
     async with aclosing(events):
         try:
-            event: Event | Planned | None = first
+            event: Happened | None = first
             while event is not None:
                 if isinstance(event, Planned):
                     yield event
@@ -88,7 +87,7 @@ async def server_sent(
 
 async def streamed(
     request: Request,
-    events: AsyncGenerator[Event | Planned],
+    events: AsyncGenerator[Happened],
     sent: Callable[[AsyncGenerator[Told]], AsyncGenerator[bytes]],
     metrics: Metrics,
 ) -> StreamingResponse:
@@ -108,7 +107,7 @@ async def streamed(
     return StreamingResponse(sent(told), media_type=wire.SSE_MEDIA_TYPE, headers=_NO_BUFFERING)
 
 
-def _data(event: Event, told: dict[int, str]) -> list[tuple[str, Written]]:
+def _data(event: Happened, told: dict[int, str]) -> list[tuple[str, Written]]:
     match event:
         case TextWritten(index, section, text):
             return _text(index, section, text, told)
@@ -126,8 +125,13 @@ def _data(event: Event, told: dict[int, str]) -> list[tuple[str, Written]]:
         case DraftFinished(draw):
             trajectory = wire.TrajectoryWritten(index=draw.index, trajectory=wire_trajectory(draw))
             return [("draft_trajectory", trajectory)]
-        case DrawFinished(draw):
-            trajectory = wire.TrajectoryWritten(index=draw.index, trajectory=wire_trajectory(draw))
+        case Judged(draw, agreement):
+            trajectory = wire.TrajectoryWritten(
+                index=draw.index,
+                trajectory=wire_trajectory(draw),
+                consistent=agreement.consistent,
+                disagreements=list(agreement.disagreements),
+            )
             return [("trajectory", trajectory)]
     return []
 

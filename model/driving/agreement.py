@@ -19,8 +19,12 @@ Parts = Literal["plan_trajectory", "reason_change"]
 """Two parts of a response that can be held against each other without knowing the scene."""
 PARTS: Final[tuple[Parts, ...]] = get_args(Parts)
 
-FOLLOWS_IOU: Final = 0.5
-"""A trajectory follows its plan when what it carries out has at least this IOU with it."""
+FOLLOWS_IOU: Final = 0.6
+"""A trajectory follows its plan when what it carries out has at least this IOU with it.
+
+Of the two tracks that a trajectory tells, half of one is then said otherwise. 96 % of the expert's own plans
+pass when its trajectory went through the codec (200 validation scenes).
+"""
 
 
 @dataclass(frozen=True)

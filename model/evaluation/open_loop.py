@@ -181,13 +181,16 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw], greedy: Draw 
         for draw in draws
     ]
     branches = [draw.branch for draw in draws if draw.branch is not None]
+    change, seen, unknown = _words(labelled, draws)
     return replace(
         evaluate_trajectories(labelled, np.stack([draw.trajectory for draw in draws])),
         greedy_ade_m=None
         if greedy is None
         else displacement_errors(greedy.trajectory[None], labelled.future).min_ade_m,
         agreement_plan_trajectory=_mean([iou for iou in followed if iou is not None]),
-        **_words(labelled, draws),
+        agreement_reason_change=change,
+        agreement_reason_view=seen,
+        unknown_words=unknown,
         plan_iou_first=_mean(first),
         plan_iou_best=max(first, default=None),
         plan_iou_revised=_mean(last),
@@ -198,23 +201,19 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw], greedy: Draw 
     )
 
 
-def _words(labelled: LabelledScene, draws: Sequence[Draw]) -> dict[str, float | None]:
-    """What the reasonings of some draws are worth; nothing where none reasoned."""
-    reasonings = [draw for draw in draws if draw.thinking is not None]
-    if not reasonings:
-        return {}
+def _words(labelled: LabelledScene, draws: Sequence[Draw]) -> tuple[float | None, float | None, float | None]:
+    """How far the reasonings of some draws agree with change and view, and their unknown words."""
     view = view_of(labelled.scene, Surroundings.of(labelled))
-    change = [
-        reason_and_change(draw.thinking, draw.plan, draw.revised_plan)
-        for draw in reasonings
-        if draw.thinking is not None and draw.plan is not None and draw.revised_plan is not None
-    ]
-    seen = [reason_and_view(draw.thinking or "", view) for draw in reasonings]
-    return {
-        "agreement_reason_change": _mean([float(each) for each in change if each is not None]),
-        "agreement_reason_view": _mean([float(each) for each in seen if each is not None]),
-        "unknown_words": _mean([float(len(unknown_words(draw.thinking or ""))) for draw in reasonings]),
-    }
+    change, seen, unknown = list[float](), list[float](), list[float]()
+    for draw in draws:
+        if draw.plan is None or draw.thinking is None or draw.revised_plan is None:
+            continue
+        unknown.append(float(len(unknown_words(draw.thinking))))
+        if (agrees := reason_and_change(draw.thinking, draw.plan, draw.revised_plan)) is not None:
+            change.append(float(agrees))
+        if (is_there := reason_and_view(draw.thinking, view)) is not None:
+            seen.append(float(is_there))
+    return _mean(change), _mean(seen), _mean(unknown)
 
 
 def evaluate_baselines(scenes: Iterable[LabelledScene]) -> dict[str, list[SceneResult]]:

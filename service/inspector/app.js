@@ -182,6 +182,11 @@ function averageError(trajectory, expert) {
   return `${(sum / trajectory.length).toFixed(2)} m`;
 }
 
+const DISAGREES = {
+  plan_trajectory: ["plan ≠ path", "the trajectory does something else than the plan it follows"],
+  reason_change: ["words ≠ plan", "the revised plan does not change as the reasoning asks for"],
+};
+
 function showDraws(draws, agreed) {
   state.draws = draws;
   state.agreed = agreed;
@@ -201,7 +206,8 @@ function drawRow(draw, index) {
     element("td", {}, element("label", {}, radio, `draw ${draw.index}`),
       index === state.agreed ? element("span", { className: "agreed", textContent: "agreed", title: "nearest to all other draws: the one to drive by" }) : ""),
     element("td", {}, draw.branch === null ? "–" : branch,
-      draw.cut ? element("span", { className: "cut", textContent: draw.cut, title: "what the deadline did to the second look" }) : ""),
+      draw.cut ? element("span", { className: "cut", textContent: draw.cut, title: "what the deadline did to the second look" }) : "",
+      ...draw.disagreements.map((parts) => element("span", { className: "disagrees", textContent: DISAGREES[parts]?.[0] ?? parts, title: DISAGREES[parts]?.[1] ?? "" }))),
     element("td", {}, draw.think_probability === null ? "–" : probability(draw.think_probability)),
     element("td", { className: "number", textContent: tokens }),
     element("td", { className: "number", textContent: averageError(draw.trajectory, state.view.future) }));

@@ -87,3 +87,9 @@ def test_strictness(path: tuple[Any, ...], value: Any) -> None:
 def test_answers_may_grow() -> None:
     problem = {"type": "t", "title": "t", "status": 418, "detail": "d", "request_id": "r", "new": 1}
     assert wire.Problem.model_validate_json(json.dumps(problem)).status == 418
+
+
+def test_an_older_service_does_not_say_whether_parts_agree() -> None:
+    trajectory = [[0.1 * step, 0.0, 0.0, 0.0] for step in range(64)]
+    written = wire.TrajectoryWritten.model_validate({"index": 0, "trajectory": trajectory})
+    assert (written.consistent, written.disagreements) == (None, [])

@@ -17,6 +17,8 @@ from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, Scripte
 from tests.service.serving import Served, body
 from tests.service.test_errors import problem
 
+STANDS = "- longitudinal\n  - 0.0s-6.4s: Wait\n- lateral\n  - 0.0s-6.4s: Left Turn\n"
+
 
 def plan(served: Served, **controls: Any) -> PlanResponse:
     answer = served.http.post("/v1/plan", json=body(**controls))
@@ -41,6 +43,20 @@ def test_draws_come_in_order_with_all_their_parts(served: Served) -> None:
         (2.4, 6.4, "Left Lane Change"),
     ]
     assert response.model.name == "scripted"
+
+
+def test_draws_say_whether_their_parts_agree(served: Served, engine: ScriptedEngine) -> None:
+    looked = plan(served, n=4, thinking="always")
+    given = plan(served, n=4, thinking="never", prefill=STANDS)
+    for draw in looked.draws:
+        assert draw.consistent is (draw.disagreements == [])
+    # It stands still by its plan, and its trajectory drives on.
+    assert {draw.consistent for draw in given.draws} == {False}
+    assert [draw.disagreements for draw in given.draws] == [["plan_trajectory"]] * 4
+    count = "looktwice_disagreements_total"
+    told = sum("plan_trajectory" in draw.disagreements for draw in (*looked.draws, *given.draws))
+    assert served.metric(count, parts="plan_trajectory", endpoint="plan") == told
+    assert served.metric(count, parts="plan_trajectory", endpoint="reflect") == 0
 
 
 def test_a_direct_draw_has_no_second_look(served: Served) -> None:

@@ -52,6 +52,9 @@ def test_a_second_look_is_told_as_it_is_taken(served: Served) -> None:
     assert by_name["revised_plan"]["plan"]["text"] == str(SLOW_DOWN)
     done = wire.PlanResponse.model_validate(by_name["done"])
     assert done.draws[0].trajectory == by_name["trajectory"]["trajectory"]
+    assert done.draws[0].consistent is by_name["trajectory"]["consistent"] is not None
+    assert done.draws[0].disagreements == by_name["trajectory"]["disagreements"]
+    assert by_name["draft_trajectory"]["consistent"] is None
     assert done.draws[0].draft_trajectory == by_name["draft_trajectory"]["trajectory"]
     assert done.deadline == wire.Deadline(met=True, cut=[])
 
