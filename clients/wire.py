@@ -190,6 +190,10 @@ class ReflectControls(Asked):
         le=600_000,
         description="Milliseconds from the request's arrival until the answer must be there; null for none.",
     )
+    bind: bool = Field(
+        default=False,
+        description="Begin only trajectories that do what the plan says, as our labeller reads them.",
+    )
 
 
 class Controls(ReflectControls):

@@ -143,6 +143,7 @@ def _controls(asked: wire.ReflectControls, prefill: Plan | None) -> Controls:
             top_p=asked.top_p,
             seed=asked.seed,
             deadline_ms=asked.deadline_ms,
+            bind=asked.bind,
         )
     except RequestError as error:
         raise at(INVALID_CONTROLS, "/controls", str(error)) from None

@@ -54,6 +54,7 @@ class Controls:
         deadline_ms: milliseconds from submission by which the answer must be there; None for no deadline.
             Thinking that would not fit is not begun, or cut; while it lasts, a direct trajectory is made
             ready beside it and is the answer if the reflection does not end in time.
+        bind: only trajectories may be begun that do what the plan says (`model.engines.binding`).
     """
 
     thinking: Thinking = "adaptive"
@@ -64,6 +65,7 @@ class Controls:
     top_p: float = 1.0
     seed: int = 0
     deadline_ms: int | None = None
+    bind: bool = False
 
     def __post_init__(self) -> None:
         if self.thinking not in ("adaptive", "always", "never"):

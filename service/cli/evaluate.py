@@ -40,6 +40,9 @@ def evaluate(
         float | None,
         typer.Option(help="Think when the think probability exceeds it, instead of by chance.", min=0, max=1),
     ] = None,
+    bind: Annotated[
+        bool, typer.Option("--bind", help="Begin only trajectories that do what their plan says.")
+    ] = False,
     rows: Rows = 96,
     engine: EngineName = "torch",
     device: Device = "cpu",
@@ -86,7 +89,7 @@ def evaluate(
         from model.engines.engine import Controls
         from model.evaluation.kept import KeptDraws
 
-        controls = Controls(n=n, temperature=temperature, think_threshold=think_threshold)
+        controls = Controls(n=n, temperature=temperature, think_threshold=think_threshold, bind=bind)
         labelled = list(_evenly(read_scenes(scenes, dense=False), count_scenes(scenes), limit))
         if perception:
             from service.cli.perception import tell_perception

@@ -67,7 +67,9 @@ def test_a_direct_draw_has_no_second_look(served: Served) -> None:
 
 def test_the_engine_gets_what_was_asked(served: Served, engine: ScriptedEngine) -> None:
     sent = scene("as-sent")
-    document = body(sent, n=5, temperature=0.7, top_p=0.9, seed=11, think_threshold=0.25, deadline_ms=900)
+    document = body(
+        sent, n=5, temperature=0.7, top_p=0.9, seed=11, think_threshold=0.25, deadline_ms=900, bind=True
+    )
     assert served.http.post("/v1/plan", json=document).status_code == 200
     got = engine.submitted[0]
     assert got.scene.scene_id == "as-sent"
@@ -78,7 +80,7 @@ def test_the_engine_gets_what_was_asked(served: Served, engine: ScriptedEngine) 
     assert np.array_equal(got.scene.route, sent.route)
     controls = got.controls
     assert (controls.n, controls.temperature, controls.top_p, controls.seed) == (5, 0.7, 0.9, 11)
-    assert (controls.think_threshold, controls.thinking) == (0.25, "adaptive")
+    assert (controls.think_threshold, controls.thinking, controls.bind) == (0.25, "adaptive", True)
     # It counts from arrival, so some of it is gone.
     assert controls.deadline_ms is not None
     assert 1 <= controls.deadline_ms < 900

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from model.engines.binding import Binding, binding_of
 from model.engines.engine import (
     DraftFinished,
     Draw,
@@ -121,12 +122,18 @@ class Decoder:
         """Whether there is nothing to do."""
         return self._schedule.idle
 
-    def add(self, plan_request: PlanRequest, submitted_s: float | None = None) -> None:
+    def add(
+        self,
+        plan_request: PlanRequest,
+        submitted_s: float | None = None,
+        binding: Binding | None = None,
+    ) -> None:
         """Queue a request.
 
         Args:
             plan_request: what is asked.
             submitted_s: when, on the decoder's clock, its deadline counts from; now if it is not given.
+            binding: of the request, see `binding_of`; made here if it is not given.
 
         Raises:
             RequestError: it can never be served: unknown format, too many draws, a missing camera, a
@@ -135,7 +142,9 @@ class Decoder:
         if plan_request.request_id in self._schedule:
             raise RequestError(f"request id {plan_request.request_id} is in use")
         start = begin(plan_request, self._runner.loaded.card, self._runner.formats)
+        loaded = self._runner.loaded
         request = Request(plan_request, start, self._clock() if submitted_s is None else submitted_s)
+        request.binding = binding or binding_of(plan_request, loaded.codec, loaded.vocabulary)
         if not self._schedule.fits(request):
             raise RequestError(
                 f"n is {request.controls.n}; this engine runs at most {self._runner.rows} draws at once"

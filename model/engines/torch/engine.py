@@ -13,6 +13,7 @@ from typing import Final
 
 import torch
 
+from model.engines.binding import Binding, binding_of
 from model.engines.engine import (
     DrawFinished,
     EngineError,
@@ -160,8 +161,8 @@ class TorchEngine:
         # Now and not when the thread gets to it, which may be a long step later.
         submitted_s = time.monotonic()
         try:
-            await self._pictures.run(lambda: self._frames.look_at(request.scene))
-            self._commands.put(lambda decoder: self._add(decoder, request, submitted_s))
+            binding = await self._pictures.run(lambda: self._prepared(request))
+            self._commands.put(lambda decoder: self._add(decoder, request, submitted_s, binding))
             remaining = request.controls.n
             while remaining:
                 event = await events.get()
@@ -178,9 +179,16 @@ class TorchEngine:
         self._tell(request_id, Failed(EngineError("the request was cancelled")))
         self._commands.put(lambda decoder: decoder.cancel(request_id))
 
-    def _add(self, decoder: Decoder, request: PlanRequest, submitted_s: float) -> None:
+    def _prepared(self, request: PlanRequest) -> Binding | None:
+        """Do what would hold up the decoding thread."""
+        self._frames.look_at(request.scene)
+        return binding_of(request, self._loaded.codec, self._loaded.vocabulary)
+
+    def _add(
+        self, decoder: Decoder, request: PlanRequest, submitted_s: float, binding: Binding | None
+    ) -> None:
         try:
-            decoder.add(request, submitted_s)
+            decoder.add(request, submitted_s, binding)
         except RequestError as error:
             self._tell(request.request_id, Failed(error))
         except Exception as error:  # one request that cannot be read must not end the others

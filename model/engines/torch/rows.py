@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from model.engines.binding import Binding
 from model.engines.engine import Controls, Event, PlanRequest, SectionFinished, TextWritten
 from model.engines.requests import branch_of
 from model.engines.response import Response, SectionText
@@ -29,12 +30,16 @@ _FIRST, _REVISED = "plan", "revised_plan"
 
 @dataclass(eq=False)
 class Request:
-    """A request as the engine tracks it; times are those of the engine's clock."""
+    """A request as the engine tracks it; times are those of the engine's clock.
+
+    ``binding`` is there where the caller's control ``bind`` asks for it.
+    """
 
     plan_request: PlanRequest
     start: Cursor
     submitted_s: float
     arrival: int = field(default_factory=lambda: next(_arrivals))
+    binding: Binding | None = None
 
     @property
     def id(self) -> str:
@@ -160,7 +165,9 @@ class Row(Response):
                 self.cut = "shortened"
                 stops: npt.NDArray[np.bool_] = allowed.ids == self.cursor.stop_id
                 return stops
-            return everything
+            binding = self.request.binding
+            bound = None if binding is None else binding.leaves(allowed.ids, self.tokens)
+            return everything if bound is None else bound
         leads = np.array([branch_of(self.cursor, int(token)) == THINKING for token in allowed.ids])
         self.think_probability = float(probabilities(logits)[leads].sum())
         wanted = controls.branch(self.think_probability)

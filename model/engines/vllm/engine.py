@@ -140,6 +140,8 @@ class VllmEngine:
         start = begin(request, self._card, self._formats)
         if request.controls.deadline_ms is not None:
             raise RequestError("deadline_ms needs the torch engine: vLLM cannot cut a text short and go on")
+        if request.controls.bind:
+            raise RequestError("bind needs the torch engine: vLLM has no grammar that depends on the plan")
         decoding = Decoding(llm, self._parts, self._grammar_of, request, start)
         self._running[request.request_id] = decoding
         try:

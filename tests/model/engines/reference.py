@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from transformers import DynamicCache
 
+from model.engines.binding import binding_of
 from model.engines.engine import Draw, PlanRequest
 from model.engines.torch.sampler import choose, probabilities, uniform
 from model.formats.cf_vla import FORMATS
@@ -85,6 +86,7 @@ def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> t
     given = {} if controls.prefill is None else {"plan": controls.prefill}
     cursor = CompiledFormat(format, loaded.vocabulary).start(given)
     tokens: list[Token] = []
+    binding = binding_of(request, loaded.codec, loaded.vocabulary)
     think_probability = None
     shares: Shares = {}
     while not cursor.done:
@@ -100,6 +102,8 @@ def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> t
                 left = thinks == (controls.thinking == "always")
             elif controls.think_threshold is not None:
                 left = thinks == (think_probability > controls.think_threshold)
+        if binding is not None and (bound := binding.leaves(allowed.ids, tokens)) is not None:
+            left = bound
         number = np.array([uniform(controls.seed, index, len(tokens))])
         token = int(allowed.ids[left][choose(scores[left], controls.temperature, controls.top_p, number)[0]])
         place = len(inputs.prompt.ids) + len(tokens)

@@ -258,6 +258,7 @@ def test_bad_requests_fail_alone(loop: asyncio.AbstractEventLoop, vllm: VllmEngi
             (PlanRequest("b", replace(scene, clips=scene.clips[:1])), "lacks camera"),
             (PlanRequest("c", scene, "elf_vla"), "unknown format"),
             (PlanRequest("d", scene, controls=Controls(deadline_ms=50)), "torch engine"),
+            (PlanRequest("e", scene, controls=Controls(bind=True)), "bind needs the torch engine"),
             (PlanRequest("good", scene), "in use"),
         ):
             with pytest.raises((RequestError, ImageError), match=message):
