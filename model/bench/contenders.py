@@ -12,6 +12,7 @@ from typing import Any
 
 from model.engines.engine import Draw, DrawFinished, Engine, PlanRequest
 from model.formats.cf_vla import FORMATS
+from model.formats.cursor import CompiledFormat
 from model.formats.pieces import FormatError
 from model.formats.text import parse
 from model.network.vocabulary import END_OF_TEXT, IM_END, Vocabulary
@@ -113,6 +114,7 @@ class PlainVllm(Contender):
 
         self._engine, self._max_tokens = engine, max_tokens
         self._vocabulary = read_parts(checkpoint).vocabulary
+        self._formats = {name: CompiledFormat(each, self._vocabulary) for name, each in FORMATS.items()}
 
     async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
         """Answer requests that arrive at once."""
@@ -132,8 +134,9 @@ class PlainVllm(Contender):
             prompt = await asyncio.to_thread(self._engine.prompt, request.scene, request.format)
             responses: list[Response] = []
             async for output in self._engine.llm.generate(prompt.then([]), parameters, request.request_id):
+                format = self._formats[request.format]
                 responses += [
-                    _read(list(part.token_ids), request.format, self._vocabulary) for part in output.outputs
+                    _read(list(part.token_ids), format, self._vocabulary) for part in output.outputs
                 ]
             return responses
 
@@ -151,6 +154,9 @@ class Transformers(Contender):
         from model.network.checkpoint import load
 
         self._loaded = load(checkpoint, dtype, device)
+        self._formats = {
+            name: CompiledFormat(each, self._loaded.vocabulary) for name, each in FORMATS.items()
+        }
         self._max_tokens, self._cache = max_tokens, cache
 
     async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
@@ -184,7 +190,7 @@ class Transformers(Contender):
             )
         steps, padding = written.shape[1], vocabulary.id_of(END_OF_TEXT)
         responses = [
-            _read([token for token in row if token != padding], format, vocabulary, steps)
+            _read([token for token in row if token != padding], self._formats[format], vocabulary, steps)
             for row in written.tolist()
         ]
         latency_s = time.perf_counter() - began_s
@@ -193,10 +199,12 @@ class Transformers(Contender):
         ]
 
 
-def _read(ids: list[int], format: str, vocabulary: Vocabulary, steps: int | None = None) -> Response:
+def _read(
+    ids: list[int], format: CompiledFormat, vocabulary: Vocabulary, steps: int | None = None
+) -> Response:
     """A response written without a grammar; each token was chosen, and took a pass."""
     try:
-        parse(FORMATS[format], vocabulary.decode(ids))
+        parse(format, vocabulary.decode(ids))
         valid = True
     except FormatError:
         valid = False

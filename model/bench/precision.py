@@ -73,7 +73,7 @@ def _decode(runner: Runner, requests: Sequence[PlanRequest]) -> Responses:
         for name, event in decoder.step():
             if isinstance(event, DrawFinished):
                 format = runner.formats[formats[name]]
-                tokens = format.render(parse(format.format, event.draw.text))
+                tokens = format.render(parse(format, event.draw.text))
                 responses[name, event.draw.index] = tuple(token.id for token in tokens)
     return responses
 

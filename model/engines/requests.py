@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from typing import cast
 
 from model.driving.plan import Plan
 from model.engines.engine import Branch, Draw, ModelCard, PlanRequest, RequestError
@@ -25,15 +26,20 @@ def begin(request: PlanRequest, card: ModelCard, formats: Mapping[str, CompiledF
     if request.format not in formats:
         known = ", ".join(formats)
         raise RequestError(f"unknown format {request.format!r}; this checkpoint writes {known}")
-    prefill = request.controls.prefill
     try:
-        start = formats[request.format].start({} if prefill is None else {"plan": prefill})
+        start = formats[request.format].start(_given(request))
     except FormatError as error:
         raise RequestError(f"prefill: {error}") from error
     cameras = {clip.camera for clip in request.scene.clips}
     if missing := [camera for camera in card.cameras if camera not in cameras]:
         raise RequestError(f"the scene lacks camera {', '.join(missing)}, which this checkpoint needs")
     return start
+
+
+def _given(request: PlanRequest) -> dict[str, Plan]:
+    """The plans that the caller gives, by section."""
+    prefill = request.controls.prefill
+    return {} if prefill is None else {"plan": prefill}
 
 
 def branch_of(cursor: Cursor, token: int) -> Branch:
@@ -55,9 +61,10 @@ def read(
         FormatError: the text is no response of the format.
     """
     text = vocabulary.decode([token.id for token in response.tokens])
-    values = parse(response.cursor.compiled.format, text)
+    values = parse(response.cursor.compiled, text, _given(request))
     codes, branch, thinking = values["trajectory"], values.get(BRANCH), values.get("thinking")
     assert isinstance(codes, tuple)
+    codes = cast("tuple[int, ...]", codes)
     plan, revised = values.get("plan"), values.get("revised_plan")
     trajectory = codec.decode(request.scene.history[None], [codes])[0]
     counts = dict(Counter(token.section for token in response.tokens))

@@ -7,23 +7,25 @@ from typing import Final
 from model.formats.pieces import (
     ACTION,
     BRANCH,
+    CODES,
     THINKING,
+    TRAJECTORY,
     Choice,
     Codes,
     Format,
     FreeText,
     Literal,
     Option,
-    PlanTracks,
     Section,
     Sequence,
 )
+from model.formats.plan_tracks import PlanTracks
 
 MAX_THINKING_TOKENS: Final = 160
 """Teachers write at most 80 words (CF-VLA section 8); two tokens a word leave room to spare."""
 
 _TRAJECTORY: Final = Sequence(
-    (Literal("\n<|traj_future_start|>"), Codes(), Literal("<|traj_future_end|><|im_end|>"))
+    (Literal("\n<|traj_future_start|>"), Codes(TRAJECTORY, CODES), Literal("<|traj_future_end|><|im_end|>"))
 )
 _PLAN: Final = Sequence((Literal("Meta Actions:\n"), PlanTracks()))
 _REFLECTION: Final = Sequence(

@@ -6,6 +6,7 @@ No torch here; a vocabulary is anything that satisfies `Vocabulary`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -13,47 +14,47 @@ import numpy as np
 import numpy.typing as npt
 
 from model.driving.plan import TICKS, WORDS, Group, Plan, format_tick
-from model.formats.given import with_given
+from model.formats.free_text import BEGUN, Alphabet, TextRules, TextState
 from model.formats.pieces import (
-    MAX_SEGMENTS,
     Choice,
     Codes,
     Format,
     FormatError,
     FreeText,
     Literal,
+    Maybe,
     Piece,
-    PlanTracks,
     Section,
     Sequence,
-    Track,
-    TrackWord,
+    Shorthand,
     Values,
 )
+from model.formats.plan_tracks import MAX_SEGMENTS, PlanTracks, with_given
+from model.formats.starts import check, first_bytes
 from model.formats.trie import Node, build_trie
+from model.formats.writing import Token as Token
+from model.formats.writing import write
 
 
 class Vocabulary(Protocol):
     """What a format needs to know about a tokenizer."""
 
+    @property
+    def alphabets(self) -> Mapping[str, tuple[range, ...]]:
+        """Named alphabets of codes: for each of its codebooks the ids of its tokens."""
+        ...
+
     def encode(self, text: str) -> tuple[int, ...]:
         """Token ids of ``text`` exactly as given; special tokens are recognised by their spelling."""
         ...
 
-    def code_ids(self, stage: int) -> range:
-        """Ids of the trajectory codes of one stage."""
+    def decode(self, ids: tuple[int, ...] | list[int]) -> str:
+        """The text of tokens, special ones spelt out."""
         ...
 
-    def free_text_ids(self) -> npt.NDArray[np.bool_]:
-        """Mask over the vocabulary: ordinary tokens without a line break."""
+    def free_text_ids(self, *, multiline: bool = False) -> npt.NDArray[np.bool_]:
+        """Mask over the vocabulary: ordinary tokens that are text on their own, of one line or of several."""
         ...
-
-
-class Token(NamedTuple):
-    """A token of a response and the section it belongs to."""
-
-    id: int
-    section: str
 
 
 class Run(NamedTuple):
@@ -64,27 +65,33 @@ class Run(NamedTuple):
 
 
 class AtChoice(NamedTuple):
-    """Within the words of a choice, at a node of its trie."""
+    """Within the words of a choice, at a node of its trie that has children."""
 
     choice: Choice
     node: Node
 
 
 class InText(NamedTuple):
-    """Within free text, behind so many of its tokens."""
+    """Within free text."""
 
     piece: FreeText
-    used: int
+    state: TextState
 
 
 class AtCode(NamedTuple):
-    """Before the code of a stage."""
+    """Before the code at a place."""
 
     piece: Codes
-    stage: int
+    place: int
 
 
-Active = Run | AtChoice | InText | AtCode
+class Ways(NamedTuple):
+    """Where the next token tells which way a response goes: each with what comes behind it."""
+
+    ways: tuple[tuple[Active, Rest], ...]
+
+
+Active = Run | AtChoice | InText | AtCode | Ways
 Rest = tuple[Piece, str, "Rest"] | None
 """What comes behind the active piece: a linked list of pieces with the section each stands in."""
 
@@ -105,48 +112,51 @@ class Allowed:
 
 
 class CompiledFormat:
-    """A format over one vocabulary; tries and tokenised literals are kept between responses."""
+    """A format over one vocabulary; tries and tokenised literals are kept between responses.
+
+    Raises:
+        FormatError: the format names an alphabet that the vocabulary lacks, or a text in it could be read in
+            two ways.
+    """
 
     def __init__(self, format: Format, vocabulary: Vocabulary) -> None:
         self.format = format
         self._vocabulary = vocabulary
         self._literals: dict[str, tuple[int, ...]] = {}
         self._tries: dict[tuple[str, ...], Node] = {}
-        self._expanded: dict[PlanTracks | Track | TrackWord, Sequence] = {}
-        self._codes = tuple(np.arange(ids.start, ids.stop) for ids in map(vocabulary.code_ids, range(6)))
-        self._free_ids: dict[tuple[str, bool], npt.NDArray[np.int64]] = {}
+        self._expanded: dict[Shorthand, Piece] = {}
+        self._texts: dict[FreeText, TextRules] = {}
+        self._free: dict[bool, Alphabet] = {}
+        self._codes: dict[tuple[str, int], npt.NDArray[np.int64]] = {}
+        self._spellings: dict[tuple[str, int], dict[str, int]] = {}
+        self._first_bytes: dict[Piece, frozenset[int]] = {}
         self.sentence_ends = frozenset(id for mark in ".!?" for id in self.literal(mark)[-1:])
         """Ids of the tokens that end a sentence."""
+        check(self)
 
-    def start(self, given: Values | None = None) -> Cursor:
+    def start(self, given: Mapping[str, Plan] | None = None) -> Cursor:
         """A cursor at the beginning; plans of the sections in ``given`` are forced, equal neighbours joined.
 
         Raises:
             FormatError: ``given`` names a section without a plan, or a plan beyond the format.
         """
-        known = self.format.sections()
-        for name in given or {}:
-            if name not in known:
-                raise FormatError(f"format {self.format.name} has no section {name!r}")
-        body = with_given(self.format.body, given or {})
-        return self._enter((body, "", None))
+        return self._enter((self.body(given), "", None))
 
-    def render(self, values: Values) -> list[Token]:
+    def body(self, given: Mapping[str, Plan] | None = None) -> Piece:
+        """The format's declaration, with the plans of the sections in ``given`` forced; see `start`."""
+        return with_given(self.format.body, given) if given else self.format.body
+
+    def render(self, values: Values, given: Mapping[str, Plan] | None = None) -> list[Token]:
         """The tokens of a whole response with these values, each with its section.
 
+        Args:
+            values: of all sections, the given ones included.
+            given: the response begins at ``start(given)``.
+
         Raises:
-            FormatError: a section's value is missing or not writable in this format.
+            FormatError: a section's value is missing, too many, or not writable in this format.
         """
-        tokens: list[Token] = []
-        cursor = self.start({name: value for name, value in values.items() if isinstance(value, Plan)})
-        while True:
-            forced, cursor = cursor.forced()
-            tokens += forced
-            if cursor.done:
-                return tokens
-            for token in cursor.answer(values):
-                tokens.append(Token(token, cursor.section))
-                cursor = cursor.advance(token)
+        return write(self, self.body(given), values)
 
     def longest(self) -> int:
         """A number of tokens that no response exceeds."""
@@ -160,19 +170,21 @@ class CompiledFormat:
                 return sum(map(self._longest, parts))
             case Section(_, body):
                 return self._longest(body)
+            case Maybe(inner):
+                return self._longest(inner)
             case Choice(options):
                 return max(len(self.literal(option.text)) + self._longest(option.then) for option in options)
-            case FreeText(stop, max_tokens):
-                return max_tokens + len(self.literal(stop))
-            case Codes(count):
+            case FreeText(_, max_tokens):
+                return max_tokens + len(self.text(piece).stop)
+            case Codes(_, count):
                 return count
             case PlanTracks(groups):
                 return sum(
                     len(self.literal(f"- {group}\n")) + MAX_SEGMENTS * self._longest_line(group)
                     for group in groups
                 )
-            case Track() | TrackWord():
-                raise TypeError("a track is measured as part of its plan")
+            case Shorthand():
+                return self._longest(self.expanded(piece))
 
     def _longest_line(self, group: Group) -> int:
         """Tokens of the longest meta-action of a group, all its pieces as `Track` writes them."""
@@ -187,22 +199,53 @@ class CompiledFormat:
             self._literals[text] = self._vocabulary.encode(text)
         return self._literals[text]
 
-    def encode(self, text: str) -> tuple[int, ...]:
-        """Token ids of free text, which is not kept as literals are."""
-        return self._vocabulary.encode(text)
+    def expanded(self, piece: Shorthand) -> Piece:
+        """What a shorthand stands for."""
+        if piece not in self._expanded:
+            self._expanded[piece] = piece.expand()
+        return self._expanded[piece]
 
-    def free_ids(self, stop: str, *, may_stop: bool) -> npt.NDArray[np.int64]:
-        """Ids allowed within free text; with the stop's first token when it may end here."""
-        key = (stop, may_stop)
-        if key not in self._free_ids:
-            mask = self._vocabulary.free_text_ids().copy()
-            mask[self.literal(stop)[0]] = may_stop
-            self._free_ids[key] = np.flatnonzero(mask)
-        return self._free_ids[key]
+    def text(self, piece: FreeText) -> TextRules:
+        """What the tokens of a free text may be."""
+        if piece not in self._texts:
+            encode, decode = self._vocabulary.encode, self._vocabulary.decode
+            if piece.multiline not in self._free:
+                mask = self._vocabulary.free_text_ids(multiline=piece.multiline)
+                self._free[piece.multiline] = Alphabet(mask, lambda ids: decode(list(ids)))
+            stop = self.literal(piece.stop)
+            self._texts[piece] = TextRules(piece, stop, self._free[piece.multiline], encode)
+        return self._texts[piece]
 
-    def codes(self, stage: int) -> npt.NDArray[np.int64]:
-        """Ids of one stage's codes."""
-        return self._codes[stage]
+    def codebooks(self, alphabet: str) -> tuple[range, ...]:
+        """Ids of an alphabet, by codebook; raises `FormatError` where the vocabulary lacks it."""
+        alphabets = self._vocabulary.alphabets
+        if alphabet not in alphabets:
+            raise FormatError(f"the vocabulary has no alphabet {alphabet!r}; it has {', '.join(alphabets)}")
+        return alphabets[alphabet]
+
+    def codes(self, piece: Codes, place: int) -> npt.NDArray[np.int64]:
+        """Ids of the codes that may stand at a place."""
+        key = (piece.alphabet, place)
+        if key not in self._codes:
+            books = self.codebooks(piece.alphabet)
+            self._codes[key] = np.arange(books[place % len(books)].start, books[place % len(books)].stop)
+        return self._codes[key]
+
+    def spellings(self, piece: Codes, place: int) -> dict[str, int]:
+        """The codes that may stand at a place, by their text."""
+        books = self.codebooks(piece.alphabet)
+        key = (piece.alphabet, place % len(books))
+        if key not in self._spellings:
+            self._spellings[key] = {
+                self._vocabulary.decode([token]): code for code, token in enumerate(books[key[1]])
+            }
+        return self._spellings[key]
+
+    def first_bytes(self, piece: Piece) -> frozenset[int]:
+        """The bytes that a piece, which is never empty, may begin with."""
+        if piece not in self._first_bytes:
+            self._first_bytes[piece] = first_bytes(self, piece)
+        return self._first_bytes[piece]
 
     def trie(self, choice: Choice) -> Node:
         """The trie over a choice's tokenised options."""
@@ -226,17 +269,34 @@ class CompiledFormat:
                     rest = after
                 case Section(name, body):
                     rest = (body, name, after)
-                case PlanTracks() | Track() | TrackWord():
-                    if piece not in self._expanded:
-                        self._expanded[piece] = piece.expand()
-                    rest = (self._expanded[piece], section, after)
                 case Choice():
-                    return Cursor(self, AtChoice(piece, self.trie(piece)), section, after)
+                    return self._at_node(piece, self.trie(piece), section, after)
+                case Maybe(inner):
+                    return self._either(self._enter((inner, section, after)), self._enter(after))
                 case FreeText():
-                    return Cursor(self, InText(piece, 0), section, after)
+                    return Cursor(self, InText(piece, BEGUN), section, after)
                 case Codes():
                     return Cursor(self, AtCode(piece, 0), section, after)
+                case Shorthand():
+                    rest = (self.expanded(piece), section, after)
         return Cursor(self, None, "", None)
+
+    def _at_node(self, choice: Choice, node: Node, section: str, rest: Rest) -> Cursor:
+        """The cursor at a node of a choice's trie; where an option may end there, also behind it."""
+        if node.option is None:
+            return Cursor(self, AtChoice(choice, node), section, rest)
+        then = self._enter((choice.options[node.option].then, section, rest))
+        if not node.children:
+            return then
+        return self._either(Cursor(self, AtChoice(choice, node), section, rest), then)
+
+    def _either(self, one: Cursor, other: Cursor) -> Cursor:
+        """The cursor where the next token tells which of two it is; `check` makes sure that it can."""
+        ways: list[tuple[Active, Rest]] = []
+        for cursor in (one, other):
+            assert cursor.active is not None
+            ways += cursor.active.ways if isinstance(cursor.active, Ways) else [(cursor.active, cursor.rest)]
+        return Cursor(self, Ways(tuple(ways)), one.section, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +309,7 @@ class Cursor:
     section: str
     """The section the next token belongs to."""
     rest: Rest = field(repr=False)
-    """What comes behind the active piece."""
+    """What comes behind the active piece; None where that is told with its `Ways`."""
 
     @property
     def done(self) -> bool:
@@ -269,13 +329,12 @@ class Cursor:
                 allowed = np.array([ids[position]], np.int64)
             case AtChoice(choice, node):
                 allowed, name = node.ids, choice.name
-            case InText(piece, used):
-                if used >= piece.max_tokens:
-                    allowed = np.array([self.compiled.literal(piece.stop)[0]], np.int64)
-                else:
-                    allowed = self.compiled.free_ids(piece.stop, may_stop=used > 0)
-            case AtCode(_, stage):
-                allowed = self.compiled.codes(stage)
+            case InText(piece, state):
+                allowed = self.compiled.text(piece).allowed(state)
+            case AtCode(piece, place):
+                allowed = self.compiled.codes(piece, place)
+            case Ways():
+                allowed = np.sort(np.concatenate([way.allowed().ids for way in self._ways()]))
             case None:
                 raise FormatError("the response is complete")
         return Allowed(allowed, self.section, name)
@@ -305,23 +364,24 @@ class Cursor:
                     return self._at(Run(ids, position + 1))
                 return self.compiled._enter(self.rest)
             case AtChoice(choice, node) if token in node.children:
-                child = node.children[token]
-                if child.option is None:
-                    return self._at(AtChoice(choice, child))
-                return self.compiled._enter((choice.options[child.option].then, self.section, self.rest))
-            case InText(piece, used):
-                stop = self.compiled.literal(piece.stop)
-                if token == stop[0] and used > 0:
-                    if len(stop) > 1:
-                        return self._at(Run(stop, 1))
+                return self.compiled._at_node(choice, node.children[token], self.section, self.rest)
+            case InText(piece, state):
+                rules = self.compiled.text(piece)
+                then = rules.after(state, token)
+                if then is not None:
+                    if then.matched < rules.end:
+                        return self._at(InText(piece, then))
+                    if rules.end < len(rules.stop):
+                        return self._at(Run(rules.stop, rules.end))
                     return self.compiled._enter(self.rest)
-                ids_allowed = self.compiled.free_ids(piece.stop, may_stop=False)
-                if used < piece.max_tokens and _holds(ids_allowed, token):
-                    return self._at(InText(piece, used + 1))
-            case AtCode(piece, stage) if _holds(self.compiled.codes(stage), token):
-                if stage + 1 < piece.count:
-                    return self._at(AtCode(piece, stage + 1))
+            case AtCode(piece, place) if _holds(self.compiled.codes(piece, place), token):
+                if place + 1 < piece.count:
+                    return self._at(AtCode(piece, place + 1))
                 return self.compiled._enter(self.rest)
+            case Ways():
+                for way in self._ways():
+                    if _holds(way.allowed().ids, token):
+                        return way.advance(token)
         raise FormatError(f"token {token} is not allowed in section {self.section or 'end'!r}")
 
     def option_texts(self, token: int) -> tuple[str, ...]:
@@ -333,40 +393,18 @@ class Cursor:
 
     @property
     def stop_id(self) -> int | None:
-        """Within free text: the token that ends it; None elsewhere."""
+        """Within free text: the token that ends it, or brings its end nearer; None elsewhere."""
         if isinstance(self.active, InText):
-            return self.compiled.literal(self.active.piece.stop)[0]
+            piece, state = self.active
+            return self.compiled.text(piece).stop[state.matched]
         return None
-
-    def answer(self, values: Values) -> tuple[int, ...]:
-        """The tokens that write the current section's value from here; raises `FormatError`."""
-        if self.section not in values:
-            raise FormatError(f"section {self.section!r} needs a value")
-        value = values[self.section]
-        match self.active:
-            case AtChoice(choice, _):
-                for option in choice.options:
-                    if option.text == value:
-                        return self.compiled.literal(option.text)
-                known = ", ".join(option.text for option in choice.options)
-                raise FormatError(f"{value!r} is none of {known}")
-            case InText(piece, _) if isinstance(value, str):
-                if not value or piece.stop in value:
-                    raise FormatError(f"section {self.section!r} must be text without {piece.stop!r}")
-                ids = self.compiled.encode(value)
-                if len(ids) > piece.max_tokens:
-                    raise FormatError(
-                        f"section {self.section!r} has {len(ids)} tokens; at most {piece.max_tokens}"
-                    )
-                # At its budget the text stops by itself: the stop's first token is forced then.
-                stop = self.compiled.literal(piece.stop)[:1] if len(ids) < piece.max_tokens else ()
-                return ids + stop
-            case AtCode(piece, _) if isinstance(value, tuple) and len(value) == piece.count:
-                return tuple(int(self.compiled.codes(stage)[code]) for stage, code in enumerate(value))
-        raise FormatError(f"section {self.section!r} cannot be written from {value!r}")
 
     def _at(self, active: Active) -> Cursor:
         return Cursor(self.compiled, active, self.section, self.rest)
+
+    def _ways(self) -> list[Cursor]:
+        assert isinstance(self.active, Ways)
+        return [Cursor(self.compiled, active, self.section, rest) for active, rest in self.active.ways]
 
 
 def _holds(ids: npt.NDArray[np.int64], token: int) -> bool:

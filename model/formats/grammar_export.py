@@ -1,9 +1,10 @@
 """What may follow a cursor as a Lark grammar over token ids, for guided decoding by llguidance and vLLM.
 
 Every token is named by its id (``<[17]>``), so text is split into tokens as in training. Equal parts are
-written once, as rules of their own: such engines compile a grammar anew for every request. Two things that
-would make it many times as long are left out: a track's meta-actions are not counted, and a word may
-follow itself. Whoever decodes with it walks a `Cursor` along and takes over where that refuses a token.
+written once, as rules of their own: such engines compile a grammar anew for every request. The grammar says
+what the cursor allows, but for two things about plans that would make it many times as long: it does not
+count a track's meta-actions, and a word may follow itself. Whoever decodes with it walks a `Cursor` along
+and takes over where that refuses a token.
 """
 
 from __future__ import annotations
@@ -11,21 +12,21 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from model.formats.cursor import AtChoice, AtCode, Cursor, InText, Run
+from model.formats.cursor import Active, AtChoice, AtCode, Cursor, InText, Rest, Run, Ways
+from model.formats.free_text import BEGUN, TextState
 from model.formats.pieces import (
-    MAX_SEGMENTS,
     Choice,
     Codes,
     FreeText,
     Literal,
+    Maybe,
     Option,
     Piece,
-    PlanTracks,
     Section,
     Sequence,
-    Track,
-    TrackWord,
+    Shorthand,
 )
+from model.formats.plan_tracks import MAX_SEGMENTS, Track, TrackWord
 from model.formats.trie import Node
 
 
@@ -38,32 +39,39 @@ class _Exporter:
     def __init__(self, cursor: Cursor) -> None:
         self._cursor, self._compiled = cursor, cursor.compiled
         self._rules: dict[str, str] = {}
-        self._names: dict[str | Piece, str] = {}
-        self._open: list[tuple[str, Piece]] = []  # tracks with a name, but no rule yet
+        self._names: dict[str | Piece | tuple[FreeText, TextState], str] = {}
+        self._open: list[tuple[str, Piece | tuple[FreeText, TextState]]] = []  # with a name, but no rule yet
 
     def grammar(self) -> str:
-        parts, rest = [self._active()], self._cursor.rest
+        start = self._from(self._cursor.active, self._cursor.rest)
+        while self._open:
+            name, what = self._open.pop()
+            self._rules[name] = self._text_rule(*what) if isinstance(what, tuple) else self._of(what)
+        rules = [f"start: {start}", *(f"{name}: {body}" for name, body in self._rules.items())]
+        return "\n".join(rules) + "\n"
+
+    def _from(self, active: Active | None, rest: Rest) -> str:
+        """What is left of the piece that the cursor stands in, and what comes behind it."""
+        if isinstance(active, Ways):
+            return self._named(" | ".join(self._from(*way) for way in active.ways))
+        parts = [self._active(active)]
         while rest is not None:
             piece, _, rest = rest
             parts.append(self._of(piece))
-        while self._open:
-            name, piece = self._open.pop()
-            self._rules[name] = self._of(piece)
-        rules = [f"start: {_join(parts)}", *(f"{name}: {body}" for name, body in self._rules.items())]
-        return "\n".join(rules) + "\n"
+        return _join(parts)
 
-    def _active(self) -> str:
-        """What is left of the piece that the cursor stands in."""
-        match self._cursor.active:
+    def _active(self, active: Active | None) -> str:
+        match active:
             case Run(ids, position):
                 return self._tokens(ids[position:])
             case AtChoice(choice, node):
-                return self._choice(choice.options, node)
-            case InText(piece, used):
-                return self._text(piece, used)
-            case AtCode(piece, stage):
-                return self._codes(range(stage, piece.count))
-            case None:
+                # An option that may end at this node is another of the cursor's ways.
+                return self._choice(choice.options, node, ends=False)
+            case InText(piece, state):
+                return self._text(piece, state)
+            case AtCode(piece, place):
+                return self._codes(piece, range(place, piece.count))
+            case _:
                 return ""
 
     def _of(self, piece: Piece) -> str:
@@ -74,47 +82,76 @@ class _Exporter:
                 return _join(map(self._of, parts))
             case Section(_, body):
                 return self._of(body)
-            case PlanTracks():
-                return self._of(piece.expand())
-            case Track() | TrackWord():
-                return self._track(replace(piece, segments_left=MAX_SEGMENTS, previous=None))
             case Choice(options):
-                return self._choice(options, self._compiled.trie(piece))
+                return self._choice(options, self._compiled.trie(piece), ends=True)
+            case Maybe(inner):
+                return f"{self._named(self._of(inner))}?"
             case FreeText():
-                return self._text(piece, 0)
-            case Codes(count):
-                return self._codes(range(count))
+                return self._text(piece, BEGUN)
+            case Codes(_, count):
+                return self._codes(piece, range(count))
+            case Track() | TrackWord():
+                return self._later(replace(piece, segments_left=MAX_SEGMENTS, previous=None))
+            case Shorthand():
+                return self._of(self._compiled.expanded(piece))
 
-    def _track(self, piece: Track | TrackWord) -> str:
+    def _later(self, piece: Track | TrackWord) -> str:
         if piece not in self._names:
             name = self._names[piece] = f"track_{len(self._names)}"
             self._open.append((name, piece.expand()))
         return self._names[piece]
 
-    def _choice(self, options: tuple[Option, ...], node: Node) -> str:
+    def _choice(self, options: tuple[Option, ...], node: Node, *, ends: bool) -> str:
         """The options below a node of the trie; what follows all of them alike is written once."""
-        after = {self._of(options[position].then) for position in node.options()}
+        behind = {position for position in node.options() if ends or position != node.option}
+        after = {self._of(options[position].then) for position in behind}
         if len(after) == 1:
-            return _join((self._alternatives(node, [""] * len(options)), *after))
-        return self._alternatives(node, [self._of(option.then) for option in options])
+            return _join((self._alternatives(node, [""] * len(options), ends=ends), *after))
+        return self._alternatives(node, [self._of(option.then) for option in options], ends=ends)
 
-    def _alternatives(self, node: Node, after: list[str]) -> str:
+    def _alternatives(self, node: Node, after: list[str], *, ends: bool = True) -> str:
         """The words below a node, each followed by what comes ``after`` its option."""
-        if node.option is not None:
-            return after[node.option]
+        if not node.children:
+            return after[node.option] if node.option is not None else ""
         parts = [
             _join((_id(token), self._alternatives(child, after))) for token, child in node.children.items()
         ]
-        return parts[0] if len(parts) == 1 else self._named(" | ".join(parts))
+        shorter = after[node.option] if ends and node.option is not None else None
+        if shorter:
+            parts.append(shorter)
+        words = parts[0] if len(parts) == 1 else self._named(" | ".join(parts))
+        return f"{self._named(words)}?" if shorter == "" else words
 
-    def _text(self, piece: FreeText, used: int) -> str:
-        stop = self._tokens(self._compiled.literal(piece.stop))
-        word = self._named(_ranges(map(int, self._compiled.free_ids(piece.stop, may_stop=False))))
-        left = piece.max_tokens - used
-        return _join((f"{word}{{{0 if used else 1},{left}}}" if left else "", stop))
+    def _text(self, piece: FreeText, state: TextState) -> str:
+        rules = self._compiled.text(piece)
+        if not rules.apart:
+            return self._text_name(piece, state)
+        words = _ranges(rules.allowed(BEGUN).tolist())
+        left = piece.max_tokens - state.used
+        text = f"{self._named(words)}{{{0 if state.used else 1},{left}}}" if left else ""
+        return _join((text, self._tokens(rules.stop)))
 
-    def _codes(self, stages: range) -> str:
-        return _join(_ranges(map(int, self._compiled.codes(stage))) for stage in stages)
+    def _text_name(self, piece: FreeText, state: TextState) -> str:
+        """The rule for what is left of a text from a state on."""
+        key = (piece, state)
+        if key not in self._names:
+            name = self._names[key] = f"text_{len(self._names)}"
+            self._open.append((name, key))
+        return self._names[key]
+
+    def _text_rule(self, piece: FreeText, state: TextState) -> str:
+        rules = self._compiled.text(piece)
+        parts = []
+        for then, ids in rules.groups(state).items():
+            if then.matched < rules.end:
+                behind = self._text_name(piece, then)
+            else:
+                behind = self._tokens(rules.stop[rules.end :])
+            parts.append(_join((self._named(_ranges(ids.tolist())), behind)))
+        return " | ".join(parts)
+
+    def _codes(self, piece: Codes, places: range) -> str:
+        return _join(_ranges(self._compiled.codes(piece, place).tolist()) for place in places)
 
     def _tokens(self, ids: tuple[int, ...]) -> str:
         tokens = _join(map(_id, ids))

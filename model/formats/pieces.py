@@ -1,39 +1,41 @@
 """The pieces a response format is declared with.
 
 A declaration is a tree of frozen dataclasses. Nothing here knows tokens: `cursor` walks a declaration token
-by token, `text` renders and parses it, `grammar_export` turns it into a grammar.
+by token, `writing` renders values, `text` parses them, `grammar_export` turns it into a grammar.
 
 Every `Literal` and every option of a `Choice` is tokenised on its own, in training and in decoding alike, so
 forced tokens are by construction the tokens the model was trained on.
+
+The core pieces are in this module. All others are a `Shorthand`: they expand to core pieces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import collections.abc
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 from typing import Literal as Literal_
 
-from model.driving.plan import GROUPS, TICKS, WORDS, Group, Plan, format_tick
+from model.driving.plan import Plan
 
-Value = Plan | str | tuple[int, ...]
-"""What a section holds: a plan, a word or free text, or codes."""
-Values = Mapping[str, Value]
-"""Section name to value, for the sections that hold one."""
+Value: TypeAlias = "Plan | str | bool | float | tuple[Value, ...] | Mapping[str, Value]"
+"""A plan, a word or free text, whether a `Maybe` is there, a number, codes or repeated values, a record."""
 
 BRANCH: Final = "branch"
 """Name of the choice, and of its section, where a response decides to act or to think."""
 ACTION: Final[Literal_["Action:"]] = "Action:"
 THINKING: Final[Literal_["Thinking:"]] = "Thinking:"
 
+TRAJECTORY: Final = "trajectory"
+"""The alphabet of trajectory codes: one codebook for each of its `CODES` stages."""
 CODES: Final = 6
 """Trajectory codes of a trajectory (CF-VLA section 8)."""
-MAX_SEGMENTS: Final = 12
-"""Meta-actions in one track at most: the labeller's shortest is 0.5 s, and responses stay bounded."""
 
 
 class FormatError(ValueError):
-    """Text, tokens or values that do not follow a response format.
+    """A format that cannot be read without doubt, or text, tokens or values that do not follow a format.
 
     ``line`` and ``column`` count from 1 where text was read.
     """
@@ -41,6 +43,49 @@ class FormatError(ValueError):
     def __init__(self, message: str, line: int | None = None, column: int | None = None) -> None:
         super().__init__(message if line is None else f"line {line}, column {column}: {message}")
         self.message, self.line, self.column = message, line, column
+
+
+@dataclass(frozen=True)
+class Values:
+    """What a response says.
+
+    Attributes:
+        by_section: section name to its values, in the order in which the format writes them. Sections
+            without a value are left out.
+    """
+
+    by_section: Mapping[str, tuple[Value, ...]]
+
+    @classmethod
+    def of(cls, values: Mapping[str, Value]) -> Values:
+        """One value for each section."""
+        return cls({section: (value,) for section, value in values.items()})
+
+    def all(self, section: str) -> tuple[Value, ...]:
+        """The values of a section, none where it holds none."""
+        return self.by_section.get(section, ())
+
+    def get(self, section: str) -> Value | None:
+        """The one value of a section; None where it has none. Raises `FormatError` where it has several."""
+        return self[section] if section in self.by_section else None
+
+    def __getitem__(self, section: str) -> Value:
+        """The one value of a section.
+
+        Raises:
+            KeyError: the section has no value.
+            FormatError: the section has several values; see `all`.
+        """
+        values = self.by_section[section]
+        if len(values) != 1:
+            raise FormatError(f"section {section!r} holds {len(values)} values, not one")
+        return values[0]
+
+    def __contains__(self, section: object) -> bool:
+        return section in self.by_section
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.by_section)
 
 
 @dataclass(frozen=True)
@@ -55,14 +100,34 @@ class Option:
     """One word of a choice, and what follows when it is taken."""
 
     text: str
-    then: Piece
+    then: Piece = Literal("")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several words. ``name`` lets controls and metrics refer to it."""
+    """One of several words; its value is the option's text.
+
+    An option may be the beginning of another, or empty, if what follows it tells them apart at the first
+    character. ``name`` lets controls and records refer to the choice.
+    """
 
     options: tuple[Option, ...]
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        texts = [option.text for option in self.options]
+        if not texts or len(set(texts)) < len(texts):
+            raise FormatError(f"a choice needs options of different texts, got {texts}")
+
+
+@dataclass(frozen=True)
+class Maybe:
+    """A piece or nothing; its value is whether the piece is there, before the piece's own values.
+
+    What the piece begins with must differ from what follows it at the first character.
+    """
+
+    piece: Piece
     name: str | None = None
 
 
@@ -75,7 +140,7 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Section:
-    """A named run of tokens; the innermost section names a token."""
+    """A named run of tokens; the innermost section names a token and holds its value."""
 
     name: str
     body: Piece
@@ -83,78 +148,93 @@ class Section:
 
 @dataclass(frozen=True)
 class FreeText:
-    """Free words up to ``stop``, which is written after at most ``max_tokens`` tokens."""
+    """Free words up to ``stop``, which is written after 1 to ``max_tokens`` tokens of text.
+
+    The text never contains the stop, but may hold a part of it, such as the ``<`` of ``</think>``.
+
+    Attributes:
+        multiline: whether the text may have several lines.
+    """
 
     stop: str
     max_tokens: int
+    multiline: bool = False
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        if not self.stop or self.max_tokens < 1:
+            raise FormatError("free text needs a stop and at least one token")
+        for size in range(1, len(self.stop)):
+            border = self.stop[:size]
+            if self.stop.endswith(border) and (self.multiline or "\n" not in border):
+                # Otherwise the stop could be there twice, overlapping, and where the text ends be in doubt.
+                raise FormatError(f"the stop {self.stop!r} of a free text must not end as it begins")
 
 
 @dataclass(frozen=True)
 class Codes:
-    """``count`` codes, the i-th out of the i-th codebook."""
+    """``count`` codes out of a named alphabet of the vocabulary; its value is a tuple of numbers.
 
-    count: int = CODES
+    Of an alphabet with several codebooks the i-th code is one of the i-th codebook, and ``count`` is their
+    number. Of an alphabet with one codebook every code is one of it.
 
-
-@dataclass(frozen=True)
-class PlanTracks:
-    """A plan's bullet text over ``groups``; only partitions of the horizon can be written."""
-
-    groups: tuple[Group, ...] = GROUPS
-
-    def expand(self) -> Sequence:
-        """The plan in simpler pieces."""
-        return Sequence(
-            tuple(
-                piece
-                for group in self.groups
-                for piece in (Literal(f"- {group}\n"), Track(group, start=0, segments_left=MAX_SEGMENTS))
-            )
-        )
-
-
-@dataclass(frozen=True)
-class Track:
-    """The rest of one track from the tick ``start`` on, in at most ``segments_left`` meta-actions.
-
-    No word follows itself: ``previous`` is the word before ``start``.
+    Attributes:
+        size: codes that each codebook must have; None for any number.
     """
 
-    group: Group
-    start: int
-    segments_left: int
-    previous: str | None = None
+    alphabet: str
+    count: int
+    size: int | None = None
+    name: str | None = None
 
-    def expand(self) -> Sequence:
-        """One meta-action's times in simpler pieces, and its word behind each end time."""
-        first = TICKS if self.segments_left == 1 else self.start + 1
-        ends = tuple(
-            Option(format_tick(end), TrackWord(self.group, end, self.segments_left - 1, self.previous))
-            for end in range(first, TICKS + 1)
-        )
-        return Sequence((Literal(f"  - {format_tick(self.start)}s-"), Choice(ends)))
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise FormatError(f"at least one code must be written, not {self.count}")
+
+
+class Shorthand(ABC):
+    """A piece that stands for simpler pieces. Its dataclass must be frozen."""
+
+    @abstractmethod
+    def expand(self) -> Piece:
+        """What it stands for, which may hold other shorthands."""
+
+
+class Compound(Shorthand):
+    """A shorthand that makes one value of the values of the pieces that it stands for."""
+
+    name: str | None
+
+    @abstractmethod
+    def join(self, parts: tuple[Value, ...]) -> Value:
+        """The value of values that were read, in order."""
+
+    @abstractmethod
+    def split(self, value: Value) -> tuple[Value, ...]:
+        """The inverse of `join`; raises `FormatError` for what is no value of this piece."""
+
+    def explain(self, text: str, line: int) -> FormatError | None:
+        """A better error about ``text``, which begins at the first column of ``line`` and does not parse."""
+        return None
 
 
 @dataclass(frozen=True)
-class TrackWord:
-    """The word of the meta-action that ends at the tick ``end``, and the rest of its track."""
+class Record(Shorthand):
+    """A piece whose values become one mapping; every piece in it that has a value has a name."""
 
-    group: Group
-    end: int
-    segments_left: int
-    previous: str | None
+    body: Piece
+    name: str | None = None
 
-    def expand(self) -> Sequence:
-        """The words in simpler pieces; behind each the rest of the track, if there is one."""
-        words = []
-        for word in WORDS[self.group]:
-            if word != self.previous:
-                rest = (Track(self.group, self.end, self.segments_left, word),) if self.end < TICKS else ()
-                words.append(Option(f" {word}", Sequence((Literal("\n"), *rest))))
-        return Sequence((Literal("s:"), Choice(tuple(words))))
+    def __post_init__(self) -> None:
+        _check_names(self.body, frozenset())
+        _refuse_sections(self.body, "a record")
+
+    def expand(self) -> Piece:
+        """Its body."""
+        return self.body
 
 
-Piece = Literal | Choice | Sequence | Section | FreeText | Codes | PlanTracks | Track | TrackWord
+Piece = Literal | Choice | Maybe | Sequence | Section | FreeText | Codes | Shorthand
 
 
 @dataclass(frozen=True)
@@ -166,26 +246,71 @@ class Format:
 
     def sections(self) -> tuple[str, ...]:
         """The names of all sections, in order of declaration."""
-        names: dict[str, None] = {}
-        _collect_sections(self.body, names)
-        return tuple(names)
+        return tuple(dict.fromkeys(_sections(self.body)))
 
 
-def code_text(stage: int, code: int) -> str:
-    """How a trajectory code is spelled in text and in the vocabulary."""
-    return f"<|traj_{stage}_{code:03d}|>"
-
-
-def _collect_sections(piece: Piece, names: dict[str, None]) -> None:
+def holds(piece: Piece) -> int | None:
+    """How many values a piece holds; None where that depends on what is written."""
     match piece:
-        case Section(name, body):
-            names[name] = None
-            _collect_sections(body, names)
+        case Literal() | Section():
+            return 0
         case Sequence(parts):
-            for part in parts:
-                _collect_sections(part, names)
+            counts = [holds(part) for part in parts]
+            return None if None in counts else sum(filter(None, counts))
         case Choice(options):
-            for option in options:
-                _collect_sections(option.then, names)
+            [count, *others] = {holds(option.then) for option in options}
+            return None if others or count is None else 1 + count
+        case Maybe(inner):
+            return 1 if holds(inner) == 0 else None
         case _:
-            pass
+            return 1
+
+
+def repeatable(piece: Piece) -> None:
+    """Raise `FormatError` unless ``piece`` may be repeated: it holds exactly one value, and no section."""
+    if holds(piece) != 1:
+        raise FormatError("what is repeated must hold one value; make a record of several")
+    _refuse_sections(piece, "a repeat")
+
+
+def _children(piece: Piece) -> collections.abc.Sequence[Piece]:
+    match piece:
+        case Section(_, body) | Record(body):
+            return (body,)
+        case Sequence(parts):
+            return parts
+        case Choice(options):
+            return [option.then for option in options]
+        case Maybe(inner):
+            return (inner,)
+        case _:
+            # A compound holds no section.
+            return ()
+
+
+def _sections(piece: Piece) -> Iterator[str]:
+    if isinstance(piece, Section):
+        yield piece.name
+    for child in _children(piece):
+        yield from _sections(child)
+
+
+def _refuse_sections(piece: Piece, where: str) -> None:
+    if section := next(_sections(piece), None):
+        raise FormatError(f"section {section!r} must not stand within {where}")
+
+
+def _check_names(piece: Piece, above: frozenset[str]) -> frozenset[str]:
+    """The names of values up to the end of ``piece``; raises `FormatError` for one missing or there twice."""
+    if isinstance(piece, Choice | Maybe | FreeText | Codes | Compound | Record):
+        if piece.name is None:
+            raise FormatError(f"every value of a record needs a name, as does this {type(piece).__name__}")
+        if piece.name in above:
+            raise FormatError(f"a record has two values named {piece.name!r}")
+        above |= {piece.name}
+    if isinstance(piece, Choice):
+        return above.union(*(_check_names(option.then, above) for option in piece.options))
+    if isinstance(piece, Sequence | Maybe):
+        for child in _children(piece):
+            above = _check_names(child, above)
+    return above

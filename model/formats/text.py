@@ -2,110 +2,144 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 
-from model.driving.plan import PlanError, parse_plan
+from model.driving.plan import Plan
+from model.formats.cursor import CompiledFormat
 from model.formats.pieces import (
     Choice,
     Codes,
-    Format,
+    Compound,
     FormatError,
     FreeText,
     Literal,
+    Maybe,
     Option,
     Piece,
-    PlanTracks,
+    Record,
     Section,
     Sequence,
-    Track,
-    TrackWord,
+    Shorthand,
     Value,
     Values,
 )
 
-_CODE = re.compile(r"<\|traj_(\d+)_(\d+)\|>")
-_BULLET = re.compile(r"(?:  )?- .*\n?")
+_Parts = list[tuple[str | None, Value]]
+"""Values with the names of their pieces, in order."""
 
 
-def parse(format: Format, text: str) -> Values:
-    """The values of a whole response in ``format``.
+def parse(compiled: CompiledFormat, text: str, given: Mapping[str, Plan] | None = None) -> Values:
+    """The values of a whole response, of exactly the texts that a cursor can write.
+
+    Args:
+        compiled: the format, over a vocabulary: how long free text may be depends on its tokens.
+        text: the response.
+        given: the response began at ``compiled.start(given)``.
 
     Raises:
         FormatError: with line and column; also for text behind the response's end.
     """
-    reader = _Reader(text)
-    reader.read(format.body, "")
+    reader = _Reader(compiled, text)
+    reader.read(compiled.body(given), reader.section(""))
     if reader.position != len(text):
         raise reader.error("expected the end of the response")
-    return reader.values
+    return Values(
+        {name: tuple(value for _, value in parts) for name, parts in reader.sections.items() if parts}
+    )
 
 
-@dataclass
 class _Reader:
-    text: str
-    position: int = 0
-    values: dict[str, Value] = field(default_factory=dict)
+    def __init__(self, compiled: CompiledFormat, text: str) -> None:
+        self._compiled, self._text, self.position = compiled, text, 0
+        self.sections: dict[str, _Parts] = {}
 
-    def read(self, piece: Piece, section: str) -> None:
+    def section(self, name: str) -> _Parts:
+        """The values of a section so far."""
+        return self.sections.setdefault(name, [])
+
+    def read(self, piece: Piece, values: _Parts) -> None:
+        """Read ``piece`` from the position on, its values into ``values``."""
         match piece:
             case Literal(text):
                 self._literal(text)
             case Sequence(parts):
                 for part in parts:
-                    self.read(part, section)
+                    self.read(part, values)
             case Section(name, body):
-                self.read(body, name)
-            case Choice(options):
+                self.read(body, self.section(name))
+            case Choice(options, name):
                 option = self._option(options)
-                self.values[section] = option.text
+                values.append((name, option.text))
                 self.position += len(option.text)
-                self.read(option.then, section)
-            case PlanTracks():
-                self._plan(section)
-            case FreeText(stop):
-                end = self.text.find(stop, self.position)
-                if end <= self.position:
-                    raise self.error(f"expected text that ends with {stop!r}")
-                self.values[section] = self.text[self.position : end]
-                self.position = end + len(stop)
-            case Codes(count):
-                self._codes(count, section)
-            case Track() | TrackWord():
-                raise TypeError("a track is read as part of its plan")
+                self.read(option.then, values)
+            case Maybe(inner, name):
+                ahead = self._text[self.position : self.position + 1].encode()
+                there = bool(ahead) and ahead[0] in self._compiled.first_bytes(inner)
+                values.append((name, there))
+                if there:
+                    self.read(inner, values)
+            case FreeText():
+                values.append((piece.name, self._free_text(piece)))
+            case Codes():
+                values.append((piece.name, self._codes(piece)))
+            case Record(body, name):
+                fields: _Parts = []
+                self.read(body, fields)
+                values.append((name, {field: value for field, value in fields if field is not None}))
+            case Compound():
+                values.append((piece.name, self._compound(piece)))
+            case Shorthand():
+                self.read(self._compiled.expanded(piece), values)
 
     def error(self, message: str) -> FormatError:
-        before = self.text[: self.position]
+        """An error at the position."""
+        before = self._text[: self.position]
         return FormatError(message, before.count("\n") + 1, self.position - before.rfind("\n"))
 
     def _literal(self, text: str) -> None:
-        if not self.text.startswith(text, self.position):
-            found = self.text[self.position : self.position + len(text)]
+        if not self._text.startswith(text, self.position):
+            found = self._text[self.position : self.position + len(text)]
             raise self.error(f"expected {text!r}, found {found!r}")
         self.position += len(text)
 
     def _option(self, options: tuple[Option, ...]) -> Option:
-        for option in options:
-            if self.text.startswith(option.text, self.position):
-                return option
-        raise self.error(f"expected one of {', '.join(repr(option.text) for option in options)}")
+        found = [option for option in options if self._text.startswith(option.text, self.position)]
+        if not found:
+            raise self.error(f"expected one of {', '.join(repr(option.text) for option in options)}")
+        # What follows a shorter one never goes on as the longer one does.
+        return max(found, key=lambda option: len(option.text))
 
-    def _plan(self, section: str) -> None:
-        start = self.position
-        while bullet := _BULLET.match(self.text, self.position):
-            self.position = bullet.end()
-        line = self.text.count("\n", 0, start) + 1
+    def _free_text(self, piece: FreeText) -> str:
+        end = self._text.find(piece.stop, self.position)
+        if end <= self.position:
+            raise self.error(f"expected text that ends with {piece.stop!r}")
+        text = self._text[self.position : end]
         try:
-            self.values[section] = parse_plan(self.text[start : self.position], line)
-        except PlanError as error:
-            raise FormatError(error.message, error.line, error.column) from None
+            self._compiled.text(piece).spell(text)
+        except FormatError as error:
+            raise self.error(error.message) from error
+        self.position = end + len(piece.stop)
+        return text
 
-    def _codes(self, count: int, section: str) -> None:
+    def _codes(self, piece: Codes) -> tuple[int, ...]:
         codes = []
-        for stage in range(count):
-            code = _CODE.match(self.text, self.position)
-            if code is None or int(code[1]) != stage:
-                raise self.error(f"expected trajectory code {stage + 1} of {count}")
-            codes.append(int(code[2]))
-            self.position = code.end()
-        self.values[section] = tuple(codes)
+        for place in range(piece.count):
+            spellings = self._compiled.spellings(piece, place)
+            for size in sorted({len(text) for text in spellings}, reverse=True):
+                code = spellings.get(self._text[self.position : self.position + size])
+                if code is not None:
+                    codes.append(code)
+                    self.position += size
+                    break
+            else:
+                raise self.error(f"expected {piece.alphabet} code {place + 1} of {piece.count}")
+        return tuple(codes)
+
+    def _compound(self, piece: Compound) -> Value:
+        start, parts = self.position, list[tuple[str | None, Value]]()
+        try:
+            self.read(self._compiled.expanded(piece), parts)
+        except FormatError as error:
+            line = self._text.count("\n", 0, start) + 1
+            raise piece.explain(self._text[start:], line) or error from None
+        return piece.join(tuple(value for _, value in parts))

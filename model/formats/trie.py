@@ -7,11 +7,9 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from model.formats.pieces import FormatError
-
 
 class Node:
-    """A node of a trie over tokenised options."""
+    """A node of a trie over tokenised options; ``option`` is the position of the one that may end here."""
 
     __slots__ = ("children", "ids", "option")
 
@@ -29,20 +27,12 @@ class Node:
 
 
 def build_trie(texts: Sequence[str], encode: Callable[[str], Sequence[int]]) -> Node:
-    """The trie over ``texts``; leaves know the position of their text.
-
-    Raises:
-        FormatError: a text's tokens begin another's, so that where it ends could not be told.
-    """
+    """The trie over different ``texts``."""
     root = Node()
     for position, text in enumerate(texts):
         node = root
         for token in encode(text):
-            if node.option is not None:
-                raise FormatError(f"option {texts[node.option]!r} is a beginning of {text!r} in tokens")
             node = node.children.setdefault(token, Node())
-        if node.children or node.option is not None:
-            raise FormatError(f"option {text!r} is a beginning of another option in tokens")
         node.option = position
     stack = [root]
     while stack:

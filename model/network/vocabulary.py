@@ -6,8 +6,8 @@ Special tokens are spelt as in CF-VLA sections 7 and 8; the route's markers and 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
-from functools import lru_cache
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property, lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -97,7 +97,7 @@ class Vocabulary:
         if missing:
             raise VocabularyError(f"the tokenizer lacks {', '.join(missing)}")
         self.codec_size = self._count_codes()
-        self._free: npt.NDArray[np.bool_] | None = None
+        self._free: dict[bool, npt.NDArray[np.bool_]] = {}
         self._encode = lru_cache(_ENCODE_CACHE)(self._encode_now)
 
     def __len__(self) -> int:
@@ -131,19 +131,25 @@ class Vocabulary:
         """The inverse of `codes_to_ids`; raises ValueError for ids that are not codes of their stage."""
         return tuple(self.code_ids(stage).index(int(token)) for stage, token in enumerate(ids))
 
-    def free_text_ids(self) -> npt.NDArray[np.bool_]:
+    @cached_property
+    def alphabets(self) -> Mapping[str, tuple[range, ...]]:
+        """Named alphabets of codes: for each codebook the ids of its tokens."""
+        return {"trajectory": tuple(map(self.code_ids, range(CODE_STAGES)))}
+
+    def free_text_ids(self, *, multiline: bool = False) -> npt.NDArray[np.bool_]:
         """Mask bool [len(self)] of tokens that free text may hold.
 
         These are ordinary tokens (no markers, no codes) whose bytes are printable UTF-8 on their own: no
-        line breaks of any kind, and no halves of a character that could join into one.
+        halves of a character that could join into one, and no line breaks but, with ``multiline``, ``\\n``.
         """
-        if self._free is None:
+        if multiline not in self._free:
             added = set(self._backend.get_added_tokens_decoder())
-            self._free = np.zeros(self._length, np.bool_)
+            mask = np.zeros(self._length, np.bool_)
             for token, index in self._ids.items():
-                self._free[index] = index not in added and _is_printable(token)
-            self._free.flags.writeable = False
-        return self._free
+                mask[index] = index not in added and _is_printable(token, multiline)
+            mask.flags.writeable = False
+            self._free[multiline] = mask
+        return self._free[multiline]
 
     def _encode_now(self, text: str) -> tuple[int, ...]:
         return tuple(self._backend.encode(text, add_special_tokens=False).ids)
@@ -233,8 +239,9 @@ def _byte_of_character() -> dict[str, int]:
 _BYTE_OF: Final = _byte_of_character()
 
 
-def _is_printable(token: str) -> bool:
+def _is_printable(token: str, multiline: bool) -> bool:
     try:
-        return bytes(_BYTE_OF[character] for character in token).decode("utf-8").isprintable()
+        text = bytes(_BYTE_OF[character] for character in token).decode("utf-8")
+        return (text.replace("\n", "") if multiline else text).isprintable()
     except (KeyError, UnicodeDecodeError):
         return False

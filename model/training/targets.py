@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 from model.driving.plan import Plan
 from model.formats.cursor import CompiledFormat, Token
@@ -23,6 +23,7 @@ PAPER_WEIGHTS: Final[SectionWeights] = MappingProxyType(
 """w_act : w_meta : w_CF = 1 : 10 : 10 (CF-VLA section 7); the branch word counts as a meta-action token."""
 
 Task = Literal["traj_only", "cf_vla"]
+"""Formats that there are targets for."""
 
 
 @dataclass(frozen=True)
@@ -45,31 +46,38 @@ class Target:
 
 
 def target_values(
-    task: Task, plan: Plan, codes: Sequence[int], reflection: Reflection | None = None
+    format: str, plan: Plan, codes: Sequence[int], reflection: Reflection | None = None
 ) -> Values:
     """The values of the response that an expert would give.
 
     Args:
-        task: the response format's name.
+        format: the response format's name, one of `Task`.
         plan: the expert's plan.
         codes: the expert's trajectory codes.
         reflection: makes it a counterfactual example: first the model's plan, then reasoning and ``plan``,
             or the trajectory at once.
+
+    Raises:
+        ValueError: nothing is known about what to say in this format.
     """
     trajectory = tuple(int(code) for code in codes)
-    if task == "traj_only":
-        return {"trajectory": trajectory}
+    if format == "traj_only":
+        return Values.of({"trajectory": trajectory})
+    if format != "cf_vla":
+        raise ValueError(f"no targets for format {format!r}; known are {', '.join(get_args(Task))}")
     if reflection is None:
-        return {"plan": plan, BRANCH: ACTION, "trajectory": trajectory}
+        return Values.of({"plan": plan, BRANCH: ACTION, "trajectory": trajectory})
     if not reflection.thinking:
-        return {"plan": reflection.first_plan, BRANCH: ACTION, "trajectory": trajectory}
-    return {
-        "plan": reflection.first_plan,
-        BRANCH: THINKING,
-        "thinking": reflection.thinking,
-        "revised_plan": plan,
-        "trajectory": trajectory,
-    }
+        return Values.of({"plan": reflection.first_plan, BRANCH: ACTION, "trajectory": trajectory})
+    return Values.of(
+        {
+            "plan": reflection.first_plan,
+            BRANCH: THINKING,
+            "thinking": reflection.thinking,
+            "revised_plan": plan,
+            "trajectory": trajectory,
+        }
+    )
 
 
 def weigh(tokens: Sequence[Token], weights: SectionWeights, *, counterfactual: bool = False) -> Target:
@@ -91,7 +99,13 @@ def make_target(
     weights: SectionWeights = PAPER_WEIGHTS,
     reflection: Reflection | None = None,
 ) -> Target:
-    """Render and weigh the expert's response in ``compiled``'s format."""
-    task: Task = "traj_only" if compiled.format.name == "traj_only" else "cf_vla"
-    tokens = compiled.render(target_values(task, plan, codes, reflection))
+    """Render and weigh the expert's response in ``compiled``'s format.
+
+    Raises:
+        ValueError: nothing is known about what to say in this format; a `FormatError` where it cannot say it.
+    """
+    values = target_values(compiled.format.name, plan, codes, reflection)
+    # Plans of scenes without lanes lack a group, which the model by itself always writes.
+    plans = {section: value for section in values if isinstance(value := values[section], Plan)}
+    tokens = compiled.render(values, given=plans)
     return weigh(tokens, weights, counterfactual=reflection is not None)

@@ -24,7 +24,9 @@ from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
 from model.engines.torch.engine import TorchEngine
 from model.evaluation.open_loop import BASELINES, evaluate_baselines, evaluate_trajectories
 from model.formats.cf_vla import CF_VLA
+from model.formats.cursor import CompiledFormat
 from model.formats.text import parse
+from model.network.checkpoint import read_parts
 from service.settings import Settings
 from tests.service.serving import Served, serve
 
@@ -110,8 +112,9 @@ def test_a_thousand_hot_draws_all_parse() -> None:
 
     draws = asyncio.run(write())
     assert len(draws) == 12 * 84
+    compiled = CompiledFormat(CF_VLA, read_parts(CHECKPOINT).vocabulary)
     for draw in draws:
-        values = parse(CF_VLA, draw.text)
+        values = parse(compiled, draw.text)
         assert (values["plan"], values["branch"], values["trajectory"]) == (
             draw.plan,
             draw.branch,

@@ -84,7 +84,8 @@ def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> t
         use_cache=True,
     ).logits[0, -1]
     given = {} if controls.prefill is None else {"plan": controls.prefill}
-    cursor = CompiledFormat(format, loaded.vocabulary).start(given)
+    compiled = CompiledFormat(format, loaded.vocabulary)
+    cursor = compiled.start(given)
     tokens: list[Token] = []
     binding = binding_of(request, loaded.codec, loaded.vocabulary)
     think_probability = None
@@ -116,7 +117,7 @@ def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> t
             use_cache=True,
         ).logits[0, -1]
     text = loaded.vocabulary.decode([token.id for token in tokens])
-    values: Any = parse(format, text)
+    values: Any = parse(compiled, text, given)
     draw = Draw(
         index=index,
         text=text,

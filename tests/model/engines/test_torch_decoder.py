@@ -98,7 +98,7 @@ def test_cached_steps_equal_a_full_pass(exact: Loaded) -> None:
     draw = decode(Decoder(Runner(exact, 1)), one)["a", 0]
     inputs = exact.inputs.build(one.scene, "cf_vla")
     compiled = CompiledFormat(CF_VLA, exact.vocabulary)
-    response = compiled.render(parse(CF_VLA, draw.text))
+    response = compiled.render(parse(compiled, draw.text))
     ids = torch.tensor([[*inputs.prompt.ids, *(token.id for token in response)]])
     logits = exact.model(
         input_ids=ids,
@@ -149,7 +149,7 @@ def test_every_response_parses_at_high_temperature(untrained_checkpoint: Path) -
     compiled = CompiledFormat(CF_VLA, loaded.vocabulary)
     assert len(draws) == 24
     for draw in draws.values():
-        values = parse(CF_VLA, draw.text)
+        values = parse(compiled, draw.text)
         assert values["plan"] == draw.plan
         if draw.branch == "Action:":
             assert draw.tokens == Counter(token.section for token in compiled.render(values))

@@ -2,42 +2,28 @@ from __future__ import annotations
 
 from itertools import cycle, pairwise
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, parse_plan
 from model.formats.cf_vla import CF_VLA, FORMATS, MAX_THINKING_TOKENS, TRAJ_ONLY
-from model.formats.cursor import CompiledFormat, Cursor, Token
-from model.formats.pieces import MAX_SEGMENTS, Choice, Format, FormatError, Literal, Option, Values
+from model.formats.cursor import CompiledFormat
+from model.formats.pieces import Format, FormatError, Value, Values
+from model.formats.plan_tracks import MAX_SEGMENTS
 from model.formats.text import parse
-from tests.model.formats.strategies import branching_formats, cf_vla_values, plans
-from tests.model.formats.vocabulary import ByteVocabulary
+from tests.model.formats.strategies import VOCABULARY, branching_formats, cf_vla_values, plans
+from tests.model.formats.test_laws import walk
 
-VOCABULARY = ByteVocabulary()
 COMPILED = CompiledFormat(CF_VLA, VOCABULARY)
+FULL = parse_plan("".join(f"- {group}\n  - 0.0s-6.4s: {WORDS[group][0]}\n" for group in GROUPS))
 PLAN = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n- lateral\n  - 0.0s-6.4s: Straight\n")
-
-
-def walk(cursor: Cursor, seed: int) -> list[Token]:
-    """A response written by uniform random choices."""
-    random = np.random.default_rng(seed)
-    written: list[Token] = []
-    while True:
-        forced, cursor = cursor.forced()
-        written += forced
-        if cursor.done:
-            return written
-        token = int(random.choice(cursor.allowed().ids))
-        written.append(Token(token, cursor.section))
-        cursor = cursor.advance(token)
 
 
 @given(cf_vla_values())
 def test_rendered_values_parse_to_themselves(values: Values) -> None:
     tokens = COMPILED.render(values)
-    assert parse(CF_VLA, VOCABULARY.decode([token.id for token in tokens])) == values
+    assert parse(COMPILED, VOCABULARY.decode([token.id for token in tokens])) == values
 
 
 @given(cf_vla_values())
@@ -54,7 +40,7 @@ def test_rendered_tokens_can_be_written_one_by_one(values: Values) -> None:
 def test_whatever_is_written_parses_and_renders_back(name: str, seed: int) -> None:
     compiled = CompiledFormat(FORMATS[name], VOCABULARY)
     tokens = walk(compiled.start(), seed)
-    values = parse(FORMATS[name], VOCABULARY.decode([token.id for token in tokens]))
+    values = parse(compiled, VOCABULARY.decode([token.id for token in tokens]))
     # Free text may be split otherwise by the tokenizer; everything else is the same to the token.
     rendered = compiled.render(values)
     keep = [token for token in tokens if token.section != "thinking"]
@@ -66,23 +52,23 @@ def test_whatever_is_written_in_a_made_up_format_parses(format: Format, seed: in
     compiled = CompiledFormat(format, VOCABULARY)
     tokens = walk(compiled.start(), seed)
     assert len(tokens) <= compiled.longest()
-    values = parse(format, VOCABULARY.decode([token.id for token in tokens]))
-    assert {token.section for token in tokens} >= values.keys() >= {"plan", "branch", "trajectory"}
+    values = parse(compiled, VOCABULARY.decode([token.id for token in tokens]))
+    assert {token.section for token in tokens} >= set(values) >= {"plan", "branch", "trajectory"}
 
 
 @given(plans(), st.integers(0, 1000))
 def test_a_given_plan_is_forced_and_tokenised_as_the_model_writes_it(plan: Plan, seed: int) -> None:
     forced, _ = COMPILED.start({"plan": plan}).forced()
-    values: Values = {"plan": plan, "branch": "Action:", "trajectory": (0,) * 6}
+    values = Values.of({"plan": plan, "branch": "Action:", "trajectory": (0,) * 6})
     assert forced == [token for token in COMPILED.render(values) if token.section == "plan"]
     written = walk(COMPILED.start({"plan": plan}), seed)
-    assert parse(CF_VLA, VOCABULARY.decode([token.id for token in written]))["plan"] == plan
+    assert parse(COMPILED, VOCABULARY.decode([token.id for token in written]), {"plan": plan})["plan"] == plan
 
 
 @given(st.integers(0, 2**32 - 1))
 def test_no_word_follows_itself(seed: int) -> None:
     written = [token.id for token in walk(COMPILED.start(), seed)]
-    plan = parse(CF_VLA, VOCABULARY.decode(written))["plan"]
+    plan = parse(COMPILED, VOCABULARY.decode(written))["plan"]
     assert isinstance(plan, Plan)
     assert all(one.word != two.word for _, track in plan.tracks() for one, two in pairwise(track))
 
@@ -97,7 +83,10 @@ def test_equal_neighbours_of_a_given_plan_are_joined() -> None:
 
 def test_a_given_plan_may_lack_a_group() -> None:
     written = walk(COMPILED.start({"plan": PLAN}), 0)
-    assert parse(CF_VLA, VOCABULARY.decode([token.id for token in written]))["plan"] == PLAN
+    text = VOCABULARY.decode([token.id for token in written])
+    assert parse(COMPILED, text, {"plan": PLAN})["plan"] == PLAN
+    with pytest.raises(FormatError, match="expected '- lane"):
+        parse(COMPILED, text)
 
 
 def test_end_times_lie_behind_the_start() -> None:
@@ -115,7 +104,7 @@ def test_end_times_lie_behind_the_start() -> None:
 
 def test_the_last_segment_reaches_the_horizon() -> None:
     written = [token.id for token in walk(COMPILED.start(), 7)]
-    plan = parse(CF_VLA, VOCABULARY.decode(written))["plan"]
+    plan = parse(COMPILED, VOCABULARY.decode(written))["plan"]
     assert isinstance(plan, Plan)
     assert all(len(track) <= 12 for _, track in plan.tracks())
 
@@ -150,28 +139,26 @@ def test_tokens_out_of_turn_are_refused() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"plan": PLAN}, "section 'branch' needs a value"),
-        ({"plan": PLAN, "branch": "Action"}, "none of"),
-        ({"plan": PLAN, "branch": "Action:", "trajectory": (1, 2)}, "cannot be written"),
-        ({"plan": PLAN, "branch": "Thinking:", "thinking": "a\nb"}, "must be text without"),
-        ({"plan": PLAN, "branch": "Thinking:", "thinking": "é" * 500 + "a" * 500}, "at most"),
+        ({"plan": FULL}, "section 'branch' needs a value"),
+        ({"plan": PLAN}, "a plan with the groups longitudinal, lateral, lane is needed"),
+        ({"plan": FULL, "branch": "Action"}, "none of"),
+        ({"plan": FULL, "branch": "Action:", "trajectory": (1, 2)}, "cannot be written"),
+        ({"plan": FULL, "branch": "Action:", "trajectory": (16,) * 6}, "code 16 is none of 0 to 15"),
+        ({"plan": FULL, "branch": "Action:", "trajectory": (0,) * 6, "thinking": "a"}, "more values than"),
+        ({"plan": FULL, "branch": "Thinking:", "thinking": "a\nb"}, "must be text without"),
+        ({"plan": FULL, "branch": "Thinking:", "thinking": "caf\xe9"}, "no allowed token"),
+        ({"plan": FULL, "branch": "Thinking:", "thinking": "a" * 500}, "at most 160"),
         ({"speech": "a"}, "needs a value"),
     ],
 )
-def test_values_that_cannot_be_written_are_refused(values: Values, message: str) -> None:
+def test_values_that_cannot_be_written_are_refused(values: dict[str, Value], message: str) -> None:
     with pytest.raises(FormatError, match=message):
-        COMPILED.render(values)
+        COMPILED.render(Values.of(values))
 
 
 def test_given_sections_must_exist() -> None:
     with pytest.raises(FormatError, match="has no section"):
         CompiledFormat(TRAJ_ONLY, VOCABULARY).start({"plan": PLAN})
-
-
-def test_options_must_not_begin_one_another() -> None:
-    choice = Choice((Option("a", Literal("")), Option("ab", Literal(""))))
-    with pytest.raises(FormatError, match="is a beginning of"):
-        CompiledFormat(Format("bad", choice), VOCABULARY).start()
 
 
 @given(cf_vla_values())
@@ -187,11 +174,13 @@ def test_the_longest_is_no_wild_guess() -> None:
         text += f"- {group}\n"
         text += "".join(f"  - {start}s-{end}s: {next(longest)}\n" for start, end in pairwise(times))
     plan = parse_plan(text)
-    values: Values = {
-        "plan": plan,
-        "branch": "Thinking:",
-        "thinking": "x" * MAX_THINKING_TOKENS,
-        "revised_plan": plan,
-        "trajectory": (0,) * 6,
-    }
+    values = Values.of(
+        {
+            "plan": plan,
+            "branch": "Thinking:",
+            "thinking": "x" * MAX_THINKING_TOKENS,
+            "revised_plan": plan,
+            "trajectory": (0,) * 6,
+        }
+    )
     assert COMPILED.longest() < 1.1 * len(COMPILED.render(values))

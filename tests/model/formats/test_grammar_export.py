@@ -9,14 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from model.driving.plan import WORDS
 from model.formats.cf_vla import CF_VLA, FORMATS
-from model.formats.cursor import CompiledFormat, Cursor
+from model.formats.cursor import AtChoice, CompiledFormat, Cursor
 from model.formats.grammar_export import to_lark
 from model.formats.pieces import Values
-from tests.model.formats.strategies import cf_vla_values
-from tests.model.formats.vocabulary import SPECIAL, ByteVocabulary
+from model.formats.plan_tracks import Track, TrackWord
+from tests.model.formats.strategies import VOCABULARY, cf_vla_values, compiled_formats
+from tests.model.formats.test_laws import walk
+from tests.model.formats.vocabulary import SPECIAL
 
-VOCABULARY = ByteVocabulary()
 COMPILED = CompiledFormat(CF_VLA, VOCABULARY)
 
 
@@ -25,7 +27,7 @@ class _Tokenizer:
 
     eos_token_id = SPECIAL.index("<|endoftext|>")
     bos_token_id = None
-    special_token_ids: ClassVar = list(range(len(SPECIAL) + 6 * VOCABULARY.size))
+    special_token_ids: ClassVar = list(range(VOCABULARY.special))
     tokens: ClassVar = [text.encode() for text in VOCABULARY.texts]
 
     def __call__(self, text: str | bytes) -> list[int]:
@@ -90,3 +92,47 @@ def test_it_refuses_a_gap() -> None:
     tokens = list(VOCABULARY.encode(text))
     accepted = BASE["cf_vla"].deep_copy().validate_tokens(tokens)
     assert VOCABULARY.decode(tokens[:accepted]).endswith("Keep Speed\n  - ")
+
+
+def in_plan(cursor: Cursor) -> bool:
+    """Whether the cursor stands in a plan, whose meta-actions the grammar does not count."""
+    rest = cursor.rest
+    while rest is not None:
+        piece, _, rest = rest
+        if isinstance(piece, Track | TrackWord):
+            return True
+    if not isinstance(cursor.active, AtChoice):
+        return False
+    return any(
+        isinstance(option.then, TrackWord) or option.text in PLAN_WORDS
+        for option in cursor.active.choice.options
+    )
+
+
+PLAN_WORDS = {f" {word}" for words in WORDS.values() for word in words}
+
+
+@settings(deadline=None)
+@given(compiled_formats(), st.integers(0, 2**32 - 1))
+def test_it_allows_what_the_cursor_allows_in_any_format(compiled: CompiledFormat, seed: int) -> None:
+    cursor = compiled.start()
+    state = matcher(cursor)
+    for token in walk(cursor, seed):
+        mine, theirs = set(cursor.allowed().ids.tolist()), allowed_by(state)
+        assert mine == theirs or (mine <= theirs and in_plan(cursor))
+        assert state.consume_token(token.id)
+        cursor = cursor.advance(token.id)
+    assert state.is_accepting()
+
+
+@settings(deadline=None)
+@given(compiled_formats(), st.integers(0, 2**32 - 1), st.integers(0, 400))
+def test_it_goes_on_from_any_cursor_of_any_format(compiled: CompiledFormat, seed: int, place: int) -> None:
+    tokens = [token.id for token in walk(compiled.start(), seed)]
+    place %= len(tokens)
+    cursor = compiled.start()
+    for token in tokens[:place]:
+        cursor = cursor.advance(token)
+    state = matcher(cursor)
+    assert allowed_by(state) == set(cursor.allowed().ids.tolist())
+    assert state.validate_tokens(tokens[place:]) == len(tokens) - place

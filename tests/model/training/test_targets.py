@@ -5,6 +5,7 @@ import pytest
 from model.driving.plan import parse_plan
 from model.formats.cf_vla import CF_VLA, TRAJ_ONLY
 from model.formats.cursor import CompiledFormat
+from model.formats.pieces import Format, Values
 from model.formats.text import parse
 from model.training.targets import PAPER_WEIGHTS, Reflection, make_target
 from tests.model.formats.vocabulary import ByteVocabulary
@@ -18,24 +19,32 @@ WRONG = parse_plan("- longitudinal\n  - 0.0s-6.4s: Accelerate\n")
 def test_a_direct_target_says_plan_and_codes_with_the_papers_weights() -> None:
     compiled = CompiledFormat(CF_VLA, VOCABULARY)
     target = make_target(compiled, PLAN, CODES)
-    values = parse(CF_VLA, VOCABULARY.decode(target.ids))
-    assert values == {"plan": PLAN, "branch": "Action:", "trajectory": CODES}
-    tokens = compiled.render(values)
+    values = parse(compiled, VOCABULARY.decode(target.ids), {"plan": PLAN})
+    assert values == Values.of({"plan": PLAN, "branch": "Action:", "trajectory": CODES})
+    tokens = compiled.render(values, {"plan": PLAN})
     assert target.weights == tuple(1.0 if token.section == "trajectory" else 10.0 for token in tokens)
 
 
 def test_traj_only_has_no_plan() -> None:
-    target = make_target(CompiledFormat(TRAJ_ONLY, VOCABULARY), PLAN, CODES)
-    assert parse(TRAJ_ONLY, VOCABULARY.decode(target.ids)) == {"trajectory": CODES}
+    compiled = CompiledFormat(TRAJ_ONLY, VOCABULARY)
+    target = make_target(compiled, PLAN, CODES)
+    assert parse(compiled, VOCABULARY.decode(target.ids)) == Values.of({"trajectory": CODES})
+
+
+def test_a_format_without_targets_is_refused() -> None:
+    unknown = CompiledFormat(Format("unknown", CF_VLA.body), VOCABULARY)
+    with pytest.raises(ValueError, match="no targets for format 'unknown'"):
+        make_target(unknown, PLAN, CODES)
 
 
 def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
     compiled = CompiledFormat(CF_VLA, VOCABULARY)
     reflection = Reflection(WRONG, "The car ahead stands still.")
     target = make_target(compiled, PLAN, CODES, PAPER_WEIGHTS, reflection)
-    values = parse(CF_VLA, VOCABULARY.decode(target.ids))
+    plans = {"plan": WRONG, "revised_plan": PLAN}
+    values = parse(compiled, VOCABULARY.decode(target.ids), plans)
     assert (values["plan"], values["revised_plan"]) == (WRONG, PLAN)
-    sections = [token.section for token in compiled.render(values)]
+    sections = [token.section for token in compiled.render(values, plans)]
     weights = {
         name: {weight for weight, section in zip(target.weights, sections, strict=True) if section == name}
         for name in set(sections)
@@ -52,8 +61,8 @@ def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
 def test_a_right_plan_of_its_own_is_acted_on_and_not_taught() -> None:
     compiled = CompiledFormat(CF_VLA, VOCABULARY)
     target = make_target(compiled, PLAN, CODES, PAPER_WEIGHTS, Reflection(WRONG, ""))
-    values = parse(CF_VLA, VOCABULARY.decode(target.ids))
-    assert values == {"plan": WRONG, "branch": "Action:", "trajectory": CODES}
+    values = parse(compiled, VOCABULARY.decode(target.ids), {"plan": WRONG})
+    assert values == Values.of({"plan": WRONG, "branch": "Action:", "trajectory": CODES})
     taught = [id for id, weight in zip(target.ids, target.weights, strict=True) if weight > 0]
     assert VOCABULARY.decode(taught).startswith("Action:")
 

@@ -33,7 +33,9 @@ from model.engines.engine import (
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.vllm.engine import VllmEngine, VllmSettings
 from model.formats.cf_vla import FORMATS
+from model.formats.cursor import CompiledFormat
 from model.formats.text import parse
+from model.network.checkpoint import read_parts
 
 T = TypeVar("T")
 Run = Callable[[Awaitable[T]], T]
@@ -207,8 +209,9 @@ def test_draws_are_valid_and_repeat_with_their_seed(
     assert [draw.text for draw in first] == [draw.text for draw in again]
     assert [draw.text for draw in first] != [draw.text for draw in other]
     assert len({draw.text for draw in first}) == 6
+    compiled = CompiledFormat(FORMATS["cf_vla"], read_parts(CHECKPOINT).vocabulary)
     for draw in first + other:
-        assert parse(FORMATS["cf_vla"], draw.text)["trajectory"] == draw.codes
+        assert parse(compiled, draw.text)["trajectory"] == draw.codes
 
 
 def test_sections_come_before_their_draw(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:

@@ -1,0 +1,105 @@
+"""What holds for every format: values, text, tokens and grammar say the same."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model.formats.cursor import CompiledFormat, Cursor, Token
+from model.formats.pieces import FormatError
+from model.formats.text import parse
+from tests.model.formats.strategies import VOCABULARY, compiled_formats, values_of
+
+
+def walk(cursor: Cursor, seed: int) -> list[Token]:
+    """A response written by uniform random choices."""
+    random = np.random.default_rng(seed)
+    written: list[Token] = []
+    while True:
+        forced, cursor = cursor.forced()
+        written += forced
+        if cursor.done:
+            return written
+        ids = cursor.allowed().ids
+        assert len(ids) > 1
+        assert (np.diff(ids) > 0).all()
+        token = int(random.choice(ids))
+        written.append(Token(token, cursor.section))
+        cursor = cursor.advance(token)
+
+
+def ids_of(tokens: list[Token]) -> list[int]:
+    return [token.id for token in tokens]
+
+
+@given(st.data(), compiled_formats())
+def test_what_is_rendered_parses_to_the_same_values(data: st.DataObject, compiled: CompiledFormat) -> None:
+    values = data.draw(values_of(compiled))
+    tokens = compiled.render(values)
+    assert parse(compiled, VOCABULARY.decode(ids_of(tokens))) == values
+    assert len(tokens) <= compiled.longest()
+
+
+@given(st.data(), compiled_formats())
+def test_what_is_rendered_can_be_written_by_the_cursor(data: st.DataObject, compiled: CompiledFormat) -> None:
+    cursor = compiled.start()
+    for token in compiled.render(data.draw(values_of(compiled))):
+        assert token.id in cursor.allowed().ids
+        assert token.section == cursor.section
+        cursor = cursor.advance(token.id)
+    assert cursor.done
+
+
+@given(compiled_formats(), st.integers(0, 2**32 - 1))
+def test_what_the_cursor_writes_parses_and_renders_to_the_same_text(
+    compiled: CompiledFormat, seed: int
+) -> None:
+    tokens = walk(compiled.start(), seed)
+    assert len(tokens) <= compiled.longest()
+    text = VOCABULARY.decode(ids_of(tokens))
+    # The tokenizer may spell free text with other tokens; the text is the same.
+    assert VOCABULARY.decode(ids_of(compiled.render(parse(compiled, text)))) == text
+
+
+@given(st.data(), compiled_formats(), st.integers(0, 2**32 - 1))
+def test_a_changed_text_parses_only_if_the_cursor_can_write_it(
+    data: st.DataObject, compiled: CompiledFormat, seed: int
+) -> None:
+    text = VOCABULARY.decode(ids_of(walk(compiled.start(), seed)))
+    place = data.draw(st.integers(0, len(text)))
+    cut = data.draw(st.integers(0, 3))
+    put = data.draw(st.sampled_from(["", "a", "b", "<", "1", "\n", ",", "-", " ", text[place : place + 9]]))
+    changed = text[:place] + put + text[place + cut :]
+    try:
+        values = parse(compiled, changed)
+    except FormatError:
+        assert not can_write(compiled, changed)
+        return
+    tokens = compiled.render(values)
+    assert VOCABULARY.decode(ids_of(tokens)) == changed
+    cursor = compiled.start()
+    for token in tokens:
+        cursor = cursor.advance(token.id)
+    assert cursor.done
+
+
+def can_write(compiled: CompiledFormat, text: str) -> bool:
+    """Whether any tokens that the cursor allows spell ``text``."""
+    # Tokens of one text lead to few different states; those that failed are not tried again.
+    failed: set[tuple[int, object, object]] = set()
+
+    def from_(cursor: Cursor, place: int) -> bool:
+        if cursor.done:
+            return place == len(text)
+        key = (place, cursor.active, cursor.rest)
+        if key in failed:
+            return False
+        for token in cursor.allowed().ids.tolist():
+            spelt = VOCABULARY.texts[token]
+            if text.startswith(spelt, place) and from_(cursor.advance(token), place + len(spelt)):
+                return True
+        failed.add(key)
+        return False
+
+    return from_(compiled.start(), 0)
