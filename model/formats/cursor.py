@@ -13,8 +13,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.plan import TICKS, WORDS, Group, Plan, format_tick
+from model.driving.plan import Plan
 from model.formats.free_text import BEGUN, Alphabet, TextRules, TextState
+from model.formats.lengths import longest
 from model.formats.pieces import (
     Choice,
     Codes,
@@ -29,7 +30,7 @@ from model.formats.pieces import (
     Shorthand,
     Values,
 )
-from model.formats.plan_tracks import MAX_SEGMENTS, PlanTracks, with_given
+from model.formats.plan_tracks import with_given
 from model.formats.starts import check, first_bytes
 from model.formats.trie import Node, build_trie
 from model.formats.writing import Token as Token
@@ -160,38 +161,7 @@ class CompiledFormat:
 
     def longest(self) -> int:
         """A number of tokens that no response exceeds."""
-        return self._longest(self.format.body)
-
-    def _longest(self, piece: Piece) -> int:
-        match piece:
-            case Literal(text):
-                return len(self.literal(text))
-            case Sequence(parts):
-                return sum(map(self._longest, parts))
-            case Section(_, body):
-                return self._longest(body)
-            case Maybe(inner):
-                return self._longest(inner)
-            case Choice(options):
-                return max(len(self.literal(option.text)) + self._longest(option.then) for option in options)
-            case FreeText(_, max_tokens):
-                return max_tokens + len(self.text(piece).stop)
-            case Codes(_, count):
-                return count
-            case PlanTracks(groups):
-                return sum(
-                    len(self.literal(f"- {group}\n")) + MAX_SEGMENTS * self._longest_line(group)
-                    for group in groups
-                )
-            case Shorthand():
-                return self._longest(self.expanded(piece))
-
-    def _longest_line(self, group: Group) -> int:
-        """Tokens of the longest meta-action of a group, all its pieces as `Track` writes them."""
-        starts = max(len(self.literal(f"  - {format_tick(tick)}s-")) for tick in range(TICKS))
-        ends = max(len(self.literal(format_tick(tick))) for tick in range(1, TICKS + 1))
-        words = max(len(self.literal(f" {word}")) for word in WORDS[group])
-        return starts + ends + len(self.literal("s:")) + words + len(self.literal("\n"))
+        return longest(self, self.format.body)
 
     def literal(self, text: str) -> tuple[int, ...]:
         """Token ids of a literal."""

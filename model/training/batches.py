@@ -15,6 +15,7 @@ from torch.utils.data import BatchSampler, Dataset, Sampler
 from model.driving.trajectory import HISTORY_STEPS, STEP_S, present_speed
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat
+from model.formats.pieces import CODES
 from model.network.codec import TrajectoryCodec
 from model.network.inputs import InputBuilder
 from model.network.patches import patchify
@@ -99,6 +100,9 @@ class ResponseDataset(Dataset[Sample]):
         vision: what the tower sees in all examples, where it does not learn; else their patches are given.
         reflections: to be asked for by items.
         seed: of the codes that are drawn.
+
+    Raises:
+        FormatError: a reflection holds text that the checkpoint cannot write.
     """
 
     def __init__(
@@ -120,6 +124,10 @@ class ResponseDataset(Dataset[Sample]):
         self._random = np.random.default_rng(seed)
         self._weights, self._pictures, self._vocabulary = weights, pictures, vocabulary
         self._formats = {name: CompiledFormat(FORMATS[name], vocabulary) for name in ("cf_vla", "traj_only")}
+        for reflection in reflections:
+            # Before hours of training: the format must be able to say it.
+            no_codes = [0] * CODES
+            make_target(self._formats["cf_vla"], reflection.first_plan, no_codes, weights, reflection)
 
     def __len__(self) -> int:
         return len(self._examples)

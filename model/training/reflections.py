@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,19 @@ import numpy.typing as npt
 from model.driving.reflection_store import LabelledReflection
 from model.training.examples import Examples
 from model.training.targets import Reflection
+
+_PLAIN: Final = str.maketrans(
+    {
+        "\u2018": "'",
+        "\u2019": "'",
+        "\u201c": '"',
+        "\u201d": '"',
+        "\u2013": "-",
+        "\u2014": "-",
+        "\u2026": "...",
+    }
+)
+"""Typographic quotes, dashes and dots as ASCII: small tokenizers have no tokens for them."""
 
 
 class OnExamples(NamedTuple):
@@ -21,12 +34,16 @@ class OnExamples(NamedTuple):
 
 
 def reflections_on(examples: Examples, found: Iterable[LabelledReflection]) -> OnExamples:
-    """Reflections with the examples of their scenes; raises `ValueError` where a scene is missing."""
+    """Reflections, in plain punctuation, with the examples of their scenes.
+
+    Raises:
+        ValueError: a scene is missing.
+    """
     place_of = {str(scene_id): place for place, scene_id in enumerate(examples.scene_id)}
     places, reflections = [], []
     for each in found:
         if each.scene_id not in place_of:
             raise ValueError(f"there is a reflection on scene {each.scene_id}, which is not among the scenes")
         places.append(place_of[each.scene_id])
-        reflections.append(Reflection(each.predicted_plan, each.reflection))
+        reflections.append(Reflection(each.predicted_plan, each.reflection.translate(_PLAIN)))
     return OnExamples(np.array(places, np.int64), reflections)

@@ -1,11 +1,12 @@
 """What a frozen tower sees in all examples, worked out once: an epoch then costs no tower.
 
-The tokens lie in one file of float16, mapped into memory. The file's name tells the tower and the examples
-apart, so tokens of another tower are never taken; a count beside it lets a killed run go on.
+The tokens lie in one file of float16, mapped into memory. The file's name tells tower, cameras and pictures
+apart, so tokens of others are never taken; a count beside it lets a killed run go on.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -109,7 +110,10 @@ def _look(loaded: Loaded, patches: npt.NDArray[np.uint8], scenes: int) -> Tokens
 def _key(loaded: Loaded, examples: Examples, sides: int) -> str:
     weights: dict[str, Any] = loaded.model.model.visual.state_dict()
     tower = [weights[name].float().cpu().numpy().tobytes() for name in sorted(weights)]
-    return hash_of(_VERSION, sides, *tower, *(str(name) for name in examples.scene_id))
+    settings = (loaded.settings.cameras, loaded.settings.grid)
+    # Not by the names of scenes: two folders may have scenes of one name, with other pictures.
+    pictures = hashlib.sha256(examples.pictures).digest()
+    return hash_of(_VERSION, sides, settings, *tower, pictures, examples.picture_spans.tobytes())
 
 
 def _write(path: Path, done: int) -> None:

@@ -12,6 +12,7 @@ from accelerate.data_loader import BatchSamplerShard
 from model.driving.plan import parse_plan
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.driving.trajectory import present_speed
+from model.formats.pieces import FormatError
 from model.network.checkpoint import Loaded, load
 from model.network.vocabulary import FUTURE_START
 from model.training.batches import Item, ResponseDataset, Sample, TaskSampler, collate
@@ -41,6 +42,11 @@ def dataset(loaded: Loaded, *texts: str, pictures: bool = True) -> ResponseDatas
         pictures=pictures,
         reflections=[Reflection(WRONG, text) for text in texts],
     )
+
+
+def test_a_reflection_that_cannot_be_written_is_refused_before_training(loaded: Loaded) -> None:
+    with pytest.raises(FormatError, match="no allowed token"):
+        dataset(loaded, "The car ahead stands.", "\u524d\u306e\u8eca")
 
 
 def test_an_epoch_gives_every_example_at_most_once_with_its_share_of_tasks() -> None:

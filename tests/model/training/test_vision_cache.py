@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,14 @@ def test_another_tower_has_another_cache(loaded: Loaded, resampling_checkpoint: 
     first = open_vision(loaded, EXAMPLES, tmp_path, mirrored=False)
     second = open_vision(other, EXAMPLES, tmp_path, mirrored=False)
     assert not np.array_equal(first.tokens(0, False), second.tokens(0, False))
+
+
+def test_other_pictures_under_the_same_names_have_another_cache(loaded: Loaded, tmp_path: Path) -> None:
+    other = replace(EXAMPLES, picture_spans=np.roll(EXAMPLES.picture_spans, 1, axis=0))
+    assert other.scene_id.tolist() == EXAMPLES.scene_id.tolist()
+    first = open_vision(loaded, EXAMPLES, tmp_path, mirrored=False)
+    second = open_vision(loaded, other, tmp_path, mirrored=False)
+    np.testing.assert_array_equal(second.tokens(1, False), first.tokens(0, False))
 
 
 def test_mirror_images_that_nobody_asked_for_are_not_there(loaded: Loaded, tmp_path: Path) -> None:

@@ -1,0 +1,31 @@
+from __future__ import annotations
+
+import pytest
+
+from model.driving.plan import parse_plan
+from model.driving.reflection_store import LabelledReflection
+from model.driving.scene import FRONT_WIDE
+from model.training.examples import Examples
+from model.training.reflections import reflections_on
+from tests.model.training.scenes import training_scene
+
+PLAN = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
+EXAMPLES = Examples.from_scenes((training_scene(k) for k in range(3)), (FRONT_WIDE,))
+
+
+def reflection(scene_id: str, text: str) -> LabelledReflection:
+    return LabelledReflection(scene_id, PLAN, text, PLAN, "key", "nano", "1", "rules", "1", 1, "2026-01-01")
+
+
+def test_reflections_find_their_examples_in_plain_punctuation() -> None:
+    found = reflections_on(
+        EXAMPLES,
+        [reflection(str(EXAMPLES.scene_id[2]), "The car\u2019s brake lights\u2026 I \u201cwait\u201d.")],
+    )
+    assert found.examples.tolist() == [2]
+    assert found.reflections[0].thinking == 'The car\'s brake lights... I "wait".'
+
+
+def test_a_reflection_on_an_unknown_scene_is_refused() -> None:
+    with pytest.raises(ValueError, match="scene nowhere, which is not among"):
+        reflections_on(EXAMPLES, [reflection("nowhere", "")])
