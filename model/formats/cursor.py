@@ -28,6 +28,7 @@ from model.formats.pieces import (
     Section,
     Sequence,
     Shorthand,
+    Texts,
     Values,
 )
 from model.formats.plan_tracks import with_given
@@ -129,7 +130,7 @@ class CompiledFormat:
         self._texts: dict[FreeText, TextRules] = {}
         self._free: dict[bool, Alphabet] = {}
         self._codes: dict[tuple[str, int], npt.NDArray[np.int64]] = {}
-        self._spellings: dict[tuple[str, int], dict[str, int]] = {}
+        self._spellings: dict[tuple[str, int], Texts] = {}
         self._first_bytes: dict[Piece, frozenset[int]] = {}
         self.sentence_ends = frozenset(id for mark in ".!?" for id in self.literal(mark)[-1:])
         """Ids of the tokens that end a sentence."""
@@ -201,14 +202,12 @@ class CompiledFormat:
             self._codes[key] = np.arange(books[place % len(books)].start, books[place % len(books)].stop)
         return self._codes[key]
 
-    def spellings(self, piece: Codes, place: int) -> dict[str, int]:
-        """The codes that may stand at a place, by their text."""
+    def spellings(self, piece: Codes, place: int) -> Texts:
+        """The texts of the codes that may stand at a place."""
         books = self.codebooks(piece.alphabet)
         key = (piece.alphabet, place % len(books))
         if key not in self._spellings:
-            self._spellings[key] = {
-                self._vocabulary.decode([token]): code for code, token in enumerate(books[key[1]])
-            }
+            self._spellings[key] = Texts(self._vocabulary.decode([token]) for token in books[key[1]])
         return self._spellings[key]
 
     def first_bytes(self, piece: Piece) -> frozenset[int]:

@@ -15,6 +15,7 @@ import collections.abc
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, TypeAlias
 from typing import Literal as Literal_
 
@@ -88,6 +89,22 @@ class Values:
         return iter(self.by_section)
 
 
+class Texts:
+    """Different texts by their position, to be found within a longer one."""
+
+    def __init__(self, texts: collections.abc.Iterable[str]) -> None:
+        self.position_of = {text: position for position, text in enumerate(texts)}
+        self._sizes = sorted({len(text) for text in self.position_of}, reverse=True)
+
+    def longest_at(self, text: str, place: int) -> tuple[int, int] | None:
+        """The position of the longest of the texts that ``text`` has at a place, and the place behind it."""
+        for size in self._sizes:
+            found = text[place : place + size]
+            if found in self.position_of:
+                return self.position_of[found], place + len(found)
+        return None
+
+
 @dataclass(frozen=True)
 class Literal:
     """Text that is always written."""
@@ -118,6 +135,11 @@ class Choice:
         texts = [option.text for option in self.options]
         if not texts or len(set(texts)) < len(texts):
             raise FormatError(f"a choice needs options of different texts, got {texts}")
+
+    @cached_property
+    def texts(self) -> Texts:
+        """The texts of the options."""
+        return Texts(option.text for option in self.options)
 
 
 @dataclass(frozen=True)

@@ -146,7 +146,9 @@ class _Checker:
                 case FreeText():
                     found |= self._compiled.text(start.what).alphabet.first_bytes
                 case Codes():
-                    found |= {text.encode()[0] for text in self._compiled.spellings(start.what, 0)}
+                    found |= {
+                        text.encode()[0] for text in self._compiled.spellings(start.what, 0).position_of
+                    }
         return frozenset(found)
 
     def _may_be_empty(self, piece: Piece) -> bool:

@@ -67,10 +67,9 @@ class _Reader:
                     self.read(part, values)
             case Section(name, body):
                 self.read(body, self.section(name))
-            case Choice(options, name):
-                option = self._option(options)
+            case Choice(_, name):
+                option = self._option(piece)
                 values.append((name, option.text))
-                self.position += len(option.text)
                 self.read(option.then, values)
             case Maybe(inner, name):
                 ahead = self._text[self.position : self.position + 1].encode()
@@ -102,12 +101,13 @@ class _Reader:
             raise self.error(f"expected {text!r}, found {found!r}")
         self.position += len(text)
 
-    def _option(self, options: tuple[Option, ...]) -> Option:
-        found = [option for option in options if self._text.startswith(option.text, self.position)]
-        if not found:
-            raise self.error(f"expected one of {', '.join(repr(option.text) for option in options)}")
-        # What follows a shorter one never goes on as the longer one does.
-        return max(found, key=lambda option: len(option.text))
+    def _option(self, choice: Choice) -> Option:
+        # What follows a shorter option never goes on as a longer one does.
+        found = choice.texts.longest_at(self._text, self.position)
+        if found is None:
+            raise self.error(f"expected one of {', '.join(map(repr, choice.texts.position_of))}")
+        position, self.position = found
+        return choice.options[position]
 
     def _free_text(self, piece: FreeText) -> str:
         end = self._text.find(piece.stop, self.position)
@@ -124,15 +124,11 @@ class _Reader:
     def _codes(self, piece: Codes) -> tuple[int, ...]:
         codes = []
         for place in range(piece.count):
-            spellings = self._compiled.spellings(piece, place)
-            for size in sorted({len(text) for text in spellings}, reverse=True):
-                code = spellings.get(self._text[self.position : self.position + size])
-                if code is not None:
-                    codes.append(code)
-                    self.position += size
-                    break
-            else:
+            found = self._compiled.spellings(piece, place).longest_at(self._text, self.position)
+            if found is None:
                 raise self.error(f"expected {piece.alphabet} code {place + 1} of {piece.count}")
+            code, self.position = found
+            codes.append(code)
         return tuple(codes)
 
     def _compound(self, piece: Compound) -> Value:

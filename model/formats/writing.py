@@ -104,10 +104,10 @@ class _Writer:
                 self.write(body, name, self.section(name))
             case Choice(options, name):
                 value = source.take(name)
-                option = next((option for option in options if option.text == value), None)
-                if option is None:
-                    known = ", ".join(option.text for option in options)
-                    raise FormatError(f"section {section!r}: {value!r} is none of {known}")
+                known = piece.texts.position_of
+                if not isinstance(value, str) or value not in known:
+                    raise FormatError(f"section {section!r}: {value!r} is none of {', '.join(known)}")
+                option = options[known[value]]
                 self._emit(self._compiled.literal(option.text), section)
                 self.write(option.then, section, source)
             case Maybe(inner, name):
