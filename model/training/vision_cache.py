@@ -112,7 +112,7 @@ def _key(loaded: Loaded, examples: Examples, sides: int) -> str:
     tower = [weights[name].float().cpu().numpy().tobytes() for name in sorted(weights)]
     settings = (loaded.settings.cameras, loaded.settings.grid)
     # Not by the names of scenes: two folders may have scenes of one name, with other pictures.
-    pictures = hashlib.sha256(examples.pictures).digest()
+    pictures = hashlib.sha256(examples.pictures.data).digest()
     return hash_of(_VERSION, sides, settings, *tower, pictures, examples.picture_spans.tobytes())
 
 
