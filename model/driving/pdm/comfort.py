@@ -1,0 +1,192 @@
+"""Comfort: smoothed accelerations and turns of states, against nuPlan's bounds.
+
+Source: NAVSIM's comfort metrics; the smoothing is that of Savitzky and Golay with polynomials fitted at
+both ends.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import Final, Literal
+
+import numpy as np
+
+from model.driving.pdm.geometry import IndexArray
+from model.driving.pdm.world import (
+    ACCELERATION,
+    ACCELERATION_Y,
+    HEADING,
+    STEP_S,
+    YAW_ACCELERATION,
+    YAW_RATE,
+    Array,
+    BoolArray,
+    ScoreError,
+    Vehicle,
+)
+
+Version = Literal["v1.1", "v2.2"]
+
+MAX_ACCELERATION: Final = 2.40
+MIN_ACCELERATION: Final = -4.05
+MAX_LATERAL_ACCELERATION: Final = 4.89
+MAX_JERK: Final = 8.37
+MAX_LONGITUDINAL_JERK: Final = 4.13
+MAX_YAW_RATE: Final = 0.95
+MAX_YAW_ACCELERATION: Final = 1.93
+
+EXTENDED_ACCELERATION: Final = 0.7
+EXTENDED_JERK: Final = 0.5
+EXTENDED_YAW_RATE: Final = 0.1
+EXTENDED_YAW_ACCELERATION: Final = 0.1
+
+MOST_SECONDS_BETWEEN: Final = 0.55
+_DECIMALS: Final = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Comfort:
+    """Whether plans are comfortable, and which bound they break first.
+
+    Attributes:
+        holds: bool [n].
+        first_step: int [n], the step at which a bound is broken first, counted from now; -1 where none is.
+        bound: the broken bound's name, a plan each; "" where none is.
+    """
+
+    holds: BoolArray
+    first_step: IndexArray
+    bound: tuple[str, ...]
+
+
+def comfort(states: Array, vehicle: Vehicle, version: Version, past: Array | None = None) -> Comfort:
+    """Comfort of simulated ``states`` [n, 41, 11], with the ``past`` [h, 11] before them in v2.2."""
+    before = 0
+    if past is not None:
+        # NAVSIM leaves the last of them out: its past ends at -0.2 s, and the plan begins at 0 s.
+        past = past[:-1].copy()
+        # ... and knows no turn: nuPlan's interpolated states have none.
+        past[:, [YAW_RATE, YAW_ACCELERATION]] = 0.0
+        before = len(past)
+        repeated = np.broadcast_to(past, (len(states), *past.shape))
+        states = np.concatenate([repeated, states], axis=1)
+    names, broken = zip(*_bounds(states, vehicle, version), strict=True)
+    first = np.stack([np.where(each.any(axis=1), each.argmax(axis=1), states.shape[1]) for each in broken])
+    worst = first.argmin(axis=0)
+    earliest = first.min(axis=0)
+    holds = earliest == states.shape[1]
+    bound = tuple("" if fine else names[kind] for fine, kind in zip(holds, worst, strict=True))
+    return Comfort(holds, np.where(holds, -1, np.maximum(earliest - before, 0)), bound)
+
+
+def _bounds(states: Array, vehicle: Vehicle, version: Version) -> list[tuple[str, BoolArray]]:
+    """Each bound's name, and bool [n, t] where it is broken."""
+    count = states.shape[1]
+    longitudinal, lateral = states[..., ACCELERATION], states[..., ACCELERATION_Y]
+    magnitude = np.hypot(longitudinal, lateral)
+    if version == "v2.2":
+        longitudinal, lateral = _shifted(states, vehicle)
+        window, jerk_window = 8, 15
+    else:
+        window, jerk_window = count, count
+    jerk, longitudinal_jerk = (
+        _smooth(_smooth(each, 8, 2), jerk_window, 2, 1) for each in (magnitude, longitudinal)
+    )
+    longitudinal, lateral = _smooth(longitudinal, window, 2), _smooth(lateral, window, 2)
+    heading = _unwrapped(states[..., HEADING])
+
+    def beyond(values: Array, most: float) -> BoolArray:
+        result: BoolArray = ~((values > -most) & (values < most))
+        return result
+
+    return [
+        (
+            "longitudinal_acceleration",
+            ~((longitudinal > MIN_ACCELERATION) & (longitudinal < MAX_ACCELERATION)),
+        ),
+        ("lateral_acceleration", beyond(lateral, MAX_LATERAL_ACCELERATION)),
+        ("jerk", beyond(jerk, MAX_JERK)),
+        ("longitudinal_jerk", beyond(longitudinal_jerk, MAX_LONGITUDINAL_JERK)),
+        ("yaw_acceleration", beyond(_smooth(heading, 5, 3, 2), MAX_YAW_ACCELERATION)),
+        ("yaw_rate", beyond(_smooth(heading, 5, 2, 1), MAX_YAW_RATE)),
+    ]
+
+
+def extended_comfort(states: Array, previous: Array, seconds_between: float) -> BoolArray:
+    """Whether plans go on as the plan before them began: bool [n].
+
+    Args:
+        states: [n, 41, 11], simulated, from now on.
+        previous: [41, 11] or [n, 41, 11], simulated, from an earlier moment on; motion, not pose, matters.
+        seconds_between: how much earlier, above 0 and below 0.55.
+
+    Raises:
+        ScoreError: moments too far apart.
+    """
+    if not STEP_S / 2 <= seconds_between < MOST_SECONDS_BETWEEN:
+        raise ScoreError("previous", f"lies {STEP_S} to {MOST_SECONDS_BETWEEN} s back, not {seconds_between}")
+    shift = round(seconds_between / STEP_S)
+    earlier = np.broadcast_to(previous, states.shape)
+    ours, theirs = (_features(each) for each in (states[:, :-shift], earlier[:, shift:]))
+    bounds = (EXTENDED_ACCELERATION, EXTENDED_JERK, EXTENDED_YAW_RATE, EXTENDED_YAW_ACCELERATION)
+    result = np.ones(len(states), dtype=np.bool_)
+    for one, other, bound in zip(ours, theirs, bounds, strict=True):
+        result &= np.sqrt(((one - other) ** 2).mean(axis=1)) <= bound
+    return result
+
+
+def _features(states: Array) -> tuple[Array, Array, Array, Array]:
+    acceleration = _smooth(np.hypot(states[..., ACCELERATION], states[..., ACCELERATION_Y]), 8, 2)
+    heading = _unwrapped(states[..., HEADING])
+    jerk = _smooth(acceleration, 15, 2, 1)
+    return acceleration, jerk, _smooth(heading, 5, 2, 1), _smooth(heading, 5, 2, 2)
+
+
+def _shifted(states: Array, vehicle: Vehicle) -> tuple[Array, Array]:
+    """Acceleration of the box's centre in m/s², forward and to the left.
+
+    NAVSIM adds the turn's two terms along the car's axis both; physics has one of them to the side. This
+    is NAVSIM's.
+    """
+    turning = states[..., YAW_RATE] ** 2 + states[..., YAW_ACCELERATION]
+    return states[..., ACCELERATION] + vehicle.centre_m * turning, states[..., ACCELERATION_Y]
+
+
+def _unwrapped(heading: Array) -> Array:
+    result = heading.copy()
+    result[..., 1:] -= 2 * np.pi * np.cumsum(np.round(np.diff(heading, axis=-1) / (2 * np.pi)), axis=-1)
+    return result
+
+
+def _smooth(values: Array, window: int, order: int, derivative: int = 0) -> Array:
+    count = values.shape[-1]
+    filter_ = _filter(count, min(window, count), order, derivative)
+    result: Array = np.round(values @ filter_.T, _DECIMALS)
+    return result
+
+
+@cache
+def _filter(count: int, window: int, order: int, derivative: int) -> Array:
+    """The filter as a matrix [count, count]; a window of even length reaches one step farther ahead."""
+    if order >= window:
+        raise ScoreError("past", "too few states to smooth")
+    half = window // 2
+    matrix = np.zeros((count, count))
+    for row in range(count):
+        if row < half:
+            start, at = 0, float(row)
+        elif row >= count - half:
+            start, at = count - window, float(row - (count - window))
+        else:
+            start, at = row - (window - 1) // 2, (window - 1) / 2
+        matrix[row, start : start + window] = _weights(window, order, derivative, at)
+    return matrix
+
+
+def _weights(window: int, order: int, derivative: int, at: float) -> Array:
+    """Weights of a window's values in the derivative at ``at`` of the polynomial fitted to them."""
+    basis, triangle = np.linalg.qr(np.vander(np.arange(window) - at, order + 1, increasing=True))
+    row: Array = np.linalg.solve(triangle, basis.T)[derivative]
+    return row * math.factorial(derivative) / STEP_S**derivative
