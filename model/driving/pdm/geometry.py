@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,34 +20,48 @@ class Points:
     def __init__(self, points: Array) -> None:
         self._order = np.argsort(points[:, 1], kind="stable")
         self._x, self._y = points[self._order].T.copy()
+        self._low = points.min(axis=0, initial=np.inf)
+        self._high = points.max(axis=0, initial=-np.inf)
+
+    def inside_each(self, areas: Sequence[Area]) -> BoolArray:
+        """bool [areas, m]: inside each by the even-odd rule; a point on a border may fall on either side."""
+        count = len(self._y)
+        result = np.zeros((len(areas), count), dtype=np.bool_)
+        close = [
+            number
+            for number, area in enumerate(areas)
+            if (area.low <= self._high).all() and (area.high >= self._low).all()
+        ]
+        if not close:
+            return result
+        edges = np.concatenate([areas[number].edges for number in close])
+        owner = np.repeat(np.arange(len(close)), [len(areas[number].edges) for number in close])
+        low, high = np.minimum(edges[:, 1], edges[:, 3]), np.maximum(edges[:, 1], edges[:, 3])
+        edge, point = _pairs(np.searchsorted(self._y, low), np.searchsorted(self._y, high))
+        rise = np.where(high > low, edges[:, 3] - edges[:, 1], 1.0)
+        slope = (edges[:, 2] - edges[:, 0]) / rise
+        left = self._x[point] < (self._y[point] - edges[edge, 1]) * slope[edge] + edges[edge, 0]
+        crossed = np.bincount(owner[edge[left]] * count + point[left], minlength=len(close) * count)
+        result[np.ix_(np.array(close), self._order)] = (crossed & 1).reshape(len(close), count)
+        return result
 
     def inside(self, area: Area) -> BoolArray:
-        """bool [m]: inside ``area`` by the even-odd rule; a point on its border may fall on either side."""
-        low = np.minimum(area.edges[:, 1], area.edges[:, 3])
-        high = np.maximum(area.edges[:, 1], area.edges[:, 3])
-        first, last = np.searchsorted(self._y, low), np.searchsorted(self._y, high)
-        result = np.zeros(len(self._y), dtype=np.bool_)
-        crossed = np.flatnonzero(first < last)
-        if not len(crossed):
-            return result
-        start, end = int(first[crossed].min()), int(last[crossed].max())
-        odd = np.zeros(end - start, dtype=np.bool_)
-        slopes = (area.edges[crossed, 2] - area.edges[crossed, 0]) / (
-            area.edges[crossed, 3] - area.edges[crossed, 1]
-        )
-        for edge, slope in zip(crossed, slopes, strict=True):
-            rows = slice(int(first[edge]), int(last[edge]))
-            right = (self._y[rows] - area.edges[edge, 1]) * slope + area.edges[edge, 0]
-            odd[rows.start - start : rows.stop - start] ^= self._x[rows] < right
-        result[self._order[start:end]] = odd
+        """bool [m]: inside ``area``."""
+        result: BoolArray = self.inside_each([area])[0]
         return result
 
     def inside_any(self, areas: Sequence[Area]) -> BoolArray:
         """bool [m]: inside at least one of ``areas``."""
-        result = np.zeros(len(self._y), dtype=np.bool_)
-        for area in areas:
-            result |= self.inside(area)
+        result: BoolArray = np.logical_or.reduce(self.inside_each(areas), axis=0)
         return result
+
+
+def _pairs(first: IndexArray, last: IndexArray) -> tuple[IndexArray, IndexArray]:
+    """For ranges first..last of rows: each pair of a range's number and one of its rows."""
+    counts = np.maximum(last - first, 0)
+    which = np.repeat(np.arange(len(counts)), counts)
+    before = np.cumsum(counts) - counts
+    return which, np.arange(len(which)) - before[which] + first[which]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +80,11 @@ class Boxes:
     sin: Array
     half_length: Array
     half_width: Array
-    radius: Array = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", np.hypot(self.half_length, self.half_width))
+    @property
+    def radius(self) -> Array:
+        """From the centre to a corner."""
+        return np.hypot(self.half_length, self.half_width)
 
     @classmethod
     def of(cls, x: Array, y: Array, heading: Array, length_m: Array, width_m: Array) -> Boxes:
@@ -103,7 +118,7 @@ def near(ego: Boxes, others: Boxes) -> tuple[IndexArray, IndexArray, IndexArray]
     if not others.x.size or not ego.x.size:
         nothing = np.zeros(0, dtype=np.intp)
         return nothing, nothing, nothing
-    reach = others.radius + ego.radius.flat[0]
+    reach = others.radius + ego.radius[0, 0]
     # Others that no plan comes near to, at any step, are left out before plans are looked at one by one.
     low_x, high_x = ego.x.min(axis=0)[:, None], ego.x.max(axis=0)[:, None]
     low_y, high_y = ego.y.min(axis=0)[:, None], ego.y.max(axis=0)[:, None]
@@ -161,8 +176,7 @@ def segments_meet(start: Array, end: Array, boxes: Boxes) -> BoolArray:
 def area_meets(area: Area, boxes: Boxes) -> BoolArray:
     """Whether boxes [m] share a point with ``area``."""
     result = np.zeros(boxes.x.shape, dtype=np.bool_)
-    low = area.edges.reshape(-1, 2).min(axis=0)
-    high = area.edges.reshape(-1, 2).max(axis=0)
+    low, high = area.low, area.high
     reach = boxes.radius
     close = np.flatnonzero(
         (boxes.x + reach >= low[0])
@@ -193,18 +207,16 @@ def beside_line(points: Array, line: Array, within_m: float) -> BoolArray:
     along = sorted_[:, axis]
     low = np.minimum(line[:-1, axis], line[1:, axis]) - within_m
     high = np.maximum(line[:-1, axis], line[1:, axis]) + within_m
-    first, last = np.searchsorted(along, low), np.searchsorted(along, high, side="right")
-    close = np.zeros(len(points), dtype=np.bool_)
-    for segment in np.flatnonzero(first < last):
-        rows = slice(int(first[segment]), int(last[segment]))
-        start, way = line[segment], line[segment + 1] - line[segment]
-        off = sorted_[rows] - start
-        length = way @ way
-        share = np.clip(off @ way / length, 0.0, 1.0) if length else np.zeros(len(off))
-        gap_x, gap_y = off[:, 0] - share * way[0], off[:, 1] - share * way[1]
-        close[rows] |= gap_x * gap_x + gap_y * gap_y <= within_m * within_m
-    result = np.empty(len(points), dtype=np.bool_)
-    result[order] = ~close
+    segment, point = _pairs(np.searchsorted(along, low), np.searchsorted(along, high, side="right"))
+    way = np.diff(line, axis=0)
+    squares = (way * way).sum(axis=1)
+    scaled = way / np.where(squares > 0, squares, 1.0)[:, None]
+    off = sorted_[point] - line[segment]
+    share = np.clip((off * scaled[segment]).sum(axis=1), 0.0, 1.0)
+    gap = off - share[:, None] * way[segment]
+    close = (gap * gap).sum(axis=1) <= within_m * within_m
+    result = np.ones(len(points), dtype=np.bool_)
+    result[order[point[close]]] = False
     return result
 
 

@@ -61,16 +61,9 @@ def areas_of(ego: Boxes, axles: Array, world: World) -> Areas:
     crossing: BoolArray | None = None
     axle_crossing: BoolArray | None = None
     if world.lanes is not None:
-        touched = np.zeros(shape, dtype=np.int32)
-        held = np.zeros(shape, dtype=np.bool_)
-        off_route = np.ones(shape, dtype=np.bool_)
-        for lane in world.lanes:
-            count = corners.inside(lane.area).reshape(*shape, 4).sum(axis=-1)
-            touched += count > 0
-            held |= count == 4
-            if lane.on_route:
-                off_route &= ~centres.inside(lane.area).reshape(shape)
-        several_lanes = (touched > 1) & ~held
+        held = corners.inside_each([lane.area for lane in world.lanes]).reshape(-1, *shape, 4).sum(axis=-1)
+        several_lanes = ((held > 0).sum(axis=0) > 1) & ~(held == 4).any(axis=0)
+        off_route = ~centres.inside_any([lane.area for lane in world.lanes if lane.on_route]).reshape(shape)
     if world.drivable is not None:
         on_road = corners.inside_any((*world.drivable, *(world.intersections or ())))
         off_road = np.logical_not(on_road.reshape(*shape, 4).all(axis=-1))

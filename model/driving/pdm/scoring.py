@@ -59,7 +59,7 @@ WEIGHTS: Final[Mapping[Version, Mapping[str, float]]] = {
 """Sub-scores that are averaged, and how much each counts."""
 SHORT_PROGRESS_M: Final = 5.0
 """Where no plan gets farther, progress is not judged."""
-_TOGETHER: Final = 512
+_TOGETHER: Final = 256
 """Plans scored at a time; more of them leave the processor's cache."""
 _LAST_TTC_STEP: Final[Mapping[Version, int]] = {"v1.1": STEPS, "v2.2": STEPS - 9}
 

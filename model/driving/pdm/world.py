@@ -76,10 +76,13 @@ class Area:
         rings: float64 [k, 2] each, closed without repeating the first point; a point is inside when an
             odd number of rings contains it, so a hole is a ring too.
         edges: float64 [e, 4], the rings' edges (x, y, x, y).
+        low, high: float64 [2], the corners of the box around it.
     """
 
     rings: tuple[Array, ...]
     edges: Array = field(init=False, repr=False)
+    low: Array = field(init=False, repr=False)
+    high: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         rings = []
@@ -98,6 +101,8 @@ class Area:
         object.__setattr__(self, "rings", tuple(rings))
         edges = np.concatenate([np.hstack([ring, np.roll(ring, -1, axis=0)]) for ring in rings])
         object.__setattr__(self, "edges", edges)
+        object.__setattr__(self, "low", edges[:, :2].min(axis=0))
+        object.__setattr__(self, "high", edges[:, :2].max(axis=0))
 
 
 @dataclass(frozen=True, eq=False)

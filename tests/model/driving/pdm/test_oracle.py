@@ -73,9 +73,9 @@ def test_the_fixture_covers_every_outcome(version: Version) -> None:
         if np.isnan(values).all():
             assert version == "v1.1"
             continue
-        # Each is failed and passed by at least one plan of fifty.
-        assert (values == 0).mean() >= 0.02, name
-        assert (values > 0.99).mean() >= 0.02, name
+        # Each is failed and passed by at least one plan of a hundred.
+        assert (values == 0).mean() >= 0.01, name
+        assert (values > 0.99).mean() >= 0.01, name
 
 
 def test_states_are_those_of_navsims_simulator() -> None:
@@ -105,7 +105,7 @@ def test_extended_comfort_and_the_human_filter_are_navsims() -> None:
             "v2.2",
             Others(reference=drawn.reference, previous=previous, human=drawn.human),
         )
-        assert found.sub_scores[EXTENDED_COMFORT] == pytest.approx(expected["extended"][seed])
+        assert found.sub_scores[EXTENDED_COMFORT] == pytest.approx(expected["extended"][seed].astype(float))
         for column, name in enumerate(NAMES[:-1]):
             wanted = expected["scores"][seed, :, column]
             if name not in (PROGRESS, COMFORT) and expected["human"][seed, column] == 0:
