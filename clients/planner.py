@@ -24,7 +24,7 @@ import msgpack
 from httpx_sse import EventSource
 from pydantic import BaseModel
 
-from clients import wire
+from clients import wire, wire_scores
 from clients.answers import (
     BUSY_STATUSES,
     BadAnswer,
@@ -226,6 +226,10 @@ class PlannerClient:
         asked = label_request(scene, predicted, expert, surroundings, seed)
         return read(self._ask("/v1/label", asked), wire.LabelResponse)
 
+    def score(self, request: wire_scores.ScoreRequest) -> wire_scores.ScoreResponse:
+        """Score trajectories by NAVSIM's rules; raises `PlannerError`."""
+        return read(self._ask("/v1/score", request), wire_scores.ScoreResponse)
+
     def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""
         return self._model_list().models
@@ -341,6 +345,10 @@ class AsyncPlannerClient:
         """Have the service's teacher look at a plan; see `PlannerClient.label`."""
         asked = label_request(scene, predicted, expert, surroundings, seed)
         return read(await self._ask("/v1/label", asked), wire.LabelResponse)
+
+    async def score(self, request: wire_scores.ScoreRequest) -> wire_scores.ScoreResponse:
+        """Score trajectories by NAVSIM's rules; raises `PlannerError`."""
+        return read(await self._ask("/v1/score", request), wire_scores.ScoreResponse)
 
     async def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""

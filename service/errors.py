@@ -24,10 +24,12 @@ from service.problems import (
     INVALID_CONTROLS,
     INVALID_HISTORY,
     INVALID_JSON,
+    INVALID_LABELS,
     INVALID_PLAN,
     INVALID_REQUEST,
     INVALID_ROUTE,
     INVALID_TRACKS,
+    INVALID_TRAJECTORY,
     METHOD_NOT_ALLOWED,
     NOT_FOUND,
     QUEUE_FULL,
@@ -55,6 +57,8 @@ _KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], Kind]]] = (
     (("expert_plan",), INVALID_PLAN),
     (("controls", "prefill"), INVALID_PLAN),
     (("controls",), INVALID_CONTROLS),
+    (("labels",), INVALID_LABELS),
+    *(((field,), INVALID_TRAJECTORY) for field in ("trajectories", "reference", "previous", "human")),
 )
 _KIND_BY_STATUS: Final = {
     kind.status: kind

@@ -31,3 +31,40 @@ def example_reflection(cameras: tuple[str, ...]) -> dict[str, Any]:
     asked = example_request(cameras)
     plan = "- longitudinal\n  - 0.0s-2.1s: Keep Speed\n  - 2.1s-6.4s: Accelerate\n"
     return {"scene": asked["scene"], "plan": plan, "controls": asked["controls"]}
+
+
+def example_score() -> dict[str, Any]:
+    """Two trajectories behind a slower car: one brakes, one does not."""
+
+    def straight(speed: float, brake: float = 0.0) -> list[list[float]]:
+        return [[speed * t - brake * t * t / 2, 0.0, 0.0] for t in (0.5 * step for step in range(1, 9))]
+
+    def strip(right: float, left: float) -> list[list[float]]:
+        return [[-20.0, right], [100.0, right], [100.0, left], [-20.0, left]]
+
+    return {
+        "labels": {
+            "ego": {"speed_mps": 8.0},
+            "past": [{"heading_rad": 0.0, "acceleration_mps2": 0.0}] * 15,
+            "agents": [
+                {
+                    "agent_id": "leader",
+                    "kind": "vehicle",
+                    "length_m": 4.5,
+                    "width_m": 1.9,
+                    "poses": [[30.0 + 0.2 * step, 0.0, 0.0] for step in range(51)],
+                }
+            ],
+            "lanes": [
+                {"lane_id": "mine", "ring": strip(-2.0, 2.0), "on_route": True},
+                {"lane_id": "beside", "ring": strip(2.0, 6.0), "on_route": True},
+            ],
+            "intersections": [],
+            "drivable": [[strip(-2.0, 6.0)]],
+            "red_lights": [],
+            "centreline": [[-20.0, 0.0], [100.0, 0.0]],
+        },
+        "trajectories": [straight(8.0, brake=1.2), straight(8.0)],
+        "reference": straight(8.0, brake=1.0),
+        "against": "idm",
+    }

@@ -55,6 +55,8 @@ def engine_request(
     Raises:
         ProblemError: pictures, geometry, plan, controls, format or cameras that cannot be served.
     """
+    if not card.formats:
+        raise at(UNKNOWN_FORMAT, "/format", "this service runs without a model; it only scores")
     if asked.format not in card.formats:
         raise at(UNKNOWN_FORMAT, "/format", f"{card.name} writes {', '.join(card.formats)}")
     cameras = [clip.camera for clip in asked.scene.clips]

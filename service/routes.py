@@ -57,6 +57,7 @@ from service.problems import (
     ProblemError,
 )
 from service.scene_files import read_scene_file
+from service.scoring_routes import scoring_router
 from service.views import BundledScenes, view
 
 _FILES_AT_ONCE: Final = 1
@@ -76,9 +77,11 @@ def make_router(parts: Parts) -> APIRouter:
     router.include_router(planning_router(parts))
     router.include_router(openai_router(parts))
     _add_labelling(router, parts)
+    bundled = BundledScenes(parts.settings.bundled_scenes)
+    router.include_router(scoring_router(parts, bundled))
     _add_models(router, parts)
     _add_probes(router, parts)
-    _add_scenes(router, parts)
+    _add_scenes(router, parts, bundled)
     return router
 
 
@@ -185,8 +188,7 @@ def _add_probes(router: APIRouter, parts: Parts) -> None:
         return Response(encode(parts.metrics.registry), headers={"Content-Type": media_type})
 
 
-def _add_scenes(router: APIRouter, parts: Parts) -> None:
-    bundled = BundledScenes(parts.settings.bundled_scenes)
+def _add_scenes(router: APIRouter, parts: Parts, bundled: BundledScenes) -> None:
     reading = asyncio.Semaphore(_FILES_AT_ONCE)
 
     @router.get("/v1/scenes", tags=["scenes"], responses=problems(UNAUTHORIZED, SCENES_UNREADABLE))

@@ -19,12 +19,15 @@ ALLOWED = {
     "model.formats": ("model.formats", "model.driving"),
     "clients": ("clients", "model.driving"),
     "loadtests": ("loadtests", "clients", "model.driving"),
-    "service": ("service", "clients.wire", "clients.wire_values", "clients.labelling.teachers", "model"),
+    "service": (
+        *("service", "clients.wire", "clients.wire_scores", "clients.wire_values"),
+        *("clients.labelling.teachers", "model"),
+    ),
     "service.cli": EVERYTHING,
     "deploy": ("deploy", "service", "model.bundled"),
 }
 TORCH_FREE = ("model.driving", "model.formats", "clients", "loadtests")
-LIGHT = ("clients.wire", "clients.planner")
+LIGHT = ("clients.wire", "clients.wire_scores", "clients.planner")
 LIGHT_IMPORTS = ("numpy", "PIL", "httpx", "httpx_sse", "msgpack", "pydantic", "model", "clients")
 
 

@@ -115,6 +115,32 @@ def precision(
 
 
 @bench.command()
+def score(
+    navsim: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder that holds the package navsim or nuplan; once for each. None: ours only."),
+    ] = None,
+    navsim_python: Annotated[
+        Path | None, typer.Option(help="Interpreter that has what NAVSIM needs; this one without it.")
+    ] = None,
+    repeats: Annotated[int, typer.Option(help="Measured rounds.", min=1)] = 5,
+    as_json: Json = False,
+) -> None:
+    """Our scorer of plans, and NAVSIM's own beside it, in seconds of one core."""
+    with told():
+        from model.bench.scoring import measure
+
+        found = measure(repeats, navsim or [], navsim_python and navsim_python.absolute())
+        if as_json:
+            typer.echo(json.dumps(found.to_json()))
+            return
+        typer.echo(f"6 plans {1000 * found.seconds_6:.1f} ms, 4,096 plans {found.seconds_4096:.2f} s")
+        if found.navsim_seconds_a_plan is not None:
+            theirs_ms = 1000 * found.navsim_seconds_a_plan
+            typer.echo(f"NAVSIM {theirs_ms:.1f} ms a plan, {found.times_navsim:.0f} times ours")
+
+
+@bench.command()
 def egodriver(
     scenes: ScenePath = DEFAULT_SCENES,
     checkpoint: Checkpoint = DEFAULT_CHECKPOINT,

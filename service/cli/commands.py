@@ -16,6 +16,7 @@ import service.cli.keys as keys
 import service.cli.loadtest as loadtest
 import service.cli.plan as plan
 import service.cli.scenes as scenes
+import service.cli.score as score
 import service.cli.serve as serve
 import service.cli.train as train
 
@@ -45,6 +46,7 @@ app = typer.Typer(
 app.command("plan")(plan.plan)
 app.command("serve")(serve.serve)
 app.command("train")(train.train)
+app.command("score")(score.score)
 app.command("evaluate")(evaluate.evaluate)
 app.command("drive")(drive.drive)
 app.command("loadtest")(loadtest.loadtest)

@@ -28,6 +28,9 @@ def serve(
     vllm_arguments: VllmArguments = "{}",
     cache_mb: CacheMb = 256,
     reproducible: Reproducible = None,
+    no_model: Annotated[
+        bool, typer.Option("--no-model", help="Load no checkpoint: scores trajectories, plans nothing.")
+    ] = False,
     list_settings: Annotated[
         bool, typer.Option("--settings", help="Say what can be set by environment variables, and end.")
     ] = False,
@@ -52,7 +55,13 @@ def serve(
             cache_mb=cache_mb,
             reproducible=reproducible,
         )
-        app = create_app(load(checkpoint), settings, teacher=TeacherSettings().teacher(), load=load)
+        teacher = TeacherSettings().teacher()
+        if no_model:
+            from service.no_model import NoModel
+
+            app = create_app(NoModel(), settings, teacher=teacher)
+        else:
+            app = create_app(load(checkpoint), settings, teacher=teacher, load=load)
         make_server(app, settings, host, port, announce=_announce).run()
 
 

@@ -12,10 +12,13 @@ import schemathesis
 from pydantic import ValidationError
 
 import clients.wire as wire
+from clients.wire_scores import ScoreRequest
+from service.examples import example_score
 from service.openai_chat import ChatRequest
 from tests.service.serving import body
 
 REAL = body()["scene"]
+SCORED = {"scene_id": None, **example_score()}
 PICTURES = [
     {"type": "image_url", "image_url": {"url": f"data:image/jpeg;base64,{image}"}}
     for clip in REAL["clips"]
@@ -35,6 +38,8 @@ def map_body(context: Any, body: Any) -> Any:
         return body
     requests = body["requests"] if isinstance(body.get("requests"), list) else [body]
     for request in requests:
+        if isinstance(request, dict) and len(str(request)) % 2 and _is_of_the_schema(ScoreRequest, request):
+            request.update(SCORED)
         scene = request.get("scene") if isinstance(request, dict) else None
         if isinstance(scene, dict) and len(str(request)) % 2 and _is_of_the_schema(wire.Scene, scene):
             scene.update({part: REAL[part] for part in ("clips", "history", "route")})

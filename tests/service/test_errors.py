@@ -290,6 +290,8 @@ def test_types_are_stable() -> None:
         "invalid-route": 422,
         "invalid-tracks": 422,
         "invalid-controls": 422,
+        "invalid-labels": 422,
+        "invalid-trajectory": 422,
         "invalid-plan": 422,
         "unknown-format": 422,
         "request-refused": 422,

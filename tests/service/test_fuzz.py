@@ -17,7 +17,7 @@ from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
 
 ROOT = Path(__file__).parents[2]
-WITH_SCENES = "^/v1/(plan|plan/batch|reflect|label|chat/completions)$"
+WITH_SCENES = "^/v1/(plan|plan/batch|reflect|label|score|score/batch|chat/completions)$"
 CONFIG = """
 # That a picture is one, and that a history can be driven, no schema can say: such bodies get a 422.
 [checks]
@@ -31,6 +31,10 @@ checks.positive_data_acceptance.expected-statuses = ["2xx", "400", "401", "403",
 # A scene of a batch that breaks the contract gets its 422 within an answer to the others.
 [[operations]]
 include-path = "/v1/plan/batch"
+checks.negative_data_rejection.expected-statuses = ["2xx", "400", "401", "404", "415", "422", "429"]
+
+[[operations]]
+include-path = "/v1/score/batch"
 checks.negative_data_rejection.expected-statuses = ["2xx", "400", "401", "404", "415", "422", "429"]
 """
 

@@ -1,0 +1,57 @@
+"""An engine that plans nothing, for a service that only scores."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator
+from typing import Final
+
+from model.engines.engine import Event, Load, ModelCard, PlanRequest, RequestError
+
+CARD: Final = ModelCard(
+    name="no-model",
+    revision="",
+    engine="none",
+    formats=(),
+    cameras=(),
+    image_size=(0, 0),
+    parameters=0,
+    inputs=(),
+)
+
+
+class NoModel:
+    """`model.engines.engine.Engine` without a model: it is always ready, and refuses every scene."""
+
+    def __init__(self) -> None:
+        self._stopped = asyncio.Event()
+
+    @property
+    def card(self) -> ModelCard:
+        """Writes no format, so that requests are refused before they get here."""
+        return CARD
+
+    @property
+    def load(self) -> Load:
+        """Nothing."""
+        return Load(0, 0)
+
+    async def start(self) -> None:
+        """There is nothing to load."""
+        self._stopped.clear()
+
+    async def wait(self) -> None:
+        """Until it is stopped."""
+        await self._stopped.wait()
+
+    async def stop(self) -> None:
+        """There is nothing to free."""
+        self._stopped.set()
+
+    async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
+        """Refuse ``request``."""
+        raise RequestError("this service runs without a model")
+        yield
+
+    def cancel(self, request_id: str) -> None:
+        """Nothing runs."""

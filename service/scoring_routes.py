@@ -1,0 +1,121 @@
+"""POST /v1/score and /v1/score/batch; they need no model."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import Annotated, Any, Final
+
+import structlog
+from fastapi import APIRouter, Body, Request
+from fastapi.openapi.models import Example
+
+import clients.wire_scores as wire_scores
+from service.admission import Admission
+from service.callers import while_connected
+from service.errors import problem_document, validated
+from service.examples import example_score
+from service.openapi import PACKED, payloads, problems
+from service.parts import Parts
+from service.payloads import payload_route
+from service.planning import Arrival, full_as_problem, let_in
+from service.planning_routes import arrival_of, respond
+from service.problems import (
+    BODY_TIMEOUT,
+    BODY_TOO_LARGE,
+    DRAINING,
+    INVALID_BODY,
+    INVALID_JSON,
+    INVALID_LABELS,
+    INVALID_REQUEST,
+    INVALID_TRAJECTORY,
+    QUEUE_FULL,
+    RATE_LIMITED,
+    SCENES_UNREADABLE,
+    UNAUTHORIZED,
+    UNKNOWN_FIELD,
+    UNKNOWN_SCENE,
+    UNSUPPORTED_MEDIA_TYPE,
+    ProblemError,
+    unforeseen,
+)
+from service.scoring import scored
+from service.views import BundledScenes
+
+log = structlog.stdlib.get_logger()
+
+_AT_ONCE: Final = 1
+"""Scenes that are scored; each is work for one core, and planning needs the others."""
+EXAMPLES: Final[dict[str, Example]] = {"straight on behind a car": {"value": example_score()}}
+_REFUSALS: Final = (
+    *(INVALID_JSON, INVALID_BODY, UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE),
+    *(INVALID_REQUEST, UNKNOWN_FIELD, INVALID_LABELS, INVALID_TRAJECTORY, UNKNOWN_SCENE),
+    *(QUEUE_FULL, RATE_LIMITED, SCENES_UNREADABLE, DRAINING),
+)
+
+
+def scoring_router(parts: Parts, bundled: BundledScenes) -> APIRouter:
+    """The endpoints of the scorer."""
+    admission = Admission(parts.settings.max_scenes, parts.settings.max_scenes, time.monotonic)
+    working = asyncio.Semaphore(_AT_ONCE)
+
+    def check_open(_: Request) -> None:
+        parts.lifecycle.check_accepting()
+        with full_as_problem():
+            admission.check_open()
+
+    async def one(asked: wire_scores.ScoreRequest, arrival: Arrival) -> wire_scores.ScoreResponse:
+        async with working:
+            return await asyncio.to_thread(scored, asked, bundled, arrival.request_id)
+
+    async def result(given: Any, arrival: Arrival) -> wire_scores.ScoreResult:
+        try:
+            asked = validated(wire_scores.ScoreRequest, given)
+            return wire_scores.ScoreResult(status=200, response=await one(asked, arrival))
+        except ProblemError as error:
+            failure = error
+        except Exception:  # one scene must not end the others
+            log.exception("scene of a batch failed")
+            failure = unforeseen()
+        parts.metrics.problem_told_within(failure.kind)
+        document = problem_document(failure, arrival.request_id)
+        return wire_scores.ScoreResult(status=failure.kind.status, problem=document)
+
+    router = APIRouter(route_class=payload_route(check_open), tags=["scoring"])
+    refusals = problems(*_REFUSALS)
+
+    @router.post(
+        "/v1/score",
+        response_model=wire_scores.ScoreResponse,
+        responses=refusals | PACKED,
+        openapi_extra=payloads(wire_scores.ScoreRequest),
+    )
+    async def score(
+        request: Request, asked: Annotated[wire_scores.ScoreRequest, Body(openapi_examples=EXAMPLES)]
+    ) -> Any:
+        """What trajectories are worth by NAVSIM's rules: sub-scores, and why each one fails."""
+        arrival = arrival_of(request)
+        with parts.lifecycle.accepted(), let_in(admission.place(1)):
+            await parts.planning.spend(arrival.owner, 1)
+            return respond(request, await while_connected(request, one(asked, arrival)))
+
+    @router.post(
+        "/v1/score/batch",
+        response_model=wire_scores.ScoreBatchResponse,
+        responses=refusals | PACKED,
+        openapi_extra=payloads(wire_scores.ScoreBatchRequest),
+    )
+    async def batch(request: Request, asked: wire_scores.ScoreBatchRequest) -> Any:
+        """Many scenes at once: each gets its scores or its problem."""
+        arrival = arrival_of(request)
+
+        async def work() -> wire_scores.ScoreBatchResponse:
+            return wire_scores.ScoreBatchResponse(
+                results=[await result(each, arrival) for each in asked.requests]
+            )
+
+        with parts.lifecycle.accepted(), let_in(admission.place(1)):
+            await parts.planning.spend(arrival.owner, len(asked.requests))
+            return respond(request, await while_connected(request, work()))
+
+    return router

@@ -1,0 +1,36 @@
+"""`looktwice score`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+from service.cli.commands import app
+from service.examples import example_score
+
+RUNNER = CliRunner()
+
+
+def test_a_request_is_scored_as_over_http(tmp_path: Path) -> None:
+    path = tmp_path / "request.json"
+    path.write_text(json.dumps({**example_score(), "version": "v1.1"}))
+    told = RUNNER.invoke(app, ["score", str(path), "--json"])
+    assert told.exit_code == 0, told.output
+    scores = json.loads(told.stdout)["scores"]
+    assert scores[0]["score"] > scores[1]["score"] == 0
+    text = RUNNER.invoke(app, ["score", "-"], input=json.dumps(example_score())).stdout
+    assert "progress against idm; missing: extended_comfort" in text
+    assert "no_at_fault_collisions with leader 0.00 m" in text
+
+
+def test_a_wrong_request_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "request.json"
+    path.write_text(json.dumps({**example_score(), "trajectories": [[[0.0, 0.0, 0.0]] * 9]}))
+    told = RUNNER.invoke(app, ["score", str(path)])
+    assert told.exit_code == 2
+    assert told.stderr == (
+        "looktwice: A trajectory cannot be scored: "
+        "/trajectories/0: has 9 poses; 8 at 0.5 s or 64 at 0.1 s are scored\n"
+    )
