@@ -16,6 +16,9 @@ DIRECTION_FINE_M: Final = 2.0
 DIRECTION_WORST_M: Final = 6.0
 LANE_OFFSET_M: Final = 0.5
 LANE_STEPS: Final = 20
+_CENTRE: Final = 4
+_AXLE: Final = 5
+"""Behind the corners, among the points of a box."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,27 +53,39 @@ class Areas:
 
 def areas_of(ego: Boxes, axles: Array, world: World) -> Areas:
     """The areas of ego boxes [n, 41] with rear axles [n, 41, 2]."""
-    shape = ego.x.shape
-    corners, centres = (
-        Points(ego.corners().reshape(-1, 2)),
-        Points(np.stack([ego.x, ego.y], -1).reshape(-1, 2)),
+    # Four corners, the centre and the rear axle of each box, looked up in all areas at once.
+    centres = np.stack([ego.x, ego.y], axis=-1)
+    points = np.concatenate([ego.corners(), centres[:, :, None], axles[:, :, None]], axis=2)
+    layers = (
+        [lane.area for lane in world.lanes or ()],
+        list(world.drivable or ()),
+        list(world.intersections or ()),
     )
+    every = [area for layer in layers for area in layer]
+    inside = Points(points.reshape(-1, 2)).inside_each(every).reshape(len(every), *points.shape[:3])
+    lanes, drivable, crossings = np.split(inside, np.cumsum([len(layer) for layer in layers])[:-1])
     several_lanes: BoolArray | None = None
     off_road: BoolArray | None = None
     off_route: BoolArray | None = None
     crossing: BoolArray | None = None
     axle_crossing: BoolArray | None = None
     if world.lanes is not None:
-        held = corners.inside_each([lane.area for lane in world.lanes]).reshape(-1, *shape, 4).sum(axis=-1)
-        several_lanes = ((held > 0).sum(axis=0) > 1) & ~(held == 4).any(axis=0)
-        off_route = ~centres.inside_any([lane.area for lane in world.lanes if lane.on_route]).reshape(shape)
+        held = lanes[..., :_CENTRE].sum(axis=-1)
+        several_lanes = ((held > 0).sum(axis=0) > 1) & ~_any(held == 4)
+        on_route = [lane.on_route for lane in world.lanes]
+        off_route = ~_any(lanes[on_route, ..., _CENTRE])
     if world.drivable is not None:
-        on_road = corners.inside_any((*world.drivable, *(world.intersections or ())))
-        off_road = np.logical_not(on_road.reshape(*shape, 4).all(axis=-1))
+        off_road = _any(np.moveaxis(~(_any(drivable) | _any(crossings))[..., :_CENTRE], -1, 0))
     if world.intersections is not None:
-        crossing = centres.inside_any(world.intersections).reshape(shape)
-        axle_crossing = Points(axles.reshape(-1, 2)).inside_any(world.intersections).reshape(shape)
+        crossing = _any(crossings[..., _CENTRE])
+        axle_crossing = _any(crossings[..., _AXLE])
     return Areas(several_lanes, off_road, off_route, crossing, axle_crossing)
+
+
+def _any(flags: BoolArray) -> BoolArray:
+    """Whether a flag is set in any of the first axis."""
+    result: BoolArray = np.logical_or.reduce(flags, axis=0)
+    return result
 
 
 def driven_against(ego: Boxes, against: BoolArray) -> Array:

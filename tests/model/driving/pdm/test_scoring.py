@@ -86,6 +86,14 @@ def test_a_missing_layer_is_never_a_silent_1(layer: str, lost: set[str]) -> None
     assert found.partial_score == pytest.approx([1.0])
 
 
+def test_what_is_known_to_be_empty_is_judged() -> None:
+    found = score(road(lanes=(), drivable=()), straight(8)[None]).sub_scores
+    for name, expected in ((DRIVABLE, 0.0), (DIRECTION, 0.0), (COLLISIONS, 1.0)):
+        value = found[name]
+        assert value is not None
+        assert value.tolist() == [expected]
+
+
 def test_without_other_plans_progress_and_extended_comfort_are_missing() -> None:
     found = score(road(), straight(8)[None])
     assert set(found.missing) == {PROGRESS, EXTENDED_COMFORT}
