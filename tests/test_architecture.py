@@ -18,6 +18,7 @@ ALLOWED = {
     "model.driving": ("model.driving",),
     "model.formats": ("model.formats", "model.driving"),
     "clients": ("clients", "model.driving"),
+    "clients.importers": ("clients.importers", "clients.navsim", "model.driving"),
     "loadtests": ("loadtests", "clients", "model.driving"),
     "service": (
         *("service", "clients.wire", "clients.wire_scores", "clients.wire_values"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,8 +13,10 @@ import typer
 from service.cli.options import DEFAULT_SCENES, Json, told
 
 if TYPE_CHECKING:
-    from clients.recordings import Source
+    from clients.importers.recording import Recording
+    from clients.importers.views import Source
     from model.driving.cameras import CameraSpec
+    from model.driving.scene import LabelledScene
 
 app = typer.Typer(help="Make, count and look at driving scenes.", no_args_is_help=True)
 _Scenes = Annotated[Path, typer.Argument(help="Scene file or folder; the bundled test scenes without one.")]
@@ -57,13 +60,19 @@ def generate(
 
 @app.command("import")
 def import_(
-    folder: Annotated[Path, typer.Argument(help="A drive: poses.csv, and a folder of pictures a camera.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="A drive: poses.csv and a folder of pictures a camera; or nuScenes; or comma2k19."
+        ),
+    ],
     out: Annotated[Path, typer.Argument(help="Scene file to write.")],
     camera: Annotated[
         list[str] | None,
         typer.Option(
-            help="CAMERA=FOLDER:DEGREES[:HORIZON], once for each camera: where its pictures are, what they "
-            "show from side to side, and where the horizon lies (0.5 is half-way down).",
+            help="CAMERA=FOLDER:DEGREES[:HORIZON[:DEGREES_DOWN]], once a camera: where its pictures are, "
+            "what they show from side to side, where the horizon lies (0.5 is half-way down), and what they "
+            "show from top to bottom, for pictures whose pixels are not square.",
             show_default="folders named like the model's two cameras",
         ),
     ] = None,
@@ -71,16 +80,22 @@ def import_(
     route: Annotated[bool, typer.Option(help="Take the way that was driven for the route.")] = False,
     width: Annotated[int, typer.Option(help="Width of the pictures in pixels, twice their height.")] = 336,
 ) -> None:
-    """Make scenes of a drive of your own; docs/own-cameras.md tells how."""
+    """Make scenes of recorded drives, your own or others'; docs/own-cameras.md tells how."""
     with told():
-        from clients.recordings import Recording, RecordingError, doubts
+        from clients.importers.recording import RecordingError
         from model.driving.scene_store import write_scenes
 
-        cameras = _played(camera or [], width)
-        recording = Recording.read(folder, list(cameras.values()))
-        for doubt in doubts(recording, cameras):
-            typer.echo(f"looktwice: {doubt}", err=True)
-        count = write_scenes(out, recording.scenes(cameras, stride_s=stride, route=route))
+        doubts: set[str] = set()
+
+        def scenes() -> Iterator[LabelledScene]:
+            for recording in _recordings(folder, camera or [], width):
+                for doubt in recording.doubts():
+                    if doubt not in doubts:
+                        typer.echo(f"looktwice: {doubt}", err=True)
+                        doubts.add(doubt)
+                yield from recording.scenes(stride_s=stride, route=route)
+
+        count = write_scenes(out, scenes())
         if not count:
             out.unlink()
             raise RecordingError(
@@ -90,25 +105,44 @@ def import_(
         typer.echo(f"{count} scenes in {out}")
 
 
-def _played(told: list[str], width: int) -> dict[CameraSpec, Source]:
-    from clients.recordings import RecordingError, Source
+def _recordings(folder: Path, told: list[str], width: int) -> Iterable[Recording]:
+    """Of whichever layout the folder has."""
+    from clients.importers.comma2k19 import POSES_FOLDER, read_segments
+    from clients.importers.folder import POSES_FILE, read_folder
+    from clients.importers.nuscenes import VERSIONS, read_nuscenes
     from model.driving.cameras import FRONT_CAMERAS
 
-    specs = {spec.name: spec.resized(width) for spec in FRONT_CAMERAS}
+    specs = [spec.resized(width) for spec in FRONT_CAMERAS]
+    if any(folder.glob(VERSIONS)):
+        others = read_nuscenes(folder, specs)
+    elif not (folder / POSES_FILE).exists() and any(folder.rglob(POSES_FOLDER)):
+        others = read_segments(folder, specs)
+    else:
+        return [read_folder(folder, _played(told, specs))]
+    if told:
+        raise ValueError("--camera is for a folder of your own; nuScenes and comma2k19 tell of their cameras")
+    return others
+
+
+def _played(told: list[str], specs: list[CameraSpec]) -> dict[CameraSpec, Source]:
+    from clients.importers.recording import RecordingError
+    from clients.importers.views import Source
+
     if not told:
-        return {spec: Source(name, spec.hfov_degrees, spec.horizon) for name, spec in specs.items()}
+        return {spec: Source(spec.name, spec.hfov_degrees, spec.horizon) for spec in specs}
+    named = {spec.name: spec for spec in specs}
     found = {}
     for each in told:
         name, _, source = each.partition("=")
-        parts = source.split(":")
         try:
-            folder, degrees, *horizon = parts
-            found[specs[name]] = Source(folder, float(degrees), *map(float, horizon[:1]))
+            folder, *numbers = source.split(":")
+            degrees, horizon, *down = [*map(float, numbers), 0.5][: max(2, len(numbers))]
+            found[named[name]] = Source(folder, degrees, horizon, vfov_degrees=down[0] if down else None)
         except (KeyError, ValueError) as error:
             if isinstance(error, RecordingError):
                 raise
-            known = ", ".join(specs)
-            raise ValueError(f"{each!r} is no CAMERA=FOLDER:DEGREES[:HORIZON]; known are {known}") from None
+            form = "CAMERA=FOLDER:DEGREES[:HORIZON[:DEGREES_DOWN]]"
+            raise ValueError(f"{each!r} is no {form}; known are {', '.join(named)}") from None
     return found
 
 

@@ -10,7 +10,9 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from clients.recordings import Recording, RecordingError, Source, doubts, grey_share, played
+from clients.importers.folder import read_folder
+from clients.importers.recording import RecordingError
+from clients.importers.views import Source, as_seen, fov_of, grey_share
 from model.driving.cameras import FRONT_CAMERAS
 from model.driving.images import decode_image
 from model.driving.scene_store import read_scenes
@@ -86,12 +88,12 @@ def test_a_drive_becomes_scenes_that_move_as_it_did(drive: Path, tmp_path: Path)
 @pytest.mark.parametrize("spec", [WIDE, TELE], ids=lambda spec: str(spec.name))
 @pytest.mark.parametrize(("hfov", "horizon"), [(100.0, 0.45), (150.0, 0.5)])
 def test_a_picture_is_played_as_the_camera_would_have_taken_it(
-    tmp_path: Path, spec: object, hfov: float, horizon: float
+    spec: object, hfov: float, horizon: float
 ) -> None:
     assert spec in (WIDE, TELE)
     camera = WIDE if spec is WIDE else TELE
-    picture(1600, 1200, hfov, horizon).save(tmp_path / "0.png")
-    seen = decode_image(played(camera, Source(".", hfov, horizon), tmp_path / "0.png")).astype(float)
+    shown = np.asarray(picture(1600, 1200, hfov, horizon))
+    seen = decode_image(as_seen(camera, Source("dash", hfov, horizon), shown)).astype(float)
     assert seen.shape == (168, 336, 3)
     columns = np.degrees(np.arctan2(168 - (np.arange(336) + 0.5), camera.focal_px))
     row = seen[round(camera.horizon * 168) + 8]
@@ -104,12 +106,30 @@ def test_a_picture_is_played_as_the_camera_would_have_taken_it(
 
 
 def test_what_is_unlike_our_cameras_is_told(drive: Path) -> None:
-    narrow = {WIDE: Source("dash", 60.0), TELE: Source("dash", 60.0)}
-    recording = Recording.read(drive, list(narrow.values()))
-    (doubt,) = doubts(recording, narrow)
+    recording = read_folder(drive, {WIDE: Source("dash", 60.0), TELE: Source("dash", 60.0)})
+    (doubt,) = recording.doubts()
     assert "front_wide_120" in doubt
     assert "60" in doubt
     assert grey_share(TELE, Source("dash", 60.0), (800, 600)) == 0
+
+
+def test_stretched_pictures_are_told_and_made_even(tmp_path: Path) -> None:
+    """800 by 600 pixels of square ones, squeezed to half their height."""
+    even = picture(800, 600, 100, 0.45)
+    squeezed = even.resize((800, 300), Image.Resampling.BOX)
+    down_degrees = fov_of(600, Source("dash", 100.0).focal_px((800, 600))[0])
+    source = Source("dash", 100.0, 0.45, vfov_degrees=down_degrees)
+    seen = decode_image(as_seen(TELE, source, np.asarray(squeezed)))
+    wanted = decode_image(as_seen(TELE, Source("dash", 100.0, 0.45), np.asarray(even)))
+    assert np.abs(seen.astype(int) - wanted).mean() < 1.5
+
+    (tmp_path / "dash").mkdir()
+    squeezed.save(tmp_path / "dash" / "0.jpg")
+    (tmp_path / "poses.csv").write_text("time_s,x_m,y_m,heading_rad\n0,0,0,0\n1,1,0,0\n")
+    (doubt,) = read_folder(tmp_path, {TELE: source}).doubts()
+    assert "100% too wide" in doubt
+    told = f"front_tele_30=dash:100:0.45:{down_degrees}"
+    assert "100% too wide" in " ".join(ran(tmp_path, tmp_path / "o", "--camera", told, code=2).split())
 
 
 @pytest.mark.parametrize(
