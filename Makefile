@@ -13,7 +13,7 @@ VLLM_PIP := $(VLLM_BIN)/pip install --quiet --disable-pip-version-check -c deplo
 # What vLLM's CPU build brings along but never imports there, and what is linked to CUDA.
 VLLM_UNUSED := torchaudio torchcodec triton
 
-.PHONY: plan test check deploy-check sim vllm test-vllm system-packages clean
+.PHONY: plan test check lint-api deploy-check sim vllm test-vllm system-packages clean
 
 plan: $(VENV)/.serve
 	$(BIN)/looktwice plan
@@ -25,6 +25,14 @@ check: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Our API's description by somebody else's rules (.spectral.yaml); takes npm.
+lint-api: $(VENV)/.dev
+	folder=$$(mktemp -d) && \
+	$(BIN)/python -m tests.service.description > "$$folder/openapi.json" && \
+	npm exec --yes --package=@stoplight/spectral-cli@6.16.3 -- \
+	spectral lint --fail-severity=warn "$$folder/openapi.json"; \
+	status=$$?; rm -r "$$folder"; exit $$status
 
 # Everything in deploy/, with hadolint, helm, promtool, a local Ray and the schemas of compose, Kubernetes and Grafana.
 deploy-check: $(VENV)/.dev $(BIN)/promtool

@@ -19,6 +19,12 @@ from service.problems import INTERNAL, Kind
 
 Responses = dict[int | str, dict[str, Any]]
 
+_TAGS = {
+    "planning": "plans, reflections and the models that make them",
+    "labelling": "what a teacher says of plans",
+    "scenes": "bundled scenes, and those of a file",
+    "operations": "health, readiness, metrics, models that are swapped",
+}
 
 PACKED: Responses = {
     200: {"content": {MSGPACK_MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}}}
@@ -68,6 +74,8 @@ def describe(app: FastAPI, *, keys: bool) -> None:
     def openapi() -> dict[str, Any]:
         if app.openapi_schema is None:
             description = generate()
+            description["servers"] = [{"url": "/", "description": "where this description comes from"}]
+            description["tags"] = [{"name": name, "description": text} for name, text in _TAGS.items()]
             for path, operations in description["paths"].items():
                 for operation in operations.values():
                     _move_problems(operation["responses"])

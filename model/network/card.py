@@ -33,6 +33,13 @@ def write_card(folder: Path, settings: VlaSettings, parameters: int, details: Ma
     (folder / CARD_FILE).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
 
 
+def write_details(folder: Path, details: Mapping[str, Any]) -> None:
+    """Add to what the card tells beside the weights; raises `CheckpointError` as `read_card` does."""
+    card = read_card(folder)
+    card["details"] |= details
+    (folder / CARD_FILE).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+
+
 def read_card(folder: Path) -> dict[str, Any]:
     """The card of a folder, with at least ``name``, ``revision``, ``parameters`` and ``details``.
 

@@ -1,7 +1,7 @@
 """Checkpoint folders in Hugging Face layout: create, save, load, expand a stock Qwen2.5-VL.
 
-A folder holds ``config.json``, tokenizer files, ``model.safetensors`` (or shards), the trajectory codec and
-``looktwice.json``, a small card for people and tools.
+A folder holds ``config.json``, tokenizer files, ``model.safetensors`` (or shards), the trajectory codec,
+``looktwice.json``, a small card for tools, and what a model repository needs (`model.network.repository`).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from model.engines.engine import ModelCard
 from model.network.card import CheckpointError, read_card, weight_files, weights_revision, write_card
 from model.network.codec import CodecError, TrajectoryCodec
 from model.network.inputs import InputBuilder
+from model.network.repository import write_repository
 from model.network.settings import SettingsError, VlaSettings
 from model.network.vla import LookTwiceVla, VlaConfig, nano_config, padded_size, parameters_of, with_settings
 from model.network.vocabulary import Vocabulary, VocabularyError, expand_tokenizer
@@ -117,6 +118,7 @@ def save(
     vocabulary.tokenizer.save_pretrained(folder)
     codec.save(folder)
     write_card(folder, model.settings, parameters_of(model), details or {})
+    write_repository(folder)
 
 
 def load(folder: Path, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Loaded:

@@ -64,6 +64,36 @@ def prompt_text(format: str, settings: VlaSettings, *, route: bool, tracks: bool
     )
 
 
+def chat_template(settings: VlaSettings) -> str:
+    """The same prompt as a template for `apply_chat_template`.
+
+    A message's content is text or a list of ``text``, ``video`` (all clips together, in the checkpoint's
+    order of cameras), ``history``, ``route`` and ``tracks``; the task comes first.
+    """
+    written = {
+        "video": _seen(settings),
+        "history": motion_text(route=False),
+        "route": motion_text(route=True).removeprefix(motion_text(route=False)),
+        "tracks": motion_text(route=False, tracks=True).removeprefix(motion_text(route=False)),
+    }
+    parts = "".join(f"{{% elif part.type == {kind!r} %}}{{{{ {text!r} }}}}" for kind, text in written.items())
+    return (
+        "{% if messages[0].role != 'system' %}"
+        f"{{{{ {f'{IM_START}system{chr(10)}{_SYSTEM}{IM_END}{chr(10)}'!r} }}}}"
+        "{% endif %}"
+        "{% for message in messages %}"
+        f"{{{{ {IM_START!r} + message.role + '\\n' }}}}"
+        "{% if message.content is string %}{{ message.content }}{% else %}"
+        "{% for part in message.content %}"
+        "{% if part.type == 'text' %}{{ part.text + '\\n' }}"
+        f"{parts}"
+        "{% endif %}{% endfor %}{% endif %}"
+        f"{{{{ {f'{IM_END}{chr(10)}'!r} }}}}"
+        "{% endfor %}"
+        f"{{% if add_generation_prompt %}}{{{{ {f'{IM_START}assistant{chr(10)}'!r} }}}}{{% endif %}}"
+    )
+
+
 def _seen(settings: VlaSettings) -> str:
     if settings.scene_tokens:
         return f"cameras:{VISION_START}{VIDEO_PAD * settings.scene_tokens}{VISION_END}\n"

@@ -9,6 +9,7 @@ import typer
 
 import service.cli.bench as bench
 import service.cli.build as build
+import service.cli.describe as describe
 import service.cli.drive as drive
 import service.cli.egodriver as egodriver
 import service.cli.evaluate as evaluate
@@ -48,6 +49,7 @@ app.command("serve")(serve.serve)
 app.command("train")(train.train)
 app.command("score")(score.score)
 app.command("evaluate")(evaluate.evaluate)
+app.command("describe")(describe.describe)
 app.command("drive")(drive.drive)
 app.command("loadtest")(loadtest.loadtest)
 app.command("egodriver")(egodriver.egodriver)

@@ -12,17 +12,6 @@ import typer
 
 from model.bundled import CHECKPOINT, SCENES
 
-Checkpoint = Annotated[
-    Path, typer.Option("--checkpoint", help="Checkpoint folder.", show_default=str(CHECKPOINT.name))
-]
-ScenePath = Annotated[
-    Path, typer.Option("--scenes", help="Scene file or folder of scene files.", show_default="bundled")
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
-
-DEFAULT_CHECKPOINT = CHECKPOINT
-DEFAULT_SCENES = SCENES
-
 
 @contextmanager
 def told() -> Iterator[None]:
@@ -32,3 +21,30 @@ def told() -> Iterator[None]:
     except (ValueError, RuntimeError, OSError, sqlite3.OperationalError) as error:
         typer.echo(f"looktwice: {error}", err=True)
         raise typer.Exit(2) from error
+
+
+def _found(checkpoint: Path) -> Path:
+    if checkpoint.exists():
+        return checkpoint
+    from model.network.hub import checkpoint_folder
+
+    with told():
+        return checkpoint_folder(checkpoint)
+
+
+Checkpoint = Annotated[
+    Path,
+    typer.Option(
+        "--checkpoint",
+        help="Checkpoint folder, or OWNER/NAME[@REVISION] on the Hugging Face hub.",
+        show_default=str(CHECKPOINT.name),
+        callback=_found,
+    ),
+]
+ScenePath = Annotated[
+    Path, typer.Option("--scenes", help="Scene file or folder of scene files.", show_default="bundled")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+
+DEFAULT_CHECKPOINT = CHECKPOINT
+DEFAULT_SCENES = SCENES

@@ -76,3 +76,15 @@ def test_its_page_needs_nothing_from_elsewhere(served: Served) -> None:
             assert served.http.get(source).status_code == 200
     assert "/openapi.json" in page.text
     assert "//cdn" not in page.text
+
+
+def test_tags_and_servers_are_told_as_spectral_wants_them(description: dict[str, Any]) -> None:
+    told = {tag["name"] for tag in description["tags"]}
+    used = {
+        tag
+        for operations in description["paths"].values()
+        for operation in operations.values()
+        for tag in operation["tags"]
+    }
+    assert used == told
+    assert description["servers"]

@@ -1,0 +1,159 @@
+"""What makes a checkpoint folder a model repository of Hugging Face: model card, processor, chat template.
+
+``auto_map`` names two small files in the folder, which import this package. With ``trust_remote_code=True``,
+`AutoModel` and `AutoProcessor` load the whole network by them; the backbone's own class would leave out the
+encoders.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from model.network.card import CheckpointError, read_card, write_details
+from model.network.processor import LookTwiceProcessor, processor_config
+from model.network.prompts import chat_template
+from model.network.settings import CONFIG_KEY, SettingsError, VlaSettings
+from model.network.vla import LookTwiceVla
+
+CARD: Final = "README.md"
+_MODEL_CODE: Final = "modeling_looktwice"
+_PROCESSOR_CODE: Final = "processing_looktwice"
+_AUTO_MODELS: Final = ("AutoModel", "AutoModelForImageTextToText", "AutoModelForMultimodalLM")
+_CODE: Final = '''"""{what} of this checkpoint, from the package `looktwice`, which has to be installed."""
+
+from {module} import {name} as _{name}
+
+
+class {name}(_{name}):
+    """As the package has it."""
+'''
+
+
+def write_repository(folder: Path, figures: Mapping[str, str] | None = None) -> None:
+    """Add to a checkpoint folder, or renew in it, what a model repository needs; weights stay as they are.
+
+    Args:
+        folder: with ``config.json``, tokenizer, weights and ``looktwice.json``.
+        figures: measured values by what was measured, kept in ``looktwice.json``; None keeps what is there.
+
+    Raises:
+        CheckpointError: the folder is no checkpoint.
+    """
+    if figures is not None:
+        write_details(folder, {"figures": dict(figures)})
+    card = read_card(folder)
+    path = folder / "config.json"
+    try:
+        config: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        extra = {name: value for name, value in config[CONFIG_KEY].items() if not name.endswith("_token_id")}
+        settings = VlaSettings.from_dict(extra)
+    except (OSError, ValueError, KeyError, AttributeError, SettingsError) as error:
+        raise CheckpointError(f"{path} is no configuration of ours: {error}") from error
+    config["auto_map"] = {auto: f"{_MODEL_CODE}.{LookTwiceVla.__name__}" for auto in _AUTO_MODELS}
+    _write(path, json.dumps(config, indent=2, sort_keys=True))
+    _write(folder / "processor_config.json", json.dumps(processor_config(settings), indent=2, sort_keys=True))
+    _write(folder / "chat_template.jinja", chat_template(settings))
+    for code, what, made in (
+        (_MODEL_CODE, "The network", LookTwiceVla),
+        (_PROCESSOR_CODE, "The processor", LookTwiceProcessor),
+    ):
+        text = _CODE.format(what=what, module=made.__module__, name=made.__name__)
+        _write(folder / f"{code}.py", text.rstrip())
+    _write(folder / CARD, model_card(card, settings))
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def model_card(card: Mapping[str, Any], settings: VlaSettings) -> str:
+    """``README.md`` of a checkpoint, from its ``looktwice.json`` and its settings."""
+    details = card["details"]
+    inputs = ", ".join(("pictures", "ego history", *settings.inputs))
+    lines = [
+        "---",
+        "license: apache-2.0",
+        "library_name: transformers",
+        "pipeline_tag: robotics",
+        "tags: [autonomous-driving, vision-language-action, simulation]",
+        "---",
+        "",
+        f"# {card['name']}",
+        "",
+        "A model that writes a driving plan in words, may look at it twice, and gives 6.4 s of trajectory. "
+        f"It has {card['parameters'] / 1e6:.1f} million parameters; revision `{card['revision']}`.",
+        "",
+        "**Not for road use.** It must not drive a vehicle, nor advise whoever drives one.",
+        "",
+        "## Use",
+        "",
+        "For research on plans that are looked at twice, and to try out planners and their interfaces.",
+        "",
+        "```python",
+        "from transformers import AutoModel, AutoProcessor",
+        "",
+        "from model.bundled import SCENES",
+        "from model.driving.scene_store import read_scenes",
+        "",
+        "model = AutoModel.from_pretrained(FOLDER, trust_remote_code=True)",
+        "processor = AutoProcessor.from_pretrained(FOLDER, trust_remote_code=True)",
+        "scene = next(read_scenes(SCENES)).scene",
+        "print(model(**processor(scene)).logits.shape)",
+        "```",
+        "",
+        "Both need the package `looktwice`. Whole responses, decoded under their grammar, come from "
+        "`looktwice plan --checkpoint FOLDER` and `looktwice serve --checkpoint FOLDER`.",
+        "",
+        "| | |",
+        "|---|---|",
+        f"| inputs | {inputs} |",
+        f"| cameras | {', '.join(settings.cameras)}; {settings.image_width} x {settings.image_height} px, "
+        "four pictures each, half a second apart |",
+        f"| response formats | {', '.join(settings.formats)} |",
+        f"| trajectory | 64 poses at 10 Hz, six codes of {settings.codec_size} |",
+        "",
+        "## Limits",
+        "",
+        "- It has seen a simulator only, from two cameras; on real pictures its plans mean nothing.",
+        "- It misses vehicles, pedestrians and barriers, and plans into them. A likely draw is no safe draw.",
+        "- Its reasons are text that goes with a plan. They need not be why it plans so.",
+        "",
+        "## Data",
+        "",
+        *_trained(details),
+        "",
+        "## Figures",
+        "",
+        *_measured(details.get("figures") or {}),
+    ]
+    return "\n".join(lines)
+
+
+def _trained(details: Mapping[str, Any]) -> Iterable[str]:
+    stages = details.get("stages")
+    if not stages:
+        return ["No training is recorded in this folder."]
+    return [
+        "Scenes rendered in MetaDrive, driven by a scripted expert; no real drive. "
+        "Stages of training, in order:",
+        "",
+        "| stage | steps | batch | scenes | episodes |",
+        "|---|---|---|---|---|",
+        *(f"| {' | '.join(str(stage.get(key, '')) for key in _STAGE_COLUMNS)} |" for stage in stages),
+    ]
+
+
+_STAGE_COLUMNS: Final = ("name", "steps", "batch_size", "examples", "episodes")
+
+
+def _measured(figures: Mapping[str, str]) -> Iterable[str]:
+    if not figures:
+        return ["None are recorded; `looktwice evaluate --checkpoint FOLDER` measures them."]
+    return [
+        "| measured | value |",
+        "|---|---|",
+        *(f"| {what} | {value} |" for what, value in figures.items()),
+    ]

@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file
+from typer.testing import CliRunner
+
+from model.bundled import CHECKPOINT, SCENES
+from model.driving.scene_store import read_scenes
+from model.network.card import CheckpointError, read_card
+from model.network.checkpoint import load, read_parts
+from model.network.processor import LookTwiceProcessor
+from model.network.prompts import TASKS, chat_template, prompt_text
+from model.network.repository import write_repository
+from model.network.settings import VlaSettings
+from service.cli.commands import app
+from tests.checkpoints import write_untrained
+
+ROOT = Path(__file__).parents[3]
+# In a process of its own: `transformers` keeps what it loads from a folder's code for the whole process.
+LOADED_BY_NAME = """
+import sys
+from safetensors.torch import save_file
+from transformers import AutoModel, AutoModelForImageTextToText, AutoProcessor
+from model.bundled import SCENES
+from model.driving.scene_store import read_scenes
+
+folder, out = sys.argv[1:]
+processor = AutoProcessor.from_pretrained(folder, trust_remote_code=True)
+inputs = processor(next(read_scenes(SCENES)).scene)
+for auto in (AutoModel, AutoModelForImageTextToText):
+    model, report = auto.from_pretrained(folder, trust_remote_code=True, output_loading_info=True)
+    assert not report["missing_keys"] and not report["unexpected_keys"], report
+    logits = model.eval()(**inputs).logits
+save_file({"logits": logits}, out)
+"""
+
+
+def run(code: str, *arguments: object, home: Path, offline: bool = True) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "HF_HOME": str(home)}
+    if offline:
+        environment["HF_HUB_OFFLINE"] = "1"
+    command = [sys.executable, *(["-c", code] if code else []), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, check=False)
+
+
+def test_auto_classes_load_the_whole_network(tmp_path: Path) -> None:
+    done = run(LOADED_BY_NAME, CHECKPOINT, tmp_path / "out", home=tmp_path)
+    assert done.returncode == 0, done.stderr
+    ours = load(CHECKPOINT)
+    inputs = LookTwiceProcessor(ours.vocabulary.tokenizer, ours.settings.to_dict())(
+        next(read_scenes(SCENES)).scene
+    )
+    with torch.no_grad():
+        logits = ours.model(**inputs).logits.numpy()
+    theirs = load_file(tmp_path / "out")["logits"]
+    assert logits.shape == theirs.shape
+    np.testing.assert_allclose(theirs, logits, atol=1e-4)
+
+
+def test_the_bundled_folder_is_what_is_written_today(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(CHECKPOINT, tmp_path / "looktwice-nano"))
+    write_repository(folder)
+    for file in folder.iterdir():
+        assert file.read_bytes() == (CHECKPOINT / file.name).read_bytes(), f"{file.name}: looktwice describe"
+
+
+@pytest.mark.parametrize("scene_tokens", [0, 16])
+def test_the_chat_template_writes_our_prompts(tmp_path: Path, scene_tokens: int) -> None:
+    settings = VlaSettings(with_tracks=True, scene_tokens=scene_tokens)
+    tokenizer = read_parts(CHECKPOINT).vocabulary.tokenizer
+    for task, route, tracks in product(TASKS, (False, True), (False, True)):
+        kinds = ["video", "history", *["route"] * route, *["tracks"] * tracks]
+        content = [{"type": "text", "text": TASKS[task]}, *({"type": kind} for kind in kinds)]
+        written = tokenizer.apply_chat_template(
+            [{"role": "user", "content": content}],
+            chat_template=chat_template(settings),
+            add_generation_prompt=True,
+            tokenize=False,
+        )
+        assert written == prompt_text(task, settings, route=route, tracks=tracks)
+
+
+def test_a_new_checkpoint_has_a_card_that_tells_what_it_is(tmp_path: Path) -> None:
+    folder = write_untrained(tmp_path / "new", narrow=True)
+    card = (folder / "README.md").read_text()
+    assert read_card(folder)["revision"] in card
+    assert "Not for road use" in card
+    assert "No training is recorded" in card
+    assert "None are recorded" in card
+
+
+def test_describe_keeps_weights_and_records_figures(tmp_path: Path) -> None:
+    folder = write_untrained(tmp_path / "new", narrow=True)
+    weights = (folder / "model.safetensors").read_bytes()
+    told = ["describe", str(folder), "--figure", "minADE of 6 = 2.35 m", "--figure", "a=b=3"]
+    result = CliRunner().invoke(app, told)
+    assert result.exit_code == 0, result.output
+    card = (folder / "README.md").read_text()
+    assert "| minADE of 6 | 2.35 m |\n| a=b | 3 |" in card
+    write_repository(folder)
+    assert (folder / "README.md").read_text() == card, "figures are kept"
+    assert (folder / "model.safetensors").read_bytes() == weights
+
+
+@pytest.mark.parametrize("figure", ["none", "a=", "=3", "a|b=3"])
+def test_describe_refuses_what_is_no_figure(tmp_path: Path, figure: str) -> None:
+    folder = write_untrained(tmp_path / "new", narrow=True)
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    result = CliRunner().invoke(app, ["describe", str(folder), "--figure", figure])
+    assert result.exit_code == 2
+    assert "WHAT=VALUE" in result.output
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+def test_a_stock_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"no looktwice\.json"):
+        write_repository(tmp_path)
+
+
+PLAN = ("-m", "service.cli", "plan", "--n", 1, "--json")
+
+
+def test_a_name_on_the_hub_is_a_checkpoint(tmp_path: Path) -> None:
+    """As the hub's own client keeps what it downloaded."""
+    kept = tmp_path / "hub" / "models--somebody--nano"
+    revision = "0123456789abcdef0123456789abcdef01234567"
+    shutil.copytree(CHECKPOINT, kept / "snapshots" / revision)
+    (kept / "refs").mkdir()
+    (kept / "refs" / "main").write_text(revision)
+    out = ("--out", tmp_path / "out")
+    done = run("", *PLAN, *out, "--checkpoint", "somebody/nano", home=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["draws"]
+    other = run("", *PLAN, *out, "--checkpoint", "somebody/nano@v2", home=tmp_path)
+    assert other.returncode == 2
+
+
+def test_without_the_hub_it_says_so_in_a_line(tmp_path: Path) -> None:
+    done = run("", *PLAN, "--checkpoint", "somebody/nano", home=tmp_path)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "no folder somebody/nano" in line
+    assert "cannot be reached" in line
+    folder = run("", *PLAN, "--checkpoint", tmp_path / "nowhere", home=tmp_path)
+    assert folder.returncode == 2
+    assert "is not a LookTwice checkpoint" in folder.stderr
