@@ -79,7 +79,7 @@ def chat_template(settings: VlaSettings) -> str:
     parts = "".join(f"{{% elif part.type == {kind!r} %}}{{{{ {text!r} }}}}" for kind, text in written.items())
     return (
         "{% if messages[0].role != 'system' %}"
-        f"{{{{ {f'{IM_START}system{chr(10)}{_SYSTEM}{IM_END}{chr(10)}'!r} }}}}"
+        f"{{{{ {f'{IM_START}system{chr(10)}{SYSTEM}{IM_END}{chr(10)}'!r} }}}}"
         "{% endif %}"
         "{% for message in messages %}"
         f"{{{{ {IM_START!r} + message.role + '\\n' }}}}"
