@@ -11,8 +11,9 @@ import torch
 
 from model.driving.scene import Scene
 from model.engines.engine import Controls, DrawFinished, PlanRequest
+from model.engines.torch.batch import Batch, Feed
 from model.engines.torch.decoder import Decoder
-from model.engines.torch.runner import Feed, Prompt, Runner
+from model.engines.torch.runner import Prompt, Runner
 from model.engines.torch.sampler import probabilities, uniform
 from model.formats.text import parse
 from model.network.checkpoint import load
@@ -94,10 +95,10 @@ def _margin(exact: Runner, request: PlanRequest, draw: int, written: Sequence[in
     cursor = exact.formats[request.format].start()
     for token in written:
         cursor = cursor.advance(token)
-    [prompt] = exact.begin_prompts([(request.scene, request.format)], 0)
+    [prompt] = exact.begin_prompts([(request.scene, request.format, 0)])
     assert isinstance(prompt, Prompt)
     exact.feed_prompts([(prompt, exact.prompt_tokens)])
     feed = Feed(0, prompt, 0, [prompt.last_token, *written], [(len(written), cursor.allowed().ids)])
-    [[logits]] = exact.feed([feed])
+    [[logits]] = exact.feed(Batch.of([feed], exact.memory()))
     borders = np.cumsum(probabilities(logits, request.controls.temperature))[:-1]
     return float(np.abs(borders - uniform(request.controls.seed, draw, len(written))).min())

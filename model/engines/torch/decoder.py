@@ -1,12 +1,11 @@
-"""The decoding loop without threads: schedule, run one pass, apply what was chosen."""
+"""The decoding loop without threads. A step: schedule, run, apply."""
 
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -23,20 +22,20 @@ from model.engines.engine import (
     RequestError,
     Started,
 )
-from model.engines.requests import begin, branch_of, read
-from model.engines.torch.ahead import Ahead
-from model.engines.torch.pace import Pace
-from model.engines.torch.rows import Request, Row
-from model.engines.torch.runner import ROWS_A_PROMPT, Feed, Prompt, Runner
-from model.engines.torch.schedule import Memory, Schedule
+from model.engines.requests import begin, read
+from model.engines.torch.batch import Batch, Feed
+from model.engines.torch.deadlines import LatencyModel, drafts_of
+from model.engines.torch.drafter import Drafter
+from model.engines.torch.request import Phase, Request, Tree
+from model.engines.torch.rows import Row
+from model.engines.torch.runner import ROWS_A_TREE, Runner
+from model.engines.torch.scheduler import Scheduler
 from model.engines.torch.shortcuts import Shortcuts
-from model.engines.torch.turns import turn, works
-from model.formats.pieces import ACTION, BRANCH, THINKING
 
 Logits = npt.NDArray[np.float64]
 
 _ALONE: Final = 4
-"""So many times as many tokens of prompts go through in a step while no draw waits for it."""
+"""So many times the prefill chunk goes through in a step while no row waits for it."""
 
 
 @dataclass(frozen=True)
@@ -50,15 +49,6 @@ StepEvent = tuple[str, Event | Failed]
 """A request id and what happened to it."""
 
 
-@dataclass(eq=False)
-class _Beginning:
-    """Rows that wait for their prompt; it is begun when its turn comes."""
-
-    request: Request
-    rows: list[Row]
-    prompt: Prompt | None = None
-
-
 @dataclass
 class Counts:
     """What the decoder has done so far.
@@ -69,7 +59,8 @@ class Counts:
         fan_out_row_passes: the same if every draw had a row of its own.
         scene_passes: scenes whose draws were fed, over all passes.
         tokens: fed, over all rows.
-        kept: of these, what rows went on with; the others were guessed wrong.
+        kept: of these, what rows went on with; the others were rejected guesses.
+        preempted: rows that gave up their memory and were fed again later.
     """
 
     passes: int = 0
@@ -78,6 +69,7 @@ class Counts:
     scene_passes: int = 0
     tokens: int = 0
     kept: int = 0
+    preempted: int = 0
 
 
 class Decoder:
@@ -86,9 +78,9 @@ class Decoder:
     Args:
         runner: network and memory; the decoder's alone.
         shortcuts: see there.
-        prompt_chunk: tokens of new prompts that go through the network in one step while draws run.
+        prompt_chunk: prompt tokens that are prefilled in one step while rows run.
         clock: seconds, ever growing; what deadlines count on.
-        pace: what is known of how long things take.
+        latency: what is known of how long things take.
     """
 
     def __init__(
@@ -98,29 +90,24 @@ class Decoder:
         *,
         prompt_chunk: int = 512,
         clock: Callable[[], float] = time.monotonic,
-        pace: Pace | None = None,
+        latency: LatencyModel | None = None,
     ) -> None:
-        self._clock, self._pace = clock, pace or Pace()
-        self._drafts: dict[tuple[str, int], Draw] = {}
-        self._paused: dict[str, list[Row]] = {}
         self._runner, self._shortcuts, self._chunk = runner, shortcuts, prompt_chunk
-        rows_a_prompt = ROWS_A_PROMPT if shortcuts.shared_prompts else 1
-        self._schedule = Schedule(runner.rows, runner.prompts, rows_a_prompt)
-        self._ahead = Ahead()
-        self._beginnings: list[_Beginning] = []
-        self._prompts: list[Prompt] = []
-        self._rows: list[Row] = []
+        self._clock, self._latency, self._drafter = clock, latency or LatencyModel(), Drafter()
+        rows_a_tree = ROWS_A_TREE if shortcuts.shared_prompts else 1
+        self._scheduler, self._memory = Scheduler(runner.rows, runner.prompts, rows_a_tree), runner.memory()
+        self._vocabulary = runner.loaded.vocabulary
         self.counts = Counts()
 
     @property
     def rows_used(self) -> int:
         """Draws that memory is reserved for."""
-        return self._runner.rows - self._schedule.free.rows
+        return self._scheduler.rows_used
 
     @property
     def idle(self) -> bool:
         """Whether there is nothing to do."""
-        return self._schedule.idle
+        return self._scheduler.idle
 
     def add(
         self,
@@ -139,357 +126,306 @@ class Decoder:
             RequestError: it can never be served: unknown format, too many draws, a missing camera, a
                 prefill the format cannot write; or its id is in use.
         """
-        if plan_request.request_id in self._schedule:
+        if plan_request.request_id in self._scheduler:
             raise RequestError(f"request id {plan_request.request_id} is in use")
-        start = begin(plan_request, self._runner.loaded.card, self._runner.formats)
         loaded = self._runner.loaded
-        request = Request(plan_request, start, self._clock() if submitted_s is None else submitted_s)
+        origin = begin(plan_request, loaded.card, self._runner.formats)
+        request = Request(plan_request, origin, self._clock() if submitted_s is None else submitted_s)
         request.binding = binding or binding_of(plan_request, loaded.codec, loaded.vocabulary)
-        if not self._schedule.fits(request):
+        request.draws_a_tree = self._scheduler.draws_a_tree(request)
+        request.plant(share=self._shortcuts.shared_rows)
+        if not self._scheduler.fits(request):
             raise RequestError(
                 f"n is {request.controls.n}; this engine runs at most {self._runner.rows} draws at once"
-                + (", half of them under a deadline" if request.drafts else "")
+                + (", half of them under a deadline" if request.makes_drafts else "")
             )
-        self._schedule.add(request)
+        self._scheduler.add(request)
 
     def cancel(self, request_id: str) -> None:
-        """Drop a request, whether it waits or runs; its memory is free at once."""
-        self._schedule.release(request_id)
-        self._paused.pop(request_id, None)
-        self._drop_rows(request_id)
-        self._drafts = {key: draw for key, draw in self._drafts.items() if key[0] != request_id}
-
-    def _drop_rows(self, request_id: str) -> None:
-        for beginning in [each for each in self._beginnings if each.request.id == request_id]:
-            self._drop_beginning(beginning)
-        for row in [row for row in self._rows if row.request.id == request_id]:
-            self._free_row(row)
-
-    def _drop_beginning(self, beginning: _Beginning) -> None:
-        self._beginnings.remove(beginning)
-        if beginning.prompt is not None:
-            self._free_prompt(beginning.prompt)
-
-    def _pause(self, request: Request) -> None:
-        """Give up a request's memory and keep what its draws have written."""
-        rows = [row for row in self._rows if row.request is request]
-        rows += [row for each in self._beginnings if each.request is request for row in each.rows]
-        self._drop_rows(request.id)
-        self._paused[request.id] = rows
+        """Drop a request, whether it waits or runs; its memory is free at once. Unknown ids are ignored."""
+        if request := self._scheduler.get(request_id):
+            self._end(request)
 
     def step(self) -> list[StepEvent]:
-        """Admit what fits, bring prompts on, feed all rows once, and return what happened."""
+        """Schedule, run, apply; returns what happened."""
         began_s = self._clock()
-        for request in self._schedule.make_room(began_s):
-            self._pause(request)
-        events: list[StepEvent] = []
-        for request in self._schedule.admit(began_s):
-            rows = self._paused.pop(request.id, None)
-            if rows is None:
-                rows = self._first_rows(request)
-                events.append((request.id, Started()))
-            groups: dict[int, list[Row]] = {}
-            for row in rows:
-                groups.setdefault(row.draws[0] // self._schedule.draws_a_prompt(request), []).append(row)
-            self._beginnings += [_Beginning(request, group) for group in groups.values()]
-        reading = [each.rows for each in self._beginnings]
-        going_on = turn(works(self._rows, reading, self._drafts.keys(), self._pace), self._pace, began_s)
-        events += self._bring_prompts_on(going_on)
-        if any(row.request in going_on for row in self._rows):
-            events += self._feed_rows(going_on)
-            self._pace.saw_step(self._clock() - began_s)
+        events = self._schedule(began_s)
+        events += self._prefill(began_s)
+        fed, failures = self._feeds()
+        events += failures
+        if fed:
+            logits = self._runner.feed(Batch.of([feed for _, feed in fed], self._memory))
+            events += self._apply(fed, logits)
+            self._latency.saw_step(self._clock() - began_s)
         return events + self._settle_for_drafts()
 
-    def _feed_rows(self, going_on: Sequence[Request]) -> list[StepEvent]:
-        """Feed the rows of those that go on once, and write what was chosen."""
+    # Schedule: who has memory, what is fed.
+
+    def _schedule(self, now_s: float) -> list[StepEvent]:
+        """Preempt who has to give way, and give memory to who comes next."""
+        schedule = self._scheduler.schedule(now_s)
+        for request in schedule.preempt:
+            self._preempt(request)
         events: list[StepEvent] = []
-        places = [place for place, row in enumerate(self._rows) if row.request in going_on]
-        rows = [self._rows[place] for place in places]
-        feeds: list[Feed] = []
-        for row, place in zip(rows, places, strict=True):
+        for request in schedule.admit:
+            if not request.started:
+                events.append((request.id, Started()))
+            request.started = True
+            request.run(self._memory)
+        for tree in schedule.grow:
+            tree.allocate(self._memory)
+        return events
+
+    def _preempt(self, request: Request) -> None:
+        self.counts.preempted += len(list(request.rows))
+        request.preempt(self._memory)
+
+    def _feeds(self) -> tuple[list[tuple[Row, Feed]], list[StepEvent]]:
+        """What each row feeds whose prompt is prefilled, and the failures of those that cannot go on."""
+        trees = self._decoding()
+        rows = sum(len(tree.rows) for tree in trees)
+        fed: list[tuple[Row, Feed]] = []
+        failures: list[StepEvent] = []
+        for tree in trees:
             try:
-                feeds.append(self._feed_of(row, place, len(rows)))
+                feeds = self._feeds_of(tree, rows)
             except Exception as error:  # one draw that cannot go on must not end the others
                 failure = EngineError.because("a draw could not go on", error)
-                # Its rows are gone and others are in their places: begin anew.
-                return [self._fail(row.request, failure), *self._feed_rows(going_on)]
-        if not feeds:
-            return []
-        self._count(rows, feeds)
-        began_s = self._clock()
-        found = self._runner.feed(feeds)
-        self._pace.saw_pass(self._clock() - began_s, len(rows))
-        for row, feed, logits in zip(rows, feeds, found, strict=True):
-            if row not in self._rows:
-                continue  # its request failed with another of its rows
-            if not all(np.isfinite(values).all() for values in logits):
-                events.append(self._fail_without_numbers(row.request))
+                failures.append(self._fail(tree.request, failure))
                 continue
-            try:
-                events += self._apply(row, feed, logits)
-            except Exception as error:  # one draw that cannot go on must not end the others
-                failure = EngineError.because("a draw could not go on", error)
-                events.append(self._fail(row.request, failure))
-        return events + self._end_the_done()
+            fed += zip(tree.rows, feeds, strict=True)
+        # A request that failed may have another tree before the one it failed with.
+        return [each for each in fed if each[0].request.phase is Phase.RUNNING], failures
 
-    def check_integrity(self) -> None:
-        """Raise `AssertionError` when the books do not agree with each other."""
-        assert [prompt.row for prompt in self._prompts] == list(range(len(self._prompts)))
-        held = {id(prompt) for prompt in self._prompts}
-        begun = [each.prompt for each in self._beginnings if each.prompt is not None]
-        used = {id(row.prompt) for row in self._rows} | {id(prompt) for prompt in begun}
-        assert held == used, "a prompt is held for nobody, or missing"
-        draws = [(row.request.id, draw, row.draft) for row in self._every_row() for draw in row.draws]
-        assert len(draws) == len(set(draws)), "a draw runs twice"
-        reserved = self._schedule.reserved()
-        claimed = [(row.request.id, row.prompt) for row in self._rows]
-        claimed += [(each.request.id, each.prompt) for each in self._beginnings for _ in each.rows]
-        rows = Counter(name for name, _ in claimed)
-        prompts = Counter(name for name, _ in {(name, id(prompt)) for name, prompt in claimed if prompt})
-        assert rows.keys() == reserved.keys(), "memory is reserved for nobody, or somebody runs without"
-        for name, memory in reserved.items():
-            assert Memory(rows[name], prompts[name]).within(memory), "a request uses more than it reserved"
-        assert prompts.total() == len(self._prompts), "requests share a prompt's memory"
-        assert all(name in self._schedule and name not in reserved for name in self._paused)
-        assert all(name in self._schedule for name, _ in self._drafts), "a draft is kept for nobody"
-        for row in self._rows:
-            assert row.draws
-            assert row.pending or row.cursor.done, "a row has nothing to feed"
+    def _decoding(self) -> list[Tree]:
+        return [tree for request in self._scheduler.requests for tree in request.trees if tree.decoding]
 
-    def _bring_prompts_on(self, going_on: Sequence[Request]) -> list[StepEvent]:
-        """Some tokens of the prompts of those that go on, in order; many while no draw waits for the pass."""
-        beginnings = [each for request in going_on for each in self._beginnings if each.request is request]
-        if not beginnings:
+    def _feeds_of(self, tree: Tree, rows: int) -> list[Feed]:
+        """What the rows of a tree feed; those for which its KV row has no slots leave it.
+
+        Args:
+            tree: whose prompt is prefilled.
+            rows: in the pass.
+        """
+        if tree.request.phase is Phase.ENDED:
             return []
-        began_s = self._clock()
-        left = _ALONE * self._chunk
-        if any(row.request in going_on for row in self._rows):
-            left = self._chunk
-        taken: list[tuple[_Beginning, int]] = []
-        for beginning in beginnings:
-            if left <= 0:
-                break
-            count = min(left, self._runner.prompt_tokens)
-            taken.append((beginning, count))
-            left -= count
-        events = self._open([beginning for beginning, _ in taken if beginning.prompt is None])
-        parts = [
-            (beginning.prompt, count)
-            for beginning, count in taken
-            if beginning.prompt is not None and beginning in self._beginnings
-        ]
-        if parts:
-            self._runner.feed_prompts(parts)
-        read = [each for each in self._beginnings if each.prompt is not None and each.prompt.ready]
-        for beginning in read:
-            assert beginning.prompt is not None
-            self._beginnings.remove(beginning)
-            for row in beginning.rows:
-                row.begin(beginning.prompt, beginning.prompt.last_token)
-                self._rows.append(row)
-                if not row.tokens:
-                    told = row.write((), self._runner.loaded.vocabulary)
-                    events += [(beginning.request.id, event) for event in told]
-        self._pace.saw_prompts(self._clock() - began_s, len(read))
-        return events
+        feeds = [self._feed_of(row, rows if self._shortcuts.speculate else 0) for row in tree.rows]
+        if self._memory.fitting([feed.row_input for feed in feeds]) == len(feeds):
+            return feeds
+        # Guesses are given up first, then rows, the drafts last: these are what a deadline can rely on.
+        tree.rows.sort(key=lambda row: not row.draft)
+        feeds = [self._feed_of(row, 0) for row in tree.rows]
+        fitting = self._memory.fitting([feed.row_input for feed in feeds])
+        if leaving := tree.rows[fitting:]:
+            self.counts.preempted += len(leaving)
+            tree.request.split(tree, leaving, self._memory)
+        return feeds[:fitting]
 
-    def _open(self, beginnings: list[_Beginning]) -> list[StepEvent]:
-        """Begin prompts, their pictures encoded together; requests whose scene cannot be read fail."""
-        asked = [each.request.plan_request for each in beginnings]
-        scenes = [(request.scene, request.format) for request in asked]
-        events: list[StepEvent] = []
-        for beginning, begun in zip(
-            beginnings, self._runner.begin_prompts(scenes, len(self._prompts)), strict=True
-        ):
-            if not isinstance(begun, Exception):
-                beginning.prompt = begun
-                self._prompts.append(begun)
-            elif beginning not in self._beginnings:
-                continue  # its request failed with another of its prompts
-            elif isinstance(begun, ValueError):
-                events.append(self._fail(beginning.request, RequestError(str(begun))))
-            else:
-                error = EngineError.because("the scene could not be encoded", begun)
-                events.append(self._fail(beginning.request, error))
-        return events
-
-    def _first_rows(self, request: Request) -> list[Row]:
-        """The rows that a request begins with."""
-        every = tuple(range(request.controls.n))
-        size = self._schedule.draws_a_prompt(request) if self._shortcuts.shared_rows else 1
-        return [Row(request.start, request, every[first : first + size]) for first in every[::size]]
-
-    def _feed_of(self, row: Row, place: int, rows: int) -> Feed:
-        """A row's pending tokens and what is proposed behind them, with the decisions among both.
+    def _feed_of(self, row: Row, rows: int) -> Feed:
+        """A row's pending tokens and guesses behind them, with the decisions among both.
 
         Args:
             row: to be fed.
-            place: which it is.
-            rows: in the pass.
+            rows: in the pass; 0 to guess nothing.
         """
-        assert row.prompt is not None
+        prompt = row.tree.prompt
+        assert row.entry is not None
+        assert prompt is not None
         if not self._shortcuts.jump and len(row.pending) > 1:
-            return Feed(place, row.prompt, row.held, row.pending[:1], ())
-        tokens, wanted = self._ahead.feed(row, rows if self._shortcuts.speculate else 0)
-        return Feed(place, row.prompt, row.held, tokens, wanted)
+            return Feed(row.entry, prompt, row.held, row.pending[:1], ())
+        tokens, wanted = self._drafter.propose(row, rows)
+        return Feed(row.entry, prompt, row.held, tokens, wanted)
 
-    def _apply(self, row: Row, feed: Feed, found: list[Logits]) -> list[StepEvent]:
-        """Choose at the decisions of a feed, one after the other, while what was fed is what is chosen."""
+    # Run: the network.
+
+    def _prefill(self, now_s: float) -> list[StepEvent]:
+        """Some prompt tokens, the most urgent request's first; many while no row waits for the pass."""
+        left = self._chunk if self._decoding() else _ALONE * self._chunk
+        chunks: list[tuple[Tree, int]] = []
+        for request in self._scheduler.running(now_s):
+            for tree in filter(lambda tree: tree.prefilling, request.trees):
+                if left <= 0:
+                    break
+                count = min(left, self._runner.prompt_tokens)
+                chunks.append((tree, count))
+                left -= count
+        events = self._open([tree for tree, _ in chunks if tree.prompt is None])
+        # Those that failed have no prompt.
+        parts = [(tree.prompt, count) for tree, count in chunks if tree.prompt is not None]
+        if parts:
+            self._runner.feed_prompts(parts)
+        for tree in [tree for tree, _ in chunks if tree.decoding]:
+            tree.start()
+            for row in tree.rows:
+                if not row.tokens:
+                    events += [(tree.request.id, event) for event in row.write((), self._vocabulary)]
+        return events
+
+    def _open(self, trees: Sequence[Tree]) -> list[StepEvent]:
+        """Begin to prefill, pictures encoded together; requests whose scene cannot be read fail."""
+        scenes = []
+        for tree in trees:
+            assert tree.kv_row is not None
+            scenes.append((tree.request.plan_request.scene, tree.request.plan_request.format, tree.kv_row))
         events: list[StepEvent] = []
+        for tree, begun in zip(trees, self._runner.begin_prompts(scenes), strict=True):
+            if tree.request.phase is Phase.ENDED:
+                continue
+            if not isinstance(begun, Exception):
+                tree.prompt = begun
+            elif isinstance(begun, ValueError):
+                events.append(self._fail(tree.request, RequestError(str(begun))))
+            else:
+                failure = EngineError.because("the scene could not be encoded", begun)
+                events.append(self._fail(tree.request, failure))
+        return events
+
+    # Apply: what was chosen.
+
+    def _apply(self, fed: Sequence[tuple[Row, Feed]], logits: Sequence[list[Logits]]) -> list[StepEvent]:
+        """Write what rows choose, and end those that are done."""
+        self._count(fed)
+        events: list[StepEvent] = []
+        for (row, feed), found in zip(fed, logits, strict=True):
+            events += self._guarded(
+                row, "a draw could not go on", partial(self._accept, feed=feed, found=found)
+            )
+        for row in [row for tree in self._decoding() for row in tree.rows if row.cursor.done]:
+            events += self._guarded(row, "a response could not be read back", self._finish)
+        return events
+
+    def _guarded(self, row: Row, what: str, act: Callable[[Row], list[Event]]) -> list[StepEvent]:
+        """What ``act`` gives for a row; where it goes wrong the row's request fails, and no other.
+
+        Rows that ended meanwhile, with their request or with their draws, are left alone.
+        """
+        request = row.request
+        if request.phase is Phase.ENDED or not row.draws:
+            return []
+        try:
+            return [(request.id, event) for event in act(row)]
+        except Exception as error:
+            return [self._fail(request, EngineError.because(what, error))]
+
+    def _accept(self, row: Row, feed: Feed, found: Sequence[Logits]) -> list[Event]:
+        """Choose at one decision of a feed after the other, while what was fed is what is chosen."""
+        if not all(np.isfinite(values).all() for values in found):
+            self._wipe(row.request)
+            raise ValueError("the network gave logits that are no numbers")
+        events: list[Event] = []
         row.passes += 1
         held = row.held
-        ahead = feed.tokens[len(row.pending) :]
-        row.saw(min(len(row.pending), len(feed.tokens)))
+        guessed = feed.tokens[len(row.pending) :]
+        row.fed(min(len(row.pending), len(feed.tokens)))
         for logits in found:
-            events += self._choose(row, logits, ahead[0] if ahead else None)
+            events += self._choose(row, logits, guessed[0] if guessed else None)
             agreed = 0
-            while agreed < min(len(row.pending), len(ahead)) and row.pending[agreed] == ahead[agreed]:
+            while agreed < min(len(row.pending), len(guessed)) and row.pending[agreed] == guessed[agreed]:
                 agreed += 1
-            row.saw(agreed)
-            ahead = ahead[agreed:]
+            row.fed(agreed)
+            guessed = guessed[agreed:]
             if row.pending:
                 break
         self.counts.kept += row.held - held
         return events
 
-    def _choose(self, row: Row, logits: Logits, proposed: int | None) -> list[StepEvent]:
+    def _choose(self, row: Row, logits: Logits, guess: int | None) -> list[Event]:
         """Write what the row's draws choose; those that choose otherwise get rows of their own.
 
-        The row goes on with those that choose ``proposed``, if any do.
+        The row goes on with those that choose ``guess``, if any do.
         """
-        time_for = self._pace.time_for(row.request.deadline_s, self._clock())
-        chosen = sorted(row.choices(logits, time_for), key=lambda choice: choice[0] != proposed)
-        self._ahead.saw(row, len(logits), chosen)
-        parts = [(row.part(draws), token) for token, draws in chosen[1:]]
-        if row.request.drafts and row.cursor.allowed().choice == BRANCH:
-            direct = next(
-                int(id) for id in row.cursor.allowed().ids if branch_of(row.cursor, int(id)) == ACTION
-            )
-            thinking = [draws for token, draws in chosen if branch_of(row.cursor, token) == THINKING]
-            parts += [(row.part(draws, draft=True), direct) for draws in thinking]
+        time_for = self._latency.time_for(row.request.deadline_s, self._clock())
+        chosen = sorted(row.choices(logits, time_for), key=lambda choice: choice[0] != guess)
+        self._drafter.observe(row, len(logits), chosen)
+        drafts = drafts_of(row.cursor, chosen) if row.request.makes_drafts else []
+        parts = [
+            (row.tree.fork(row, draws, self._memory, draft=draft), token)
+            for some, draft in ((chosen[1:], False), (drafts, True))
+            for token, draws in some
+        ]
         token, row.draws = chosen[0]
-        vocabulary = self._runner.loaded.vocabulary
-        events = row.write((token,), vocabulary)
+        events = row.write((token,), self._vocabulary)
         for part, token in parts:
-            self._runner.copy_row(self._rows.index(row), len(self._rows))
-            self._rows.append(part)
-            events += part.write((token,), vocabulary)
-        return [(row.request.id, event) for event in events]
-
-    def _count(self, rows: list[Row], feeds: list[Feed]) -> None:
-        counts = self.counts
-        counts.passes += 1
-        counts.row_passes += len(rows)
-        counts.fan_out_row_passes += sum(len(row.draws) for row in rows)
-        counts.scene_passes += len({id(row.prompt) for row in rows})
-        counts.tokens += sum(len(feed.tokens) for feed in feeds)
-
-    def _end_the_done(self) -> list[StepEvent]:
-        """Take finished rows out, and read their responses."""
-        events: list[StepEvent] = []
-        for row in [row for row in self._rows if row.cursor.done]:
-            if row not in self._rows:
-                continue  # its request failed with another of its rows
-            try:
-                draws = read(
-                    row.request.plan_request,
-                    row,
-                    row.passes,
-                    row.draws,
-                    self._runner.loaded.vocabulary,
-                    self._runner.loaded.codec,
-                )
-                if not row.draft:
-                    self._ahead.finished(row)
-            except Exception as error:  # a response that cannot be read back must not end the others
-                failure = EngineError.because("a response could not be read back", error)
-                events.append(self._fail(row.request, failure))
-                continue
-            if row.passes_before_ending:
-                self._pace.saw_ending(row.passes - row.passes_before_ending)
-            else:
-                self._pace.saw_direct(row.passes)
-            if row.draft:
-                events += [(row.request.id, DraftFinished(draw)) for draw in draws]
-                self._drafts.update({(row.request.id, draw.index): draw for draw in draws})
-                self._free_row(row)
-                continue
-            self._free_row(row)
-            events += self._answer(row.request, draws)
+            events += part.write((token,), self._vocabulary)
         return events
+
+    def _finish(self, row: Row) -> list[Event]:
+        """Take a row out that is done, and read its response."""
+        request, loaded = row.request, self._runner.loaded
+        draws = read(request.plan_request, row, row.passes, row.draws, loaded.vocabulary, loaded.codec)
+        if row.passes_before_ending:
+            self._latency.saw_ending(row.passes - row.passes_before_ending)
+        if row.draft:
+            request.drafts |= {draw.index: draw for draw in draws}
+            request.remove(row, self._memory)
+            return [DraftFinished(draw) for draw in draws]
+        self._drafter.finished(row)
+        return self._answer(request, draws)
+
+    def _answer(self, request: Request, draws: Sequence[Draw]) -> list[Event]:
+        """Finished draws; the request ends with its last one."""
+        request.answer([draw.index for draw in draws], self._memory)
+        if request.phase is Phase.ENDED:
+            self._scheduler.remove(request)
+        return [DrawFinished(draw) for draw in draws]
 
     def _settle_for_drafts(self) -> list[StepEvent]:
-        """Answer with drafts where the reflection will not end in time, of requests that gave way too."""
+        """Answer with drafts where the reflection will not end in time, of preempted requests too."""
         events: list[StepEvent] = []
         now_s = self._clock()
-        for row in self._every_row():
-            if row.draft or not self._pace.last_step(row.request.deadline_s, now_s):
-                continue
-            ready = [draw for draw in row.draws if (row.request.id, draw) in self._drafts]
-            if not ready:
-                continue
-            self._take_out(row, ready)
-            drafts = [self._drafts[row.request.id, draw] for draw in ready]
-            events += self._answer(row.request, [replace(draft, cut="replaced") for draft in drafts])
+        for request in self._scheduler.requests:
+            if request.drafts and self._latency.last_step(request.deadline_s, now_s):
+                drafts = [replace(draft, cut="replaced") for draft in request.drafts.values()]
+                events += [(request.id, event) for event in self._answer(request, drafts)]
         return events
 
-    def _answer(self, request: Request, draws: list[Draw]) -> list[StepEvent]:
-        """Finished draws; what was kept for them is forgotten, and the request with its last draw."""
-        answered = [draw.index for draw in draws]
-        for index in answered:
-            self._drafts.pop((request.id, index), None)
-        for row in self._every_row():
-            if row.request is request and row.draft:
-                self._take_out(row, answered)
-        if all(row.request is not request for row in self._every_row()):
-            self._schedule.release(request.id)
-            self._paused.pop(request.id, None)
-        return [(request.id, DrawFinished(draw)) for draw in draws]
-
-    def _every_row(self) -> list[Row]:
-        """Those that run, those that wait for their prompt, and those of requests that gave way."""
-        waiting = [each.rows for each in self._beginnings]
-        return [*self._rows, *chain.from_iterable([*waiting, *self._paused.values()])]
-
-    def _take_out(self, row: Row, draws: Collection[int]) -> None:
-        """Go on without some of a row's draws, and without the row when none are left."""
-        row.draws = tuple(draw for draw in row.draws if draw not in draws)
-        if row.draws:
-            return
-        if row in self._rows:
-            self._free_row(row)
-            return
-        if row in (paused := self._paused.get(row.request.id, [])):
-            paused.remove(row)
-            return
-        beginning = next(each for each in self._beginnings if row in each.rows)
-        beginning.rows.remove(row)
-        if not beginning.rows:
-            self._drop_beginning(beginning)
-
-    def _fail_without_numbers(self, request: Request) -> StepEvent:
-        """End a request whose logits are no numbers, and let nobody read what it has written."""
-        for prompt in {id(row.prompt): row.prompt for row in self._rows if row.request is request}.values():
-            assert prompt is not None
-            self._runner.wipe_prompt(prompt)
-        return self._fail(request, EngineError("the network gave logits that are no numbers"))
-
     def _fail(self, request: Request, error: Exception) -> StepEvent:
-        self.cancel(request.id)
+        self._end(request)
         return request.id, Failed(error)
 
-    def _free_row(self, row: Row) -> None:
-        """Give up a row, and its prompt if it was the last to use it; the last row moves into its place."""
-        index, last = self._rows.index(row), self._rows.pop()
-        if last is not row:
-            self._runner.copy_row(len(self._rows), index)
-            self._rows[index] = last
-        assert row.prompt is not None
-        if all(other.prompt is not row.prompt for other in self._rows):
-            self._free_prompt(row.prompt)
+    def _end(self, request: Request) -> None:
+        request.end(self._memory)
+        self._scheduler.remove(request)
 
-    def _free_prompt(self, prompt: Prompt) -> None:
-        last = self._prompts.pop()
-        if last is not prompt:
-            self._prompts[prompt.row] = last
-            self._runner.move_prompt(last, prompt.row)
+    def _wipe(self, request: Request) -> None:
+        """Let nobody read what a request has written."""
+        for tree in request.trees:
+            if tree.kv_row is not None:
+                self._runner.wipe(tree.kv_row)
+
+    def _count(self, fed: Sequence[tuple[Row, Feed]]) -> None:
+        counts = self.counts
+        counts.passes += 1
+        counts.row_passes += len(fed)
+        counts.fan_out_row_passes += sum(len(row.draws) for row, _ in fed)
+        counts.scene_passes += len({id(row.tree) for row, _ in fed})
+        counts.tokens += sum(len(feed.tokens) for _, feed in fed)
+
+    def check_integrity(self) -> None:
+        """Raise `AssertionError` when requests and memory do not agree with each other."""
+        requests = self._scheduler.requests
+        trees = [tree for request in requests for tree in request.trees]
+        rows = [row for tree in trees for row in tree.rows]
+        for kind, pool, used in (
+            ("KV rows", self._memory.kv_rows, [tree.kv_row for tree in trees if tree.kv_row is not None]),
+            ("entries", self._memory.entries, [row.entry for row in rows if row.entry is not None]),
+        ):
+            assert len(used) == len(set(used)), f"{kind} are used twice"
+            assert len(used) == pool.size - pool.free, f"{kind} are held for nobody"
+        draws = [(row.request.id, draw, row.draft) for row in rows for draw in row.draws]
+        assert len(draws) == len(set(draws)), "a draw runs twice"
+        for request in requests:
+            assert request.phase is not Phase.ENDED, "a request is kept that has ended"
+            assert request.trees, "a request has nothing to do"
+            assert len(list(request.rows)) <= request.most_rows, "a request uses more than it reserved"
+            undecided = {draw for row in request.rows if not row.draft for draw in row.draws}
+            assert request.drafts.keys() <= undecided, "a draft is kept for nobody"
+        for tree in trees:
+            assert tree.rows, "a tree has no rows"
+            assert tree.kv_row is None or tree.request.phase is Phase.RUNNING, "a waiting request has memory"
+            assert tree.prompt is None or tree.prompt.kv_row == tree.kv_row, "a prompt lies elsewhere"
+        for row in rows:
+            assert row.draws, "a row is nobody's"
+            assert (row.entry is None) == (row.tree.kv_row is None), "a row has memory without its tree"
+            if row.tree.decoding:
+                assert row.pending or row.cursor.done, "a row has nothing to feed"

@@ -1,4 +1,4 @@
-"""Keys and values in rows: one row a prompt and what is written behind it, the live rows always the first."""
+"""Keys and values in rows: one KV row for a prompt and what is written behind it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from torch import Tensor
 class KvRows:
     """Preallocated keys and values, [layers, rows, heads, length, head_dim] each.
 
-    Live rows come first, so that a pass over all of them reads views instead of gathering copies. Memory
-    that no pass has reached yet is not touched, and on a CPU not taken from the system either.
+    The lowest free row is used first, so that a pass over all that are in use reads one view of the first
+    rows instead of gathering copies. Memory that no pass has reached yet is not touched, and on a CPU not
+    taken from the system either.
 
     Attributes:
         flat: the same memory as [2, layers, rows x heads x length, head_dim].
@@ -51,7 +52,3 @@ class KvRows:
     def wipe(self, row: int) -> None:
         """Make everything of a row zero."""
         self._both[:, :, row, :, : self._reached[row]] = 0
-
-    def copy(self, source: int, target: int, length: int) -> None:
-        """Make row ``target`` hold what row ``source`` holds in its first ``length`` places."""
-        self.row(target, length).copy_(self.row(source, length))

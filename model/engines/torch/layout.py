@@ -7,7 +7,7 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from model.engines.torch.places import BoolArray, IntArray, Written, count_up
+from model.engines.torch.memory import BoolArray, IntArray, SlotMapping, count_up
 
 _SPAN: Final = 32
 """Places seen are a multiple of this: few sizes, few kernels."""
@@ -69,35 +69,38 @@ class Layout(NamedTuple):
     hidden: BoolArray
 
 
-def lean(shape: Shape, written: Written, size: int) -> Layout:
+def lean(shape: Shape, mapping: SlotMapping, size: int) -> Layout:
     """With little padding: scenes that bring about as many tokens and see about as many places ask together,
     others in a call of their own.
 
     Args:
         shape: see there; a row a scene.
-        written: where the tokens go and what they see.
-        size: tokens of the pass; those behind what is written are padding, and nothing becomes of them.
+        mapping: where the tokens go and what they see.
+        size: tokens of the pass; those behind the mapped ones are padding, and nothing becomes of them.
     """
-    brought, ends = _brought(written)
+    brought, ends = _brought(mapping)
     parts = [
-        Part(run.start, run.stop - run.start, int(brought[run].max()), int(ends[run].max()))
+        Part(
+            run.start, run.stop - run.start, int(brought[run].max()), min(int(ends[run].max()), shape.length)
+        )
         for run in _together(brought, ends)
+        if brought[run].any()
     ]
-    slots, back, into, hidden = _laid_out(shape, written, parts)
+    slots, back, into, hidden = _laid_out(shape, mapping, parts)
     return Layout(tuple(parts), slots.ravel(), into, padded(back, size, "constant").ravel(), hidden)
 
 
-def alike(shape: Shape, written: Written, size: int) -> Layout:
+def alike(shape: Shape, mapping: SlotMapping, size: int) -> Layout:
     """With few sizes, so that most passes are like one before: all scenes ask together.
 
     Takes what `lean` takes. Padding repeats the last token in everything, so that it writes once more what
     that writes.
     """
-    brought, ends = _brought(written)
+    brought, ends = _brought(mapping)
     rows = min(1 << (len(brought) - 1).bit_length(), shape.rows)
     span = min(-(-int(ends.max()) // _LONG_SPAN) * _LONG_SPAN, shape.length)
     part = Part(0, rows, pass_size(int(brought.max())), span)
-    slots, back, into, hidden = _laid_out(shape, written, [part])
+    slots, back, into, hidden = _laid_out(shape, mapping, [part])
     return Layout(
         (part,), padded(slots, size, "edge").ravel(), into, padded(back, size, "edge").ravel(), hidden
     )
@@ -210,9 +213,9 @@ def reached(parts: Sequence[Part]) -> tuple[int, int]:
     return parts[-1].first + parts[-1].rows, max(part.span for part in parts)
 
 
-def _brought(written: Written) -> tuple[IntArray, IntArray]:
+def _brought(mapping: SlotMapping) -> tuple[IntArray, IntArray]:
     """Tokens that each row brings, and the end of what they see."""
-    prompts, _, seen = written
+    prompts, seen = mapping.kv_rows, mapping.seen
     brought = np.bincount(prompts)
     last = seen.shape[1] - seen[:, ::-1].argmax(axis=1)
     ends = np.full_like(brought, _SPAN)
@@ -221,17 +224,17 @@ def _brought(written: Written) -> tuple[IntArray, IntArray]:
 
 
 def _laid_out(
-    shape: Shape, written: Written, parts: Sequence[Part]
+    shape: Shape, mapping: SlotMapping, parts: Sequence[Part]
 ) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
     """`Layout`'s ``slots`` [k, groups], ``back`` [k, heads], ``into`` and ``hidden``."""
-    prompts, places, seen = written
+    prompts, places, seen = mapping.kv_rows, mapping.slots, mapping.seen
     heads, groups, count = shape.heads, shape.groups, len(places)
     slots = (prompts[:, None] * groups + np.arange(groups)) * shape.length + places[:, None]
     order = np.argsort(prompts, kind="stable")
     number = np.empty_like(order)
     number[order] = count_up(np.bincount(prompts))
     firsts, rows, widths, _ = np.array(parts).T
-    part_of = np.repeat(np.arange(len(parts)), rows)[prompts]
+    part_of = np.searchsorted(firsts, prompts, side="right") - 1
     sizes = rows * widths
     starts = np.cumsum(sizes) - sizes
     width = widths[part_of]

@@ -2,66 +2,24 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.binding import Binding
-from model.engines.engine import Controls, Event, PlanRequest, SectionFinished, TextWritten
+from model.engines.engine import Event, SectionFinished, TextWritten
 from model.engines.requests import branch_of
 from model.engines.response import Response, SectionText
-from model.engines.torch.pace import TimeFor
+from model.engines.torch.deadlines import TimeFor
 from model.engines.torch.sampler import choose, probabilities, uniforms
-from model.formats.cursor import Allowed, Cursor
+from model.formats.cursor import Allowed
 from model.formats.pieces import ACTION, BRANCH, THINKING
 from model.network.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
-    from model.engines.torch.runner import Prompt  # a runner needs torch, rows do not
-
-_arrivals = itertools.count()
-_FIRST, _REVISED = "plan", "revised_plan"
-
-
-@dataclass(eq=False)
-class Request:
-    """A request as the engine tracks it; times are those of the engine's clock.
-
-    ``binding`` is there where the caller's control ``bind`` asks for it.
-    """
-
-    plan_request: PlanRequest
-    start: Cursor
-    submitted_s: float
-    arrival: int = field(default_factory=lambda: next(_arrivals))
-    binding: Binding | None = None
-
-    @property
-    def id(self) -> str:
-        """The caller's name for it."""
-        return self.plan_request.request_id
-
-    @property
-    def controls(self) -> Controls:
-        """What the caller decided."""
-        return self.plan_request.controls
-
-    @property
-    def deadline_s(self) -> float:
-        """When the answer must be there; infinite without a deadline."""
-        deadline_ms = self.controls.deadline_ms
-        return float("inf") if deadline_ms is None else self.submitted_s + deadline_ms / 1000
-
-    @cached_property
-    def drafts(self) -> bool:
-        """Whether a direct trajectory is made beside every reflection."""
-        reflects = BRANCH in self.start.compiled.format.sections() and self.controls.thinking != "never"
-        return self.controls.deadline_ms is not None and reflects
+    from model.engines.torch.request import Request, Tree
 
 
 @dataclass(eq=False)
@@ -69,28 +27,39 @@ class Row(Response):
     """One row of the batch: a response, and the draws that have written it.
 
     Attributes:
-        request: whose.
+        tree: that it stands in.
         draws: indices of the draws, at least one.
-        prompt: in whose memory its prompt lies; None while it has not begun or is paused.
-        pending: tokens (of the response, before it the prompt's last) that the network has not seen yet.
-        held: how many tokens its KV row holds.
+        entry: of the row in the slot table; None while its tree has no memory.
+        pending: tokens that the network has not seen yet: the prompt's last one, then those of the response.
+        held: how many tokens are in memory behind the prompt.
         draft: whether it is a direct trajectory beside a reflection.
         passes: how many it took part in.
         passes_before_ending: how many up to the end of its text.
     """
 
-    request: Request
+    tree: Tree
     draws: tuple[int, ...]
-    prompt: Prompt | None = None
+    entry: int | None = None
     pending: list[int] = field(default_factory=list)
     held: int = 0
     draft: bool = False
     passes: int = 0
     passes_before_ending: int = 0
 
-    def begin(self, prompt: Prompt, last_token: int) -> None:
-        """Begin, or go on after a pause, behind a prompt: all that was written is to be fed again."""
-        self.prompt, self.held = prompt, 0
+    @property
+    def request(self) -> Request:
+        """Whose."""
+        return self.tree.request
+
+    @property
+    def shown(self) -> bytes:
+        """Tells the format and the pictures of its prompt from others; only while its prompt is there."""
+        assert self.tree.prompt is not None
+        return self.tree.prompt.shown
+
+    def start(self, last_token: int) -> None:
+        """Begin, or go on after a preemption, behind a prompt: all that was written is to be fed again."""
+        self.held = 0
         self.pending = [last_token, *(token.id for token in self.tokens)]
 
     def part(self, draws: tuple[int, ...], *, draft: bool = False) -> Row:
@@ -103,15 +72,7 @@ class Row(Response):
             draft=self.draft or draft,
         )
 
-    def proposal(self) -> list[int]:
-        """What may come behind ``pending``: a revised plan goes on as the first plan did, while it does."""
-        if self.cursor.section != _REVISED:
-            return []
-        first = [token.id for token in self.tokens if token.section == _FIRST]
-        revised = [token.id for token in self.tokens if token.section == _REVISED]
-        return first[len(revised) :] if first[: len(revised)] == revised else []
-
-    def saw(self, count: int) -> None:
+    def fed(self, count: int) -> None:
         """The first ``count`` pending tokens went through the network."""
         self.held += count
         self.pending = self.pending[count:]

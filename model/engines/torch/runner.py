@@ -16,42 +16,44 @@ from torch.nn import functional
 from model.driving.scene import Scene
 from model.driving.trajectory import FloatArray
 from model.engines.torch.attention import DrawPass, DrawsInOrder, PromptPart, PromptPass, PromptsInOrder
+from model.engines.torch.batch import Batch
 from model.engines.torch.clips import ClipCache, digest
 from model.engines.torch.frames import Frames
 from model.engines.torch.graphs import Capture, Graphs, Numbers, Sizes
-from model.engines.torch.head import AllowedHead, Ids
+from model.engines.torch.head import AllowedHead
 from model.engines.torch.kv import KvRows
 from model.engines.torch.layout import Shape, Walk, alike, in_order, lean, padded, pass_size, reached
+from model.engines.torch.memory import IntArray, Memory, SlotMapping
 from model.engines.torch.packed import Attention, PackedDecoder, Rotation
-from model.engines.torch.places import Fed, IntArray, Places, Written
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import Format
 from model.network.checkpoint import Loaded
 
-ROWS_A_PROMPT: Final = 12
-"""Rows of draws, drafts among them, that one prompt's memory has room for."""
+ROWS_A_TREE: Final = 12
+"""Rows, drafts among them, that share a KV row at first."""
+USUAL_TOKENS: Final = 128
+"""Of a response. A KV row has room for so many of each of its rows; what outgrows it takes another one."""
 
 
 @dataclass(eq=False)
 class Prompt:
-    """A prompt on its way into its row, all but its last token, which draws begin with.
+    """A prompt on its way into its KV row, all but its last token, which rows begin with.
 
     Attributes:
-        row: of the prompts' memory.
-        embeddings: [t, hidden] of the tokens to hold.
+        kv_row: that it lies in, from the first slot on.
+        embeddings: [t, hidden] of the tokens to be prefilled.
         rotation: theirs.
-        held: how many of them are in the row.
+        held: how many of them are prefilled.
         last_token: still to be fed.
         position_offset: see `model.network.inputs.Prompt`.
         shown: tells its format and pictures from others.
         pictures: tells apart what stands in the prompt for its pictures: with a resampler that depends on
             history and route as well.
         pictured: tokens up to the end of the pictures.
-        end: of the places that draws have written to behind it.
     """
 
-    row: int
+    kv_row: int
     embeddings: Tensor
     rotation: Rotation
     held: int
@@ -60,30 +62,16 @@ class Prompt:
     shown: bytes
     pictures: bytes
     pictured: int
-    end: int = 0
+
+    @property
+    def length(self) -> int:
+        """Tokens to be prefilled."""
+        return len(self.embeddings)
 
     @property
     def ready(self) -> bool:
-        """Whether draws can begin."""
-        return self.held == len(self.embeddings)
-
-
-class Feed(NamedTuple):
-    """What a draw's row feeds in a pass.
-
-    Attributes:
-        row: which it is.
-        prompt: of the row.
-        held: tokens that the row holds.
-        tokens: at least one.
-        wanted: places among the tokens, ascending, and the ids whose logits behind them are asked for.
-    """
-
-    row: int
-    prompt: Prompt
-    held: int
-    tokens: Sequence[int]
-    wanted: Sequence[tuple[int, Ids]]
+        """Whether all of them are, so that rows can be fed."""
+        return self.held == self.length
 
 
 class _Opened(NamedTuple):
@@ -95,13 +83,13 @@ class _Opened(NamedTuple):
 
 
 class Runner:
-    """Owns the network, keys and values. Call under `torch.inference_mode`.
+    """Owns the network, keys and values; a `Memory` says what lies where. Call under `torch.inference_mode`.
 
     Args:
         loaded: its weights must not change while the runner is used.
         rows: draws that can run at once.
-        prompts: that can be held at once, each with what up to `ROWS_A_PROMPT` rows write behind it; by
-            default as many as rows.
+        prompts: KV rows, each for a prompt and what usually `ROWS_A_TREE` rows write behind it; by default as
+            many as rows.
         clip_bytes: of vision tokens kept for pictures that come again, and as many of keys and values.
         frames: where pictures are decoded; by default a new one.
         products: what matrix products are worked out in; None for the weights' own type.
@@ -111,9 +99,12 @@ class Runner:
         capture: how passes of draws are captured, to be replayed for passes of the same sizes; None for not
             at all, which is best where an operation costs no more than what it does.
         formats: of them those that the checkpoint writes are served.
+        usual_tokens: of a response; what KV rows have room for, see `USUAL_TOKENS`.
 
     Attributes:
         prompt_tokens: that the longest prompt holds.
+        row_tokens: that the longest response holds, the prompt's last token among them.
+        kv_length: slots of a KV row.
     """
 
     def __init__(
@@ -129,14 +120,15 @@ class Runner:
         reuse: bool = True,
         capture: Capture | None = None,
         formats: Mapping[str, Format] = FORMATS,
+        usual_tokens: int = USUAL_TOKENS,
     ) -> None:
         self.loaded = loaded
         self.rows, self.prompts = rows, prompts or rows
         self.formats = {
             name: CompiledFormat(formats[name], loaded.vocabulary) for name in loaded.card.formats
         }
-        # A draw's row holds the prompt's last token too.
-        length = 1 + max(format.longest() for format in self.formats.values())
+        # A row holds the prompt's last token too.
+        self.row_tokens = 1 + max(format.longest() for format in self.formats.values())
         model: Any = loaded.model
         text = model.config.text_config
         self._products = products
@@ -157,45 +149,53 @@ class Runner:
             "device": loaded.model.device,
         }
         self.prompt_tokens = max(kept)
-        self._memory = KvRows(rows=self.prompts, length=self.prompt_tokens + ROWS_A_PROMPT * length, **sizes)
+        # Room for what rows usually take, but for one row of the longest response in any case.
+        usual = ROWS_A_TREE * min(usual_tokens, self.row_tokens)
+        self.kv_length = self.prompt_tokens + max(self.row_tokens, usual)
+        self._memory = KvRows(rows=self.prompts, length=self.kv_length, **sizes)
         self._shape = Shape(self._decoder.heads, self._memory.heads, self._memory.rows, self._memory.length)
         self._arrange = lean if capture is None else alike
         self._pass = self._run_pass if capture is None else Graphs(self._run_pass, capture)
-        self._places = Places(rows, length)
-        every_place = torch.arange(max(kept) + 1 + length, device=loaded.model.device)
-        self._rotation = self._decoder.rotation(every_place.expand(3, -1))
+        every_position = torch.arange(self.prompt_tokens + 1 + self.row_tokens, device=loaded.model.device)
+        self._rotation = self._decoder.rotation(every_position.expand(3, -1))
         self._heads: dict[str, Tensor] = {}
+
+    def memory(self) -> Memory:
+        """An empty slot table for the keys and values of this runner."""
+        return Memory(
+            rows=self.rows, row_tokens=self.row_tokens, kv_rows=self.prompts, kv_length=self.kv_length
+        )
 
     def warm_up(self, tokens: int) -> None:
         """Make the kernels of passes with up to so many tokens."""
         self._decoder.warm_up(sorted({pass_size(count) for count in range(1, tokens + 1)}))
 
-    def begin_prompts(self, scenes: Sequence[tuple[Scene, str]], first_row: int) -> list[Prompt | Exception]:
-        """Prompts of scenes in formats, from ``first_row`` on, their pictures encoded all at once.
+    def begin_prompts(self, scenes: Sequence[tuple[Scene, str, int]]) -> list[Prompt | Exception]:
+        """Begin to prefill scenes, their pictures encoded all at once.
 
-        Of each prompt its row holds what all scenes share. A scene that cannot be made into inputs (missing
-        camera, damaged picture) gets its exception and no row.
+        Of each prompt its KV row holds what is known already. A scene that cannot be made into inputs (a
+        missing camera, a damaged picture) gets its exception.
+
+        Args:
+            scenes: with format and KV row.
         """
-        opened = [self._open(scene) for scene, _ in scenes]
+        opened = [self._open(scene) for scene, _, _ in scenes]
         new: dict[bytes, npt.NDArray[np.uint8]] = {}
         for each in opened:
             if not isinstance(each, Exception):
                 new |= each.patches
         made = self._encode(new)
         begun: list[Prompt | Exception] = []
-        row = first_row
-        for (scene, format), each in zip(scenes, opened, strict=True):
+        for (scene, format, kv_row), each in zip(scenes, opened, strict=True):
             if isinstance(each, Exception):
                 begun.append(each)
                 continue
             tokens = [each.kept[key] if key in each.kept else made[key] for key in each.keys]
             shown = format.encode() + b"".join(each.keys)
             try:
-                begun.append(self._begin_prompt(scene, format, row, torch.cat(tokens), shown))
+                begun.append(self._begin_prompt(scene, format, kv_row, torch.cat(tokens), shown))
             except Exception as error:  # one scene that cannot be embedded must not end the others
                 begun.append(error)
-                continue
-            row += 1
         for key, vision_tokens in made.items():
             # A copy: a part of a tensor would keep all of it.
             self._clips.keep(key, vision_tokens.clone())
@@ -210,7 +210,7 @@ class Runner:
         kind = PromptsInOrder if self._reproducible else PromptPass
         attention = kind(
             self._memory,
-            [PromptPart(prompt.row, span.start, span.stop - span.start) for prompt, span in spans],
+            [PromptPart(prompt.kv_row, span.start, span.stop - span.start) for prompt, span in spans],
         )
         embeddings = torch.cat([prompt.embeddings[span] for prompt, span in spans])
         rotations = zip(*([part[span] for part in prompt.rotation] for prompt, span in spans), strict=True)
@@ -224,42 +224,25 @@ class Runner:
             if span.start < prompt.pictured <= span.stop:
                 self._pictures.keep(prompt.pictures, self._held(prompt, prompt.pictured).clone())
 
-    def copy_row(self, source: int, target: int) -> None:
-        """Make a draw's row hold what another holds, behind the same prompt."""
-        self._places.copy(source, target)
+    def wipe(self, kv_row: int) -> None:
+        """Zero a KV row: what is no number must not be read, not even with a weight of zero."""
+        self._memory.wipe(kv_row)
 
-    def move_prompt(self, prompt: Prompt, row: int) -> None:
-        """Put a prompt, and all that is written behind it, into another row."""
-        self._memory.copy(prompt.row, row, max(prompt.held, prompt.end))
-        prompt.row = row
+    def feed(self, batch: Batch) -> list[list[npt.NDArray[np.float64]]]:
+        """Feed rows their next tokens in one pass.
 
-    def wipe_prompt(self, prompt: Prompt) -> None:
-        """Make nothing of a prompt's row, and of all that is written behind it."""
-        self._memory.wipe(prompt.row)
-
-    def feed(self, feeds: Sequence[Feed]) -> list[list[npt.NDArray[np.float64]]]:
-        """Feed rows their next tokens in one pass, of a prompt all or none.
-
-        Returns the logits that each wants, float64 [k].
+        Returns:
+            For each feed the logits that it wants, float64 [k].
         """
+        feeds = batch.feeds
         counts = [len(feed.tokens) for feed in feeds]
         ids = np.concatenate([feed.tokens for feed in feeds]).astype(np.int64)
-        places = np.concatenate(
+        positions = np.concatenate(
             [
-                np.arange(feed.held, feed.held + count)
-                + (len(feed.prompt.embeddings) + feed.prompt.position_offset)
+                np.arange(feed.held, feed.held + count) + (feed.prompt.length + feed.prompt.position_offset)
                 for feed, count in zip(feeds, counts, strict=True)
             ]
         )
-        prompts = {feed.prompt.row: feed.prompt for feed in feeds}
-        lengths = [len(prompts[row].embeddings) if row in prompts else 0 for row in range(self.prompts)]
-        fed = [
-            Fed(feed.row, feed.prompt.row, feed.held, count)
-            for feed, count in zip(feeds, counts, strict=True)
-        ]
-        written = self._places.write(fed, lengths)
-        for prompt in prompts.values():
-            prompt.end = max(prompt.end, written.seen.shape[1])
         starts = np.cumsum(counts) - counts
         asked = [
             (number, int(starts[number]) + place, ids)
@@ -269,13 +252,13 @@ class Runner:
         size, wanted = pass_size(len(ids)), np.array([place for _, place, _ in asked], np.int64)
         numbers = [
             padded(ids, size, "edge"),
-            padded(places, size, "edge"),
+            padded(positions, size, "edge"),
             padded(wanted, pass_size(len(asked)) if asked else 0, "edge"),
         ]
         if self._reproducible:
-            hidden = self._in_order(fed, lengths, numbers)
+            hidden = self._in_order(batch, numbers)
         else:
-            hidden = self._together(written, numbers)
+            hidden = self._together(batch.mapping, numbers)
         found: list[list[npt.NDArray[np.float64]]] = [[] for _ in feeds]
         if asked:
             logits = self._head.logits(hidden[: len(asked)], [ids for _, _, ids in asked])
@@ -283,20 +266,24 @@ class Runner:
                 found[number].append(values)
         return found
 
-    def _in_order(self, fed: Sequence[Fed], lengths: Sequence[int], numbers: Sequence[IntArray]) -> Tensor:
-        """A pass in which each row looks by itself; ``numbers`` are ids, places and what is wanted."""
-        walks = []
-        for row, prompt, held, count in fed:
-            own = self._places.path(row, held + count)
-            walks.append(Walk(prompt, np.concatenate([np.arange(lengths[prompt]), own]), count))
+    def _in_order(self, batch: Batch, numbers: Sequence[IntArray]) -> Tensor:
+        """A pass in which each row attends by itself; ``numbers`` are ids, positions and what is wanted."""
+        walks = [
+            Walk(
+                feed.prompt.kv_row,
+                np.concatenate([np.arange(feed.prompt.length), path]),
+                len(feed.tokens),
+            )
+            for feed, path in zip(batch.feeds, batch.mapping.paths, strict=True)
+        ]
         attention = DrawsInOrder(self._memory, in_order(self._shape, walks, len(numbers[0])))
-        ids, places, wanted = map(torch.from_numpy, numbers)
-        return self._hidden(ids, places, wanted, attention)
+        ids, positions, wanted = map(torch.from_numpy, numbers)
+        return self._hidden(ids, positions, wanted, attention)
 
-    def _together(self, written: Written, numbers: Sequence[IntArray]) -> Tensor:
-        """A pass in which the rows of a scene look together; ``numbers`` as there."""
+    def _together(self, mapping: SlotMapping, numbers: Sequence[IntArray]) -> Tensor:
+        """A pass in which the rows of a scene attend together; ``numbers`` as there."""
         device = self.loaded.model.device
-        layout = self._arrange(self._shape, written, len(numbers[0]))
+        layout = self._arrange(self._shape, mapping, len(numbers[0]))
         every = [*numbers, layout.slots, layout.into, layout.back]
         # Before the pass, which may be a replay, in which nothing new is made zero.
         self._memory.reach(*reached(layout.parts))
@@ -311,7 +298,7 @@ class Runner:
 
     def _run_pass(self, sizes: Sizes, numbers: Numbers) -> Tensor:
         """Final hidden states of the tokens that are asked for, [k, hidden]."""
-        ids, places, wanted, slots, into, back = torch.split(numbers.whole, list(sizes.numbers))
+        ids, positions, wanted, slots, into, back = torch.split(numbers.whole, list(sizes.numbers))
         attention = DrawPass(
             self._decoder.heads,
             self._memory,
@@ -321,12 +308,12 @@ class Runner:
             back=back,
             hidden=numbers.hidden,
         )
-        return self._hidden(ids, places, wanted, attention)
+        return self._hidden(ids, positions, wanted, attention)
 
-    def _hidden(self, ids: Tensor, places: Tensor, wanted: Tensor, attention: Attention) -> Tensor:
+    def _hidden(self, ids: Tensor, positions: Tensor, wanted: Tensor, attention: Attention) -> Tensor:
         device = self.loaded.model.device
         embeddings = self.loaded.model.get_input_embeddings()(ids.to(device))
-        rotation = self._rotation.at(places.to(device))
+        rotation = self._rotation.at(positions.to(device))
         return self._decoder(embeddings, rotation, attention, wanted.to(device) if len(wanted) else None)
 
     def _open(self, scene: Scene) -> _Opened | Exception:
@@ -360,7 +347,7 @@ class Runner:
         return dict(zip(patches, torch.cat(tokens).tensor_split(len(patches)), strict=True))
 
     def _begin_prompt(
-        self, scene: Scene, format: str, row: int, vision_tokens: Tensor, shown: bytes
+        self, scene: Scene, format: str, kv_row: int, vision_tokens: Tensor, shown: bytes
     ) -> Prompt:
         loaded = self.loaded
         route, tracks = loaded.inputs.way(scene), loaded.inputs.tracks(scene)
@@ -370,7 +357,7 @@ class Runner:
         kept = len(prompt.ids) - 1
         clips = np.flatnonzero(prompt.ids == loaded.model.config.video_token_id)
         begun = Prompt(
-            row,
+            kv_row,
             embedded.embeddings[:kept],
             Rotation(*(part[:kept] for part in rotation)),
             0,
@@ -402,7 +389,7 @@ class Runner:
 
     def _held(self, prompt: Prompt, count: int) -> Tensor:
         """A prompt's first keys and values, [2, layers, heads, count, head_dim]."""
-        return self._memory.row(prompt.row, count)
+        return self._memory.row(prompt.kv_row, count)
 
 
 def _gathered_with(history: FloatArray, route: FloatArray | None) -> bytes:

@@ -9,7 +9,7 @@ import torch
 from model.engines.torch.attention import DrawPass
 from model.engines.torch.kv import KvRows
 from model.engines.torch.layout import Layout, Part, Shape, alike, lean, pass_size
-from model.engines.torch.places import Fed, Places, Written
+from model.engines.torch.memory import Memory, RowInput, SlotMapping
 
 PROMPTS = (5, 3, 9)
 HEADS, GROUPS, WIDTH = 4, 2, 8
@@ -38,10 +38,18 @@ def shape(memory: KvRows) -> Shape:
     return Shape(HEADS, GROUPS, memory.rows, memory.length)
 
 
+def slot_table(rows: int) -> Memory:
+    """With entries for so many rows of up to 40 tokens."""
+    table = Memory(rows=16, row_tokens=40, kv_rows=16, kv_length=3000)
+    for _ in range(rows):
+        table.entries.take()
+    return table
+
+
 @pytest.mark.parametrize("arrange", [lean, alike])
 @pytest.mark.parametrize("seed", range(20))
 def test_each_token_sees_its_prompt_and_what_its_draw_has_written(
-    seed: int, arrange: Callable[[Shape, Written, int], Layout]
+    seed: int, arrange: Callable[[Shape, SlotMapping, int], Layout]
 ) -> None:
     """Passes over draws that part and write by chance, against attention worked out draw by draw."""
     random = np.random.default_rng(seed)
@@ -50,19 +58,19 @@ def test_each_token_sees_its_prompt_and_what_its_draw_has_written(
     prompts = [torch.randn(2, 2, GROUPS, length, WIDTH, dtype=torch.float64) for length in PROMPTS]
     for row, prompt in enumerate(prompts):
         memory.row(row, prompt.shape[-2]).copy_(prompt)
-    places, prompt_of = Places(8, 40), [0, 2, 2, 1]
+    slots, prompt_of = slot_table(4), [0, 2, 2, 1]
     # Keys and values that each draw has written, [2, groups, t, width], in the layer looked at.
     written = [torch.empty(2, GROUPS, 0, WIDTH, dtype=torch.float64) for _ in prompt_of]
     for step in range(6):
         if step == 3:  # the second draw parts in two
-            places.copy(1, 4)
+            assert slots.fork(1) == 4
             prompt_of.append(2)
             written.append(written[1])
         resting = int(random.integers(-1, 3))  # a prompt whose rows are not fed in this pass
         rows = [row for row, prompt in enumerate(prompt_of) if prompt != resting]
         counts = [int(random.integers(1, 9)) for _ in rows]
         fed = [
-            Fed(row, prompt_of[row], written[row].shape[2], count)
+            RowInput(row, prompt_of[row], PROMPTS[prompt_of[row]], written[row].shape[2], count)
             for row, count in zip(rows, counts, strict=True)
         ]
         total = sum(counts)
@@ -71,7 +79,7 @@ def test_each_token_sees_its_prompt_and_what_its_draw_has_written(
         key, value = (torch.randn(size, GROUPS, WIDTH, dtype=torch.float64) for _ in range(2))
         for each in (query, key, value):  # as the runner pads
             each[total:] = each[total - 1]
-        attention = draw_pass(memory, arrange(shape(memory), places.write(fed, PROMPTS), size))
+        attention = draw_pass(memory, arrange(shape(memory), slots.map(fed), size))
         seen = attention.attend(1, query, key, value)
         start = 0
         for row, count in zip(rows, counts, strict=True):
@@ -91,18 +99,19 @@ def test_each_token_sees_its_prompt_and_what_its_draw_has_written(
 
 def test_a_scene_that_sees_far_leaves_the_others_their_span() -> None:
     memory = empty(layers=1, rows=3, length=3000, dtype=torch.float32)
-    written = Places(3, 40).write([Fed(row, row, 0, 8) for row in range(3)], (20, 2000, 30))
-    assert [part.span for part in lean(shape(memory), written, 24).parts] == [32, 2016, 64]
+    lengths = (20, 2000, 30)
+    mapping = slot_table(3).map([RowInput(row, row, lengths[row], 0, 8) for row in range(3)])
+    assert [part.span for part in lean(shape(memory), mapping, 24).parts] == [32, 2016, 64]
 
 
 def test_passes_are_alike_while_they_are_small() -> None:
     memory = empty(layers=1, rows=16, length=3000, dtype=torch.float32)
     parts = set()
     for rows in (5, 6, 7, 8):
-        places = Places(16, 40)
+        table = slot_table(rows)
         for fed in range(10):
-            written = places.write([Fed(row, row, fed, 1) for row in range(rows)], (70,) * rows)
-            parts.add(alike(shape(memory), written, pass_size(rows)).parts)
+            mapping = table.map([RowInput(row, row, 70, fed, 1) for row in range(rows)])
+            parts.add(alike(shape(memory), mapping, pass_size(rows)).parts)
     assert parts == {(Part(0, 8, 1, 128),)}
 
 

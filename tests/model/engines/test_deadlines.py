@@ -18,8 +18,8 @@ from model.engines.engine import (
     SectionFinished,
     Started,
 )
+from model.engines.torch.deadlines import LatencyModel
 from model.engines.torch.decoder import Decoder
-from model.engines.torch.pace import Pace
 from model.engines.torch.runner import Runner
 from model.network.checkpoint import Loaded, load
 from tests.model.engines.decoding import decode, request
@@ -129,31 +129,16 @@ def test_memory_for_drafts_is_kept_where_there_may_be_some(exact: Loaded) -> Non
     assert reserved("traj_only", deadline_ms=1000) == 3
 
 
-class Steady(Pace):
+class Steady(LatencyModel):
     """Steps of 10 ms, 40 of them behind a text, whatever is seen."""
 
-    step_s, deviation_s, ending_passes, prompt_s = 0.01, 0.0, 40.0, 0.0
+    step_s, deviation_s, ending_passes = 0.01, 0.0, 40.0
 
     def __init__(self) -> None:
         pass
 
     def saw_step(self, seconds: float) -> None:
         pass
-
-    def saw_prompts(self, seconds: float, read: int) -> None:
-        pass
-
-    def saw_pass(self, seconds: float, rows: int) -> None:
-        pass
-
-    def saw_direct(self, passes: int) -> None:
-        pass
-
-    def direct_passes_left(self, passes: int) -> float:
-        return max(1.0, 15.0 - passes)
-
-    def pass_s(self, rows: int) -> float:
-        return 0.01
 
     def saw_ending(self, passes: int) -> None:
         pass
@@ -178,7 +163,7 @@ def test_who_has_less_time_goes_first_and_the_others_lose_nothing(exact: Loaded)
 def at_the_branch(loaded: Loaded, asked: PlanRequest, now_s: float) -> Draw:
     """The only draw of a request, when the clock jumps to `now_s` as its branch is written."""
     clock = Clock()
-    decoder = Decoder(Runner(loaded, 2), clock=clock, pace=Steady())
+    decoder = Decoder(Runner(loaded, 2), clock=clock, latency=Steady())
     decoder.add(asked)
     draws = []
     while not decoder.idle:
@@ -227,32 +212,6 @@ def test_who_is_late_already_makes_nobody_else_late(exact: Loaded) -> None:
     assert [name for name, _ in draws] == ["in-time"] * 2 + ["late"] * 2 + ["whenever"] * 2
 
 
-class Crowded(Steady):
-    """As many rows as are fed make a pass so many times as long."""
-
-    def pass_s(self, rows: int) -> float:
-        return 0.01 * rows
-
-
-@pytest.mark.parametrize(("deadline_ms", "together"), [(600, False), (3000, True)])
-def test_others_wait_where_the_most_urgent_would_be_late_beside_them(
-    exact: Loaded, deadline_ms: int, together: bool
-) -> None:
-    decoder = Decoder(Runner(exact, 8), clock=Clock(), pace=Crowded())
-    decoder.add(request("patient", 0, "traj_only", n=2, temperature=0.0))
-    decoder.add(request("urgent", 1, "traj_only", n=2, temperature=0.0, deadline_ms=deadline_ms))
-    order, rows = [], []
-    while not decoder.idle:
-        before = decoder.counts.row_passes
-        order += [name for name, event in decoder.step() if isinstance(event, DrawFinished)]
-        rows.append(decoder.counts.row_passes - before)
-        decoder.check_integrity()
-    assert rows[0] == (2 if together else 1)
-    assert sorted(order) == ["patient"] * 2 + ["urgent"] * 2
-    if not together:
-        assert order == ["urgent"] * 2 + ["patient"] * 2
-
-
 def test_a_request_starts_once_even_when_it_gives_way(exact: Loaded) -> None:
     clock = Clock()
     decoder = Decoder(Runner(exact, 2), clock=clock)
@@ -265,7 +224,7 @@ def test_a_request_starts_once_even_when_it_gives_way(exact: Loaded) -> None:
 
 
 def test_steps_that_vary_are_left_more_room() -> None:
-    steady, varying = Pace(), Pace()
+    steady, varying = LatencyModel(), LatencyModel()
     for step in range(200):
         steady.saw_step(0.05)
         varying.saw_step(0.02 if step % 2 else 0.08)

@@ -26,9 +26,10 @@ from hypothesis import strategies as st
 
 from model.driving.plan import plan_from_bins
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thinking
+from model.engines.torch.deadlines import TimeFor
 from model.engines.torch.decoder import Decoder, Failed
-from model.engines.torch.pace import Pace, TimeFor
-from model.engines.torch.rows import Request, Row
+from model.engines.torch.request import Request
+from model.engines.torch.rows import Row
 from model.engines.torch.runner import Prompt, Runner
 from model.engines.torch.sampler import probabilities
 from model.engines.torch.shortcuts import Shortcuts
@@ -83,19 +84,8 @@ class Mix:
     shortcuts: Shortcuts
     rows: int
     chunk: int
-    row_s: float
+    usual_tokens: int
     reproducible: bool
-
-
-class Counted(Pace):
-    """Every row makes a pass so much longer, whatever is seen."""
-
-    def __init__(self, row_s: float) -> None:
-        super().__init__()
-        self._row_s = row_s
-
-    def pass_s(self, rows: int) -> float:
-        return self._row_s * rows
 
 
 @st.composite
@@ -137,8 +127,8 @@ mixes = st.builds(
     st.builds(Shortcuts, **{field.name: st.booleans() for field in fields(Shortcuts)}),
     st.integers(*ROWS),
     st.sampled_from([7, 64, 256]),
-    # Some have room for everybody beside the most urgent, and some make the others wait for it.
-    st.sampled_from([0.0, 0.05, 0.1]),
+    # Some KV rows have room for what responses usually take, and some are outgrown all the time.
+    st.sampled_from([0, 16, 128]),
     st.booleans(),
 )
 
@@ -241,9 +231,9 @@ def test_nothing_that_makes_it_fast_changes_a_response(
             reuse=mix.shortcuts.reuse,
             capture=Again if mix.shortcuts.capture else None,
             formats=made_up,
+            usual_tokens=mix.usual_tokens,
         )
-        pace = Counted(mix.row_s)
-        decoder = Decoder(runner, mix.shortcuts, prompt_chunk=mix.chunk, clock=lambda: 0.0, pace=pace)
+        decoder = Decoder(runner, mix.shortcuts, prompt_chunk=mix.chunk, clock=lambda: 0.0)
         with noted() as shares:
             fast = decode(decoder, mix.arrivals)
         assert {each.request.request_id for each in mix.arrivals if each.cancelled is None} <= {

@@ -9,9 +9,9 @@ import numpy.typing as npt
 import pytest
 
 from model.engines.engine import Controls, Draw, PlanRequest, RequestError
-from model.engines.torch.ahead import Ahead
+from model.engines.torch.deadlines import TimeFor
 from model.engines.torch.decoder import Decoder, Failed
-from model.engines.torch.pace import TimeFor
+from model.engines.torch.drafter import Drafter
 from model.engines.torch.rows import Row
 from model.engines.torch.runner import Runner
 from model.network.checkpoint import Loaded
@@ -97,19 +97,19 @@ def test_a_draw_that_cannot_go_on_ends_its_request_alone(
 
 
 @pytest.mark.parametrize(
-    ("method", "message"), [("feed", "could not go on"), ("finished", "could not be read")]
+    ("method", "message"), [("propose", "could not go on"), ("finished", "could not be read")]
 )
 def test_a_guess_that_goes_wrong_ends_its_request_alone(
     exact: Loaded, monkeypatch: pytest.MonkeyPatch, method: str, message: str
 ) -> None:
-    guess = getattr(Ahead, method)
+    guess = getattr(Drafter, method)
 
-    def guessing(ahead: Ahead, row: Row, *rest: Any) -> Any:
+    def guessing(drafter: Drafter, row: Row, *rest: Any) -> Any:
         if row.request.id == BAD and len(row.tokens) > 20:
             raise ArithmeticError("no")
-        return guess(ahead, row, *rest)
+        return guess(drafter, row, *rest)
 
-    monkeypatch.setattr(Ahead, method, guessing)
+    monkeypatch.setattr(Drafter, method, guessing)
     good = request("good", 2, n=2, seed=2)
     draws, failed = decode_some(Decoder(Runner(exact, 8)), request(BAD, 7, n=4, seed=7), good)
     assert list(failed) == [BAD]
@@ -123,10 +123,12 @@ def test_rows_that_nobody_owns_are_found(exact: Loaded) -> None:
     for _ in range(3):
         decoder.step()
     decoder.check_integrity()
-    decoder._schedule.release("running")
-    with pytest.raises(AssertionError, match="somebody runs without"):
+    running = decoder._scheduler.get("running")
+    assert running is not None
+    decoder._scheduler.remove(running)
+    with pytest.raises(AssertionError, match="held for nobody"):
         decoder.check_integrity()
-    decoder.cancel("running")
+    running.end(decoder._memory)
 
 
 @pytest.mark.parametrize(

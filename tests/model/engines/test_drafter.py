@@ -8,8 +8,9 @@ import pytest
 
 from model.engines.engine import Controls, PlanRequest
 from model.engines.requests import branch_of
-from model.engines.torch.ahead import Ahead
-from model.engines.torch.rows import Request, Row
+from model.engines.torch.drafter import _CONTEXTS, Drafter, _Ngrams, _Responses
+from model.engines.torch.request import Request, Tree
+from model.engines.torch.rows import Row
 from model.engines.torch.sampler import uniform
 from model.formats.cf_vla import CF_VLA
 from model.formats.cursor import CompiledFormat
@@ -27,9 +28,9 @@ def beginning(loaded: Loaded, **controls: Any) -> Row:
     """A row in front of its first decision."""
     start = CompiledFormat(CF_VLA, loaded.vocabulary).start()
     asked = PlanRequest("a", noisy_scene(), "cf_vla", Controls(n=1, **controls))
-    row = Row(start, Request(asked, start, 0.0), (0,))
-    prompt: Any = SimpleNamespace(shown=b"pictures")
-    row.begin(prompt, 0)
+    prompt: Any = SimpleNamespace(shown=b"pictures", last_token=0)
+    row = Row(start, Tree(Request(asked, start, 0.0), prompt=prompt), (0,))
+    row.start(0)
     row.write((), loaded.vocabulary)
     return row
 
@@ -44,7 +45,7 @@ def whole(loaded: Loaded) -> Row:
 
 def test_without_guesses_a_row_feeds_what_is_pending(loaded: Loaded) -> None:
     row = beginning(loaded)
-    tokens, decisions = Ahead().feed(row, rows=0)
+    tokens, decisions = Drafter().propose(row, rows=0)
     assert tokens == row.pending
     assert [place for place, _ in decisions] == [len(tokens) - 1]
 
@@ -53,10 +54,10 @@ def test_a_guess_is_what_the_draws_own_number_selects(loaded: Loaded) -> None:
     """Half of the others chose the first, half the last: which is guessed is in the seed."""
     guessed = set()
     for seed in range(12):
-        row, ahead = beginning(loaded, seed=seed), Ahead()
+        row, drafter = beginning(loaded, seed=seed), Drafter()
         ids = row.cursor.allowed().ids
-        ahead.saw(row, len(ids), [(int(ids[0]), (0, 1, 2)), (int(ids[-1]), (3, 4, 5))])
-        tokens, decisions = ahead.feed(row, rows=1)
+        drafter.observe(row, len(ids), [(int(ids[0]), (0, 1, 2)), (int(ids[-1]), (3, 4, 5))])
+        tokens, decisions = drafter.propose(row, rows=1)
         guess = tokens[len(row.pending)]
         assert guess == int(ids[0 if uniform(seed, 0, len(row.tokens)) < 0.5 else -1])
         assert len(decisions) == 2, "the decision guessed, and the next one, which is not"
@@ -65,13 +66,13 @@ def test_a_guess_is_what_the_draws_own_number_selects(loaded: Loaded) -> None:
 
 
 def test_guesses_that_are_not_sure_are_made_while_few_rows_share_a_pass(loaded: Loaded) -> None:
-    row, ahead = beginning(loaded), Ahead()
+    row, drafter = beginning(loaded), Drafter()
     ids = row.cursor.allowed().ids
-    ahead.saw(row, len(ids), [(int(token), (0,)) for token in ids[:8]])
-    assert len(ahead.feed(row, rows=4)[0]) > len(row.pending)
-    assert ahead.feed(row, rows=40)[0] == row.pending
-    ahead.saw(row, len(ids), [(int(ids[0]), tuple(range(56))), (int(ids[-1]), tuple(range(56)))])
-    assert len(ahead.feed(row, rows=40)[0]) > len(row.pending)
+    drafter.observe(row, len(ids), [(int(token), (0,)) for token in ids[:8]])
+    assert len(drafter.propose(row, rows=4)[0]) > len(row.pending)
+    assert drafter.propose(row, rows=40)[0] == row.pending
+    drafter.observe(row, len(ids), [(int(ids[0]), tuple(range(56))), (int(ids[-1]), tuple(range(56)))])
+    assert len(drafter.propose(row, rows=40)[0]) > len(row.pending)
 
 
 def test_a_revised_plan_is_fed_as_the_first_went_on_while_it_repeats_it(loaded: Loaded) -> None:
@@ -83,32 +84,32 @@ def test_a_revised_plan_is_fed_as_the_first_went_on_while_it_repeats_it(loaded: 
         row.write((int(ids[0]) if stop_id is None or stop_id not in ids else stop_id,), loaded.vocabulary)
     first = [token.id for token in row.tokens if token.section == "plan"]
     already = sum(token.section == "revised_plan" for token in row.tokens)
-    tokens, decisions = Ahead().feed(row, rows=1)
+    tokens, decisions = Drafter().propose(row, rows=1)
     assert tokens[len(row.pending) :][: len(first) - already] == first[already:]
     assert len(decisions) > 3, "all decisions of the plan are checked in one pass"
     other = next(int(id) for id in row.cursor.allowed().ids if int(id) != first[already])
     row.write((other,), loaded.vocabulary)
-    assert Ahead().feed(row, rows=1)[0] == row.pending
+    assert Drafter().propose(row, rows=1)[0] == row.pending
 
 
 def test_the_more_rows_the_less_of_the_last_answer_is_fed(loaded: Loaded) -> None:
-    ahead, first = Ahead(), whole(loaded)
-    ahead.finished(first)
+    drafter, first = Drafter(), whole(loaded)
+    drafter.finished(first)
     row = beginning(loaded, seed=1)
-    few, many = (len(ahead.feed(row, rows=rows)[0]) - len(row.pending) for rows in (6, 96))
+    few, many = (len(drafter.propose(row, rows=rows)[0]) - len(row.pending) for rows in (6, 96))
     assert few > many > 0
 
 
 def test_at_temperature_zero_the_most_frequent_is_guessed(loaded: Loaded) -> None:
-    row, ahead = beginning(loaded, temperature=0.0), Ahead()
+    row, drafter = beginning(loaded, temperature=0.0), Drafter()
     ids = row.cursor.allowed().ids
-    ahead.saw(row, len(ids), [(int(ids[0]), (0,)), (int(ids[1]), (1, 2))])
-    tokens, _ = ahead.feed(row, rows=1)
+    drafter.observe(row, len(ids), [(int(ids[0]), (0,)), (int(ids[1]), (1, 2))])
+    tokens, _ = drafter.propose(row, rows=1)
     assert tokens[len(row.pending)] == int(ids[1])
 
 
 def test_texts_are_guessed_though_any_word_may_follow(loaded: Loaded) -> None:
-    row, ahead = beginning(loaded), Ahead()
+    row, drafter = beginning(loaded), Drafter()
     while row.cursor.stop_id is None:
         allowed = row.cursor.allowed()
         token = int(allowed.ids[-1])
@@ -117,29 +118,77 @@ def test_texts_are_guessed_though_any_word_may_follow(loaded: Loaded) -> None:
         row.write((token,), loaded.vocabulary)
     ids = row.cursor.allowed().ids
     assert len(ids) > 64
-    ahead.saw(row, len(ids), [(int(ids[5]), (0,))])
-    tokens, _ = ahead.feed(row, rows=1)
+    drafter.observe(row, len(ids), [(int(ids[5]), (0,))])
+    tokens, _ = drafter.propose(row, rows=1)
     assert tokens[len(row.pending) :] == [int(ids[5])]
 
 
 def test_the_last_answer_to_the_same_pictures_is_repeated(loaded: Loaded) -> None:
-    ahead, first = Ahead(), whole(loaded)
-    ahead.finished(first)
+    drafter, first = Drafter(), whole(loaded)
+    drafter.finished(first)
     row = beginning(loaded, seed=1)
-    tokens, decisions = ahead.feed(row, rows=1)
+    tokens, decisions = drafter.propose(row, rows=1)
     repeated = [token.id for token in first.tokens]
     assert tokens[1:] == repeated[: len(tokens) - 1]
     assert len(tokens) > len(row.pending) + 10
     assert len(decisions) > 3
 
 
-def test_a_response_that_goes_another_way_than_the_last_one_is_guessed_from_habits(loaded: Loaded) -> None:
-    ahead, first = Ahead(), whole(loaded)
-    ahead.finished(first)
+def test_a_response_that_goes_another_way_than_the_last_one_is_guessed_from_what_followed(
+    loaded: Loaded,
+) -> None:
+    drafter, first = Drafter(), whole(loaded)
+    drafter.finished(first)
     row = beginning(loaded, seed=1)
     row.write((int(row.cursor.allowed().ids[0]),), loaded.vocabulary)
-    assert ahead.feed(row, rows=1)[0] == row.pending
+    assert drafter.propose(row, rows=1)[0] == row.pending
     ids = row.cursor.allowed().ids
-    ahead.saw(row, len(ids), [(int(ids[1]), (0,))])
-    tokens, _ = ahead.feed(row, rows=1)
+    drafter.observe(row, len(ids), [(int(ids[1]), (0,))])
+    tokens, _ = drafter.propose(row, rows=1)
     assert tokens[len(row.pending)] == int(ids[1])
+
+
+def test_a_random_number_selects_by_how_often_tokens_followed() -> None:
+    ngrams = _Ngrams()
+    assert ngrams.likely([1, 2], 0.5) is None
+    ngrams.count([1, 2], 9, 3)
+    ngrams.count([1, 2], 4, 1)
+    for number, token in ((0.0, 4), (0.24, 4), (0.26, 9), (0.99, 9), (None, 9)):
+        assert ngrams.likely([1, 2], number) == (token, {4: 1, 9: 3}[token] / 5)
+    assert ngrams.likely([2, 1], 0.5) is None
+
+
+def test_the_longest_context_that_is_known_counts() -> None:
+    ngrams = _Ngrams()
+    end = list(range(min(_CONTEXTS)))
+    ngrams.count([98, *end], 7, 1)
+    ngrams.count([99, *end], 8, 1)
+    assert ngrams.likely([98, *end], 0.9) == (7, 1 / 2)
+    assert ngrams.likely([97, *end], 0.9) == (8, 1 / 3), (
+        "of the last tokens, which are known, both came as often"
+    )
+
+
+def test_it_forgets_what_was_longest_unused() -> None:
+    ngrams = _Ngrams()
+    for number in range(50_001):
+        ngrams.count([number], 5, 2)
+    assert ngrams.likely([0], None) is None
+    assert ngrams.likely([1], None) == (5, 2 / 3)
+
+
+def test_every_draw_has_its_own_last_response() -> None:
+    responses = _Responses()
+    responses.keep(b"scene", (0, 2), [1, 2, 3])
+    responses.keep(b"scene", (1,), [1, 5])
+    responses.keep(b"scene", (2,), [9])
+    assert [responses.last(b"scene", draw) for draw in range(4)] == [(1, 2, 3), (1, 5), (9,), ()]
+    assert responses.last(b"other", 0) == ()
+
+
+def test_the_oldest_scenes_are_forgotten() -> None:
+    responses = _Responses()
+    for number in range(257):
+        responses.keep(str(number).encode(), (0,), [number])
+    assert responses.last(b"0", 0) == ()
+    assert responses.last(b"256", 0) == (256,)
