@@ -29,7 +29,7 @@ class Response:
         think_probability: at the branch, once that is decided.
         chosen: how many tokens were chosen where the format left more than one.
         cut: what a deadline did to the second look.
-        told: how many characters of the free text being written have been told of.
+        streamed: how many characters of the free text being written `new_text` has returned.
     """
 
     cursor: Cursor
@@ -37,7 +37,7 @@ class Response:
     think_probability: float | None = field(default=None, kw_only=True)
     chosen: int = field(default=0, kw_only=True)
     cut: Cut | None = field(default=None, kw_only=True)
-    told: int = field(default=0, kw_only=True)
+    streamed: int = field(default=0, kw_only=True)
 
     def append(self, token: int, vocabulary: Vocabulary) -> list[SectionText]:
         """Write one token; returns the section that it finishes, if any.
@@ -63,13 +63,13 @@ class Response:
     def new_text(self, vocabulary: Vocabulary) -> SectionText | None:
         """What was written of a free text since this was last asked; None outside of free text."""
         if self.cursor.stop_id is None:
-            self.told = 0
+            self.streamed = 0
             return None
         section = self.cursor.section
         text = vocabulary.decode([token.id for token in self.tokens if token.section == section])
-        if len(text) <= self.told or text.endswith(_HALF_A_CHARACTER):
+        if len(text) <= self.streamed or text.endswith(_HALF_A_CHARACTER):
             return None
-        new, self.told = text[self.told :], len(text)
+        new, self.streamed = text[self.streamed :], len(text)
         return SectionText(section, new)
 
     def _finished(self, section: str, then: str, vocabulary: Vocabulary) -> list[SectionText]:

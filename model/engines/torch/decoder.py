@@ -26,6 +26,7 @@ from model.engines.requests import begin, read
 from model.engines.torch.batch import Batch, Feed
 from model.engines.torch.deadlines import LatencyModel, drafts_of
 from model.engines.torch.drafter import Drafter
+from model.engines.torch.integrity import check
 from model.engines.torch.request import Phase, Request, Tree
 from model.engines.torch.rows import Row
 from model.engines.torch.runner import ROWS_A_TREE, Runner
@@ -187,6 +188,8 @@ class Decoder:
         fed: list[tuple[Row, Feed]] = []
         failures: list[StepEvent] = []
         for tree in trees:
+            if tree.request.phase is Phase.ENDED:
+                continue  # it failed with another of its trees
             try:
                 feeds = self._feeds_of(tree, rows)
             except Exception as error:  # one draw that cannot go on must not end the others
@@ -207,8 +210,6 @@ class Decoder:
             tree: whose prompt is prefilled.
             rows: in the pass.
         """
-        if tree.request.phase is Phase.ENDED:
-            return []
         feeds = [self._feed_of(row, rows if self._shortcuts.speculate else 0) for row in tree.rows]
         if self._memory.fitting([feed.row_input for feed in feeds]) == len(feeds):
             return feeds
@@ -403,29 +404,4 @@ class Decoder:
 
     def check_integrity(self) -> None:
         """Raise `AssertionError` when requests and memory do not agree with each other."""
-        requests = self._scheduler.requests
-        trees = [tree for request in requests for tree in request.trees]
-        rows = [row for tree in trees for row in tree.rows]
-        for kind, pool, used in (
-            ("KV rows", self._memory.kv_rows, [tree.kv_row for tree in trees if tree.kv_row is not None]),
-            ("entries", self._memory.entries, [row.entry for row in rows if row.entry is not None]),
-        ):
-            assert len(used) == len(set(used)), f"{kind} are used twice"
-            assert len(used) == pool.size - pool.free, f"{kind} are held for nobody"
-        draws = [(row.request.id, draw, row.draft) for row in rows for draw in row.draws]
-        assert len(draws) == len(set(draws)), "a draw runs twice"
-        for request in requests:
-            assert request.phase is not Phase.ENDED, "a request is kept that has ended"
-            assert request.trees, "a request has nothing to do"
-            assert len(list(request.rows)) <= request.most_rows, "a request uses more than it reserved"
-            undecided = {draw for row in request.rows if not row.draft for draw in row.draws}
-            assert request.drafts.keys() <= undecided, "a draft is kept for nobody"
-        for tree in trees:
-            assert tree.rows, "a tree has no rows"
-            assert tree.kv_row is None or tree.request.phase is Phase.RUNNING, "a waiting request has memory"
-            assert tree.prompt is None or tree.prompt.kv_row == tree.kv_row, "a prompt lies elsewhere"
-        for row in rows:
-            assert row.draws, "a row is nobody's"
-            assert (row.entry is None) == (row.tree.kv_row is None), "a row has memory without its tree"
-            if row.tree.decoding:
-                assert row.pending or row.cursor.done, "a row has nothing to feed"
+        check(self._scheduler.requests, self._memory)

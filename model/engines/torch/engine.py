@@ -49,9 +49,9 @@ class TorchSettings:
 
     Attributes:
         rows: draws decoded at once; more wait.
-        prompts: scenes decoded at once, each with memory for the longest responses that its draws could
-            write; by default a sixth of the rows, as most requests ask for six draws. On a CPU memory is
-            taken from the system as it is used.
+        prompts: scenes decoded at once, each with memory for what its draws usually write; by default a
+            sixth of the rows, as most requests ask for six draws. On a CPU memory is taken from the system
+            as it is used.
         clip_bytes: of vision tokens kept for pictures that come again, and as many of keys and values.
         dtype: of weights, keys and values.
         products: what matrix products are worked out in; by default bfloat16 on CPUs that have units for

@@ -31,10 +31,10 @@ class Sizes(NamedTuple):
 
 
 class Numbers(NamedTuple):
-    """What tells a pass from others of its sizes: whole numbers, int64, and the places hidden, bool."""
+    """What tells a pass from others of its sizes: whole numbers, int64, and masked slots, bool."""
 
     whole: Tensor
-    hidden: Tensor
+    masked: Tensor
 
 
 class Captured(Protocol):

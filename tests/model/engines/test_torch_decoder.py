@@ -77,7 +77,8 @@ def test_shortcuts_save_what_they_are_for(exact: Loaded) -> None:
     one = request("a", 0, n=6, seed=1, temperature=0.3, thinking="always")
 
     def counts(**off: bool) -> Counts:
-        decoder = Decoder(Runner(exact, 6), replace(Shortcuts(), **off))
+        # With room for all, so that nothing is fed twice.
+        decoder = Decoder(Runner(exact, 6, usual_tokens=10_000), replace(Shortcuts(), **off))
         decode(decoder, one)
         return decoder.counts
 
