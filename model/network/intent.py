@@ -126,4 +126,4 @@ class TrackReader(nn.Module):
             has_route: bool [b].
         """
         tokens: Tensor = self.tokens(self.state(tracks, history, route, has_route))
-        return tokens.unflatten(1, (INTENT_TOKENS, -1))
+        return tokens.view(len(tokens), INTENT_TOKENS, tokens.shape[1] // INTENT_TOKENS)

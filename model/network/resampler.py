@@ -85,7 +85,7 @@ class _SceneIntent(nn.Module):
     def forward(self, gathered: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
         """Tokens [b, INTENT_TOKENS, hidden]; see `state`."""
         tokens: Tensor = self.tokens(self.state(gathered, history, route, has_route))
-        return tokens.unflatten(1, (INTENT_TOKENS, -1))
+        return tokens.view(len(tokens), INTENT_TOKENS, tokens.shape[1] // INTENT_TOKENS)
 
 
 class _CrossLayer(nn.Module):
