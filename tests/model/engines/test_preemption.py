@@ -59,7 +59,7 @@ def test_a_tree_that_outgrows_its_kv_row_goes_on_in_others(
 
 
 def test_requests_may_be_preempted_at_any_step(exact: Loaded, undisturbed: Draws) -> None:
-    """In one of twelve steps some request loses all its memory, wherever it stands."""
+    """In one of six steps some request loses all its memory, wherever it stands."""
     random = np.random.default_rng(0)
     disturbed = decoder(exact, prompts=4, usual_tokens=0)
     for each in MIX:
@@ -68,7 +68,7 @@ def test_requests_may_be_preempted_at_any_step(exact: Loaded, undisturbed: Draws
     preempted = 0
     while not disturbed.idle:
         running = [each for each in disturbed._scheduler.requests if each.phase is Phase.RUNNING]
-        if running and random.random() < 1 / 12:
+        if running and random.random() < 1 / 6:
             disturbed._preempt(running[int(random.integers(len(running)))])
             disturbed.check_integrity()
             preempted += 1
