@@ -13,7 +13,7 @@ VLLM_PIP := $(VLLM_BIN)/pip install --quiet --disable-pip-version-check -c deplo
 # What vLLM's CPU build brings along but never imports there, and what is linked to CUDA.
 VLLM_UNUSED := torchaudio torchcodec triton
 
-.PHONY: plan test check lint-api deploy-check sim vllm test-vllm system-packages clean
+.PHONY: plan test check lint-api pictures deploy-check sim vllm test-vllm system-packages clean
 
 plan: $(VENV)/.serve
 	$(BIN)/looktwice plan
@@ -33,6 +33,10 @@ lint-api: $(VENV)/.dev
 	npm exec --yes --package=@stoplight/spectral-cli@6.16.3 -- \
 	spectral lint --fail-severity=warn "$$folder/openapi.json"; \
 	status=$$?; rm -r "$$folder"; exit $$status
+
+# The README's pictures anew, of the bundled checkpoint; a test holds them to its revision.
+pictures: $(VENV)/.dev system-packages
+	$(BIN)/python -m tests.browser.pictures
 
 # Everything in deploy/, with hadolint, helm, promtool, a local Ray and the schemas of compose, Kubernetes and Grafana.
 deploy-check: $(VENV)/.dev $(BIN)/promtool

@@ -1,0 +1,71 @@
+"""The same plan request, asked over HTTP in several ways: how many draws differ in a byte.
+
+Run by hand over more scenes: ``python -m tests.end_to_end.same_bytes SCENES COUNT``.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from model.bundled import CHECKPOINT
+from model.driving.scene import Scene
+from model.driving.scene_store import read_scenes
+from model.engines.torch.engine import TorchEngine
+from service.settings import Settings
+from tests.service.serving import body, serve
+
+DRAWS, FEW = 6, 3
+WAYS = ("repeated", "streamed", "batched", f"n = {FEW} of {DRAWS}", "under load")
+
+
+def draws_of(answer: dict[str, Any]) -> list[str]:
+    """Each draw's JSON, as it was sent but for blanks, without what tells of time."""
+    return [json.dumps(draw, sort_keys=True) for draw in answer["draws"]]
+
+
+def compare(http: httpx.Client, scene: Scene) -> Counter[str]:
+    """How many draws of a scene differ from the fresh ones, by how they were asked for."""
+
+    def ask(n: int = DRAWS, **more: Any) -> httpx.Response:
+        answer = http.post("/v1/plan", json=body(scene, n=n, seed=1) | more)
+        assert answer.status_code == 200, answer.text
+        return answer
+
+    fresh = draws_of(ask().json())
+    told = ask(stream=True).text.strip().split("\n\n")[-1]
+    streamed = json.loads(told.split("data: ", 1)[1])
+    batch = {"requests": [body(scene, n=FEW, seed=9), body(scene, n=DRAWS, seed=1)]}
+    batched = http.post("/v1/plan/batch", json=batch).json()["results"][1]["response"]
+    found = {
+        "repeated": draws_of(ask().json()),
+        "streamed": draws_of(streamed),
+        "batched": draws_of(batched),
+        f"n = {FEW} of {DRAWS}": draws_of(ask(n=FEW).json()),
+    }
+    with ThreadPoolExecutor(3) as pool:
+        others = [pool.submit(http.post, "/v1/plan", json=body(scene, n=4, seed=seed)) for seed in (2, 3)]
+        found["under load"] = draws_of(pool.submit(ask).result().json())
+        assert all(other.result().status_code == 200 for other in others)
+    assert all(len(draws) == (FEW if way.startswith("n =") else DRAWS) for way, draws in found.items())
+    return Counter({way: sum(a != b for a, b in zip(fresh, found[way], strict=False)) for way in WAYS})
+
+
+def main() -> None:
+    path, count = Path(sys.argv[1]), int(sys.argv[2])
+    differing = Counter(dict.fromkeys(WAYS, 0))
+    with serve(TorchEngine(CHECKPOINT), Settings()) as served:
+        for labelled in islice(read_scenes(path, dense=False), count):
+            differing.update(compare(served.http, labelled.scene))
+    print(f"draws of {count} scenes that differ: {dict(differing)}")
+
+
+if __name__ == "__main__":
+    main()
