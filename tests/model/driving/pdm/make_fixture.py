@@ -74,7 +74,7 @@ def join(out: Path, parts: list[Path]) -> None:
 
 
 def _write(out: Path, about: str, arrays: dict[str, Any]) -> None:
-    np.savez_compressed(out, allow_pickle=False, about=np.array(about), **arrays)
+    np.savez_compressed(out, **{"about": np.array(about), **arrays})
 
 
 def _near(world: World, states: Array, signs: Array, version: Literal["v1.1", "v2.2"]) -> BoolArray:
