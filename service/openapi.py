@@ -22,6 +22,7 @@ Responses = dict[int | str, dict[str, Any]]
 _TAGS = {
     "planning": "plans, reflections and the models that make them",
     "labelling": "what a teacher says of plans",
+    "scoring": "plans scored by NAVSIM's rules",
     "scenes": "bundled scenes, and those of a file",
     "operations": "health, readiness, metrics, models that are swapped",
 }

@@ -7,6 +7,7 @@ away afterwards. Tower and queries stay as they are.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -28,6 +29,7 @@ from model.training.grounding import fact_loss, fact_weights
 from model.training.vision_cache import VisionCache
 
 Source = Literal["tracks", "scene"]
+_BATCH: Final = 64
 _DROPOUT: Final = 0.2
 _WORDS_WEIGHT: Final = 2.0
 _FACTS_WEIGHT: Final = 0.5
@@ -94,6 +96,30 @@ def collate_intents(samples: list[IntentSample]) -> dict[str, Tensor]:
     """Stack samples."""
     columns = dict(zip(IntentSample._fields, zip(*samples, strict=True), strict=True))
     return {name: torch.from_numpy(np.stack(values)) for name, values in columns.items()}
+
+
+def read_errors(
+    learner: IntentLearner, examples: Examples, vision: VisionCache | None
+) -> Mapping[str, float]:
+    """How well a source is read in held-out scenes: ``plan_ade_m`` and losses, with and without the route.
+
+    The learner is put into evaluation mode meanwhile. Scenes without a route count in both.
+    """
+    data = IntentDataset(examples, vision, route_share=1.0)
+    was_training = learner.training
+    learner.eval()
+    figures: dict[str, float] = {}
+    with torch.inference_mode():
+        for suffix, route in (("", False), ("+route", True)):
+            sums: dict[str, float] = {}
+            for start in range(0, len(data), _BATCH):
+                places = range(start, min(start + _BATCH, len(data)))
+                batch = collate_intents([data.look(place, mirror=False, route=route) for place in places])
+                for name, value in learner(**batch).items():
+                    sums[name] = sums.get(name, 0.0) + len(places) * float(value)
+            figures |= {f"{name}/read{suffix}": total / len(data) for name, total in sums.items()}
+    learner.train(was_training)
+    return figures
 
 
 class IntentLearner(nn.Module):

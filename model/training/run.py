@@ -30,7 +30,7 @@ from model.training.batches import ResponseDataset, TaskSampler, collate
 from model.training.dense import DENSE_SHAPE
 from model.training.examples import Examples, load_examples
 from model.training.grounding import GroundingDataset, GroundingLearner, collate_grounding
-from model.training.intents import IntentDataset, IntentLearner, Source, collate_intents
+from model.training.intents import IntentDataset, IntentLearner, Source, collate_intents, read_errors
 from model.training.learner import ResponseLearner
 from model.training.recipes import Recipe
 from model.training.reflections import OnExamples, reflections_on
@@ -121,6 +121,10 @@ def run(
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
     on_examples = None if reflections is None else reflections_on(examples, read_reflections(reflections))
     learner, dataset, sampler, collator = _prepare(recipe, loaded, examples, on_examples, settings)
+    if isinstance(learner, IntentLearner) and validation:
+        held_out = Examples.from_scenes(validation, loaded.settings.cameras)
+        seen = open_vision(loaded, held_out, settings.cache, mirrored=False) if recipe.pictures else None
+        validate = partial(read_errors, learner, held_out, seen)
     trainer = LearnerTrainer(
         learner,
         recipe,

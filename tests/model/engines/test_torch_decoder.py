@@ -83,7 +83,8 @@ def test_shortcuts_save_what_they_are_for(exact: Loaded) -> None:
         return decoder.counts
 
     everything = counts()
-    assert counts(jump=False, speculate=False).passes > 2.5 * everything.passes
+    # The tokenizer has a token for most forced words, so there is less to jump over than with single digits.
+    assert counts(jump=False, speculate=False).passes > 1.4 * everything.passes
     assert everything.row_passes < everything.fan_out_row_passes
     unshared = counts(shared_rows=False)
     assert unshared.row_passes == unshared.fan_out_row_passes > everything.row_passes

@@ -13,6 +13,7 @@ import torch
 
 from model.driving.images import ImageError
 from model.driving.scene import Clip, Scene
+from model.engines.binding import Binding
 from model.engines.engine import Controls, Draw, DrawFinished, EngineError, PlanRequest, RequestError
 from model.engines.torch.decoder import Decoder, StepEvent
 from model.engines.torch.engine import TorchEngine, TorchSettings
@@ -173,9 +174,9 @@ def test_a_deadline_counts_from_submission(
         go_on.wait(60)
         return step(decoder)
 
-    def noted(decoder: Decoder, request: PlanRequest, stamp_s: float) -> None:
+    def noted(decoder: Decoder, request: PlanRequest, stamp_s: float, binding: Binding | None) -> None:
         submitted_s[request.request_id] = stamp_s
-        add(decoder, request, stamp_s)
+        add(decoder, request, stamp_s, binding)
 
     async def test() -> None:
         async with running(untrained_checkpoint) as engine:

@@ -12,7 +12,7 @@ from model.network.checkpoint import Loaded, load
 from model.network.intent import INTENT_TOKENS
 from model.network.track_features import TRACK_FEATURES
 from model.training.examples import Examples
-from model.training.intents import IntentDataset, IntentLearner, Source, collate_intents
+from model.training.intents import IntentDataset, IntentLearner, Source, collate_intents, read_errors
 from model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
 
@@ -77,6 +77,23 @@ def test_a_few_steps_learn_to_plan_from_a_source_and_leave_the_rest_alone(
     learned = "track_reader." if source == "tracks" else "resampler.intent."
     assert changed
     assert all(name.startswith(learned) for name in changed)
+
+
+def test_held_out_scenes_are_read_with_and_without_their_route(
+    resampling_checkpoint: Path, examples: Examples, data: IntentDataset
+) -> None:
+    loaded = load(resampling_checkpoint)
+    learner = IntentLearner(loaded.model, loaded.codec, "tracks").train()
+    figures = read_errors(learner, examples, None)
+    assert learner.training
+    one_by_one = []
+    learner.eval()
+    for index in range(len(data)):
+        batch = collate_intents([data.look(index, mirror=False, route=True)])
+        with torch.inference_mode():
+            one_by_one.append(float(learner(**batch)["plan_ade_m"]))
+    assert figures["plan_ade_m/read+route"] == pytest.approx(np.mean(one_by_one), rel=1e-4)
+    assert figures["fact_loss/read"] != figures["fact_loss/read+route"]
 
 
 def test_a_checkpoint_without_the_source_is_refused(untrained_checkpoint: Path) -> None:
