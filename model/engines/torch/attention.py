@@ -185,7 +185,10 @@ class OrderedDecode:
             memory.index_copy_(0, self._slot_mapping, new[:written].reshape(-1, width))
         queries, outputs = query.reshape(-1, width), []
         for (lines, kv_heads, span), key_index, query_index, mask in self._calls:
-            keys, values = flat.index_select(1, key_index).view(2, lines, kv_heads, span, width)
+            # One by one: along the first dimension rows are copied whole, along the second number by number.
+            keys, values = (
+                memory.index_select(0, key_index).view(lines, kv_heads, span, width) for memory in flat
+            )
             some = queries.index_select(0, query_index).view(lines, kv_heads, -1, width)
             output = functional.scaled_dot_product_attention(some, keys, values, attn_mask=mask, scale=1.0)
             outputs.append(output.reshape(-1, width))
