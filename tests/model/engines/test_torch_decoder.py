@@ -90,7 +90,11 @@ def test_shortcuts_save_what_they_are_for(exact: Loaded) -> None:
     assert unshared.row_passes == unshared.fan_out_row_passes > everything.row_passes
     decision_by_decision = counts(speculate=False)
     assert decision_by_decision.kept == decision_by_decision.tokens
-    assert everything.kept == decision_by_decision.kept < everything.tokens
+    # A guess that is right up to a response's end was fed with the last code and the two markers behind it.
+    fed_at_the_end = everything.kept - decision_by_decision.kept
+    assert fed_at_the_end % 3 == 0
+    assert 0 <= fed_at_the_end <= 3 * 6
+    assert everything.kept < everything.tokens
     assert decision_by_decision.fan_out_row_passes == counts(speculate=False, shared_rows=False).row_passes
 
 
