@@ -24,9 +24,9 @@ from model.driving.facts import (
     mirrored,
 )
 from model.driving.scene import SEMANTIC_CLASSES
-from model.driving.trajectory import STEP_S
 from model.network.codec import TrajectoryCodec
 from model.network.inputs import InputBuilder
+from model.network.intent import present_speeds
 from model.network.patches import patchify
 from model.network.perception import PerceptionHeads
 from model.network.vla import LookTwiceVla
@@ -210,7 +210,7 @@ class GroundingLearner(nn.Module):
         moved = (dense[..., _CLASSES + 1 :] - motion.permute(0, 1, 3, 4, 2)).abs().sum(dim=-1)
         motion_loss = (moved * agents).sum() / agents.sum().clamp_min(1)
         of_facts = fact_loss(self.heads.read(gathered), facts, self.fact_weights)
-        speeds = -history[:, -4, 0] / (3 * STEP_S)
+        speeds = present_speeds(history)
         state = self.resampler.intent.state(gathered, history, route, has_route)
         guesses = self.heads.trajectory(state.float())
         planned = self.heads.trajectory.loss(guesses, speeds, futures)

@@ -136,12 +136,13 @@ class IntentLearner(nn.Module):
 
     def __init__(self, vla: LookTwiceVla, codec: TrajectoryCodec, source: Source) -> None:
         super().__init__()
-        if (vla.track_reader if source == "tracks" else vla.resampler) is None:
+        scene = None if vla.resampler is None else vla.resampler.intent
+        part: Any = vla.track_reader if source == "tracks" else scene
+        if part is None:
             raise ValueError(f"this checkpoint reads no {source}")
         self._source = source
         # Kept out of the registered modules: only the part that learns is trained and saved with the state.
         self._vla: list[LookTwiceVla] = [vla]
-        part: Any = vla.track_reader if source == "tracks" else vla.resampler.intent  # type: ignore[union-attr]
         self.part = part
         width = IntentTrunk.width
         self.trajectory = TrajectoryHead(width, codec)

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.driving.trajectory import STEP_S
 from model.network.codec import TrajectoryCodec
+from model.network.intent import present_speeds
 from model.network.trajectory_head import TrajectoryHead
 from model.network.vla import LookTwiceVla
 from model.network.vocabulary import FUTURE_START, Vocabulary
@@ -143,7 +143,7 @@ class ResponseLearner(nn.Module):
             # Where the first code is written, a trajectory is drawn at once: metres teach faster than codes.
             row, place = ((input_ids == self._future_start_id) & (parts > 0)).nonzero(as_tuple=True)
             guesses = self.head(hidden[row, place].float())
-            speeds = -history[:, -4, 0] / (3 * STEP_S)
+            speeds = present_speeds(history)
             drawn = self.head.loss(guesses, speeds[row], futures[row])
             losses["loss"] = losses["loss"] + self._head_weight * drawn["loss"]
             losses["head_ade_m"] = drawn["ade_m"]
