@@ -34,6 +34,13 @@ FACTS: Final = (
     *(f"walker_{rank}_{field}" for rank in range(WALKERS) for field in WALKER_FIELDS),
     *(f"road_left_{distance}m" for distance in ROAD_DISTANCES_M),
 )
+FACT_GROUPS: Final = (
+    *((LEAD_FIELDS,) * (len(LANES) * RANKS)),
+    *((OBSTACLE_FIELDS,) * len(LANES)),
+    *((WALKER_FIELDS,) * WALKERS),
+    tuple(f"road_left_{distance}m" for distance in ROAD_DISTANCES_M),
+)
+"""Fields that tell of one agent, obstacle or walker, or of the road; in the order of `FACTS`."""
 IS_YES_OR_NO: Final[npt.NDArray[np.bool_]] = np.array(
     [name.endswith(("present", "standing", "braking", "fixed")) for name in FACTS]
 )
@@ -66,13 +73,13 @@ _SIGNED: Final[npt.NDArray[np.bool_]] = np.array(
 )
 
 
-_HAS_OBJECT: Final[npt.NDArray[np.bool_]] = np.array(
+TELLS_OF_OBJECT: Final[npt.NDArray[np.bool_]] = np.array(
     [not name.endswith("present") and not name.startswith("road_") for name in FACTS]
 )
-_PRESENCE: Final[npt.NDArray[np.int64]] = np.array(
+PRESENCE: Final[npt.NDArray[np.int64]] = np.array(
     [
         max(place for place in range(index + 1) if FACTS[place].endswith("present")) if tells else index
-        for index, tells in enumerate(_HAS_OBJECT)
+        for index, tells in enumerate(TELLS_OF_OBJECT)
     ]
 )
 """Where the presence of each fact's object is told: at the beginning of its fields."""
@@ -131,13 +138,6 @@ def mirrored(facts: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Facts [..., len(FACTS)] of a scene whose left and right are swapped."""
     swapped: npt.NDArray[np.float32] = np.where(_SIGNED, -facts[..., _MIRROR], facts[..., _MIRROR])
     return swapped
-
-
-def weighed(facts: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Facts [..., len(FACTS)] as inputs: each counts as much as its object is present, and none is NaN."""
-    known = np.nan_to_num(facts)
-    values: npt.NDArray[np.float32] = np.where(_HAS_OBJECT, known * known[..., _PRESENCE], known)
-    return values
 
 
 def _states(track: Track) -> tuple[float, float, float]:

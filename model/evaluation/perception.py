@@ -13,7 +13,6 @@ import torch
 
 from model.driving.facts import (
     FACTS,
-    IS_YES_OR_NO,
     LANES,
     ROAD_DISTANCES_M,
     ROAD_SCALE_M,
@@ -23,7 +22,7 @@ from model.driving.facts import (
 )
 from model.driving.scene import LabelledScene
 from model.network.checkpoint import Loaded
-from model.network.perception import PerceptionHeads
+from model.network.fact_reader import likely
 
 _BATCH: Final = 16
 _NEAR_M: Final = 60.0
@@ -53,7 +52,6 @@ class Reading:
 
 def read_facts(
     loaded: Loaded,
-    heads: PerceptionHeads,
     scenes: Iterable[LabelledScene],
     on_done: Callable[[int], None] | None = None,
 ) -> Reading:
@@ -61,7 +59,6 @@ def read_facts(
 
     Args:
         loaded: with a resampler.
-        heads: that were grounded with it.
         scenes: labelled.
         on_done: told how many scenes are done.
 
@@ -73,7 +70,7 @@ def read_facts(
     parts: list[Reading] = []
     done = 0
     for batch in _batches(labelled for labelled in scenes if labelled.scene.route is not None):
-        parts.append(_reading(loaded, heads, batch))
+        parts.append(_reading(loaded, batch))
         done += len(batch)
         if on_done is not None:
             on_done(done)
@@ -83,9 +80,9 @@ def read_facts(
     return Reading(*(np.concatenate(column) for column in columns))
 
 
-def _reading(loaded: Loaded, heads: PerceptionHeads, batch: list[LabelledScene]) -> Reading:
+def _reading(loaded: Loaded, batch: list[LabelledScene]) -> Reading:
     return Reading(
-        read=_read(loaded, heads, batch),
+        read=_read(loaded, batch),
         true=np.stack([scene_facts(labelled) for labelled in batch]),
         history=np.stack([labelled.scene.history for labelled in batch]),
         route=np.stack([np.asarray(labelled.scene.route) for labelled in batch]),
@@ -100,7 +97,7 @@ def _batches(scenes: Iterator[LabelledScene]) -> Iterator[list[LabelledScene]]:
 
 
 @torch.inference_mode()
-def _read(loaded: Loaded, heads: PerceptionHeads, batch: list[LabelledScene]) -> Array:
+def _read(loaded: Loaded, batch: list[LabelledScene]) -> Array:
     model, builder = loaded.model, loaded.inputs
     assert model.resampler is not None
     patches = np.concatenate(
@@ -114,9 +111,7 @@ def _read(loaded: Loaded, heads: PerceptionHeads, batch: list[LabelledScene]) ->
         torch.from_numpy(np.stack([np.asarray(each.scene.route) for each in batch])),
         torch.ones(len(batch), dtype=torch.bool),
     )
-    facts = heads.read(gathered)
-    likely = torch.where(torch.from_numpy(IS_YES_OR_NO), facts.sigmoid(), facts)
-    values: Array = likely.numpy()
+    values: Array = likely(model.resampler.facts(gathered)).numpy()
     return values
 
 

@@ -13,7 +13,7 @@ from typing import Final
 from model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, track_from_words
 from model.driving.scene import CAMERAS
 from model.network.prompts import SYSTEM, TASKS, prompt_text
-from model.network.settings import VlaSettings
+from model.network.settings import LEAST_SCENE_TOKENS, VlaSettings
 
 _SLOTS: Final[dict[str, tuple[str, ...]]] = {
     "agent": (
@@ -294,6 +294,6 @@ def nano_corpus() -> Iterator[str]:
     for format in TASKS:
         for route in (False, True):
             # Often enough that the prompt's own words become single tokens.
-            for tokens in (0, 3):
+            for tokens in (0, LEAST_SCENE_TOKENS):
                 settings = VlaSettings(cameras=CAMERAS, scene_tokens=tokens)
                 yield from [prompt_text(format, settings, route=route, tracks=route)] * 20

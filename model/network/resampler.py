@@ -13,14 +13,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.driving.facts import FACTS
 from model.network.encoders import HistoryEncoder, RouteEncoder
+from model.network.fact_reader import FactReader, likely, weighed
 from model.network.intent import INTENT_TOKENS, IntentTrunk
 
 _HEADS: Final = 4
 _LAYERS: Final = 2
 _EPSILON: Final = 1e-6
-_AROUND: Final = 192
-"""What the gathered tokens are brought down to, to be planned by."""
 
 
 class SceneResampler(nn.Module):
@@ -42,12 +42,14 @@ class SceneResampler(nn.Module):
         self.vision_norm = nn.RMSNorm(hidden_size, eps=_EPSILON)
         self.layers = nn.ModuleList(_CrossLayer(hidden_size) for _ in range(_LAYERS))
         self.norm = nn.RMSNorm(hidden_size, eps=_EPSILON)
-        self.intent = _SceneIntent(hidden_size, len(self.queries))
+        self.facts = FactReader(hidden_size)
+        self.intent = _SceneIntent(hidden_size)
 
     def forward(self, vision_tokens: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
         """What stands in the prompt, [b, scene_tokens, hidden]; see `gather`."""
         gathered = self.gather(vision_tokens, history, route, has_route)
-        return torch.cat([gathered, self.intent(gathered, history, route, has_route)], dim=1)
+        facts = likely(self.facts(gathered))
+        return torch.cat([gathered, self.intent(facts, history, route, has_route)], dim=1)
 
     def gather(self, vision_tokens: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
         """What the queries gather, [b, queries, hidden].
@@ -69,22 +71,21 @@ class SceneResampler(nn.Module):
 
 
 class _SceneIntent(nn.Module):
-    """What to do about what was gathered."""
+    """What to do about the facts that are read."""
 
-    def __init__(self, hidden_size: int, queries: int) -> None:
+    def __init__(self, hidden_size: int) -> None:
         super().__init__()
-        self.around = nn.Sequential(nn.Linear(queries * hidden_size, _AROUND), nn.SiLU())
-        self.trunk = IntentTrunk(_AROUND)
+        self.trunk = IntentTrunk(len(FACTS))
         self.tokens = nn.Linear(IntentTrunk.width, INTENT_TOKENS * hidden_size)
 
-    def state(self, gathered: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
-        """What to do, [b, 256], from gathered tokens [b, queries, hidden]; see `SceneResampler.gather`."""
-        state: Tensor = self.trunk(history, route, has_route, self.around(gathered.flatten(1)))
+    def state(self, facts: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
+        """What to do, [b, 256], about facts [b, len(FACTS)] with their probabilities; see `likely`."""
+        state: Tensor = self.trunk(history, route, has_route, weighed(facts))
         return state
 
-    def forward(self, gathered: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
+    def forward(self, facts: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
         """Tokens [b, INTENT_TOKENS, hidden]; see `state`."""
-        tokens: Tensor = self.tokens(self.state(gathered, history, route, has_route))
+        tokens: Tensor = self.tokens(self.state(facts, history, route, has_route))
         return tokens.view(len(tokens), INTENT_TOKENS, tokens.shape[1] // INTENT_TOKENS)
 
 

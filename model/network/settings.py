@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+from model.driving.facts import FACT_GROUPS
 from model.driving.scene import CAMERAS, CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE
 from model.network.intent import INTENT_TOKENS
 
 CONFIG_KEY: Final = "looktwice"
 """Where these settings lie in a checkpoint's ``config.json``."""
+LEAST_SCENE_TOKENS: Final = len(FACT_GROUPS) + INTENT_TOKENS
 
 
 class SettingsError(ValueError):
@@ -59,9 +61,10 @@ class VlaSettings:
             raise SettingsError(f"temporal_patch_size {self.temporal_patch_size} must divide {CLIP_FRAMES}")
         if unknown := [camera for camera in self.cameras if camera not in CAMERAS]:
             raise SettingsError(f"unknown camera {', '.join(unknown)}; known are {', '.join(CAMERAS)}")
-        if self.scene_tokens and self.scene_tokens <= INTENT_TOKENS:
+        if 0 < self.scene_tokens < LEAST_SCENE_TOKENS:
             raise SettingsError(
-                f"scene_tokens must be 0 or more than the intent's {INTENT_TOKENS}, got {self.scene_tokens}"
+                f"scene_tokens must be 0 or at least {LEAST_SCENE_TOKENS}, got {self.scene_tokens}: "
+                "every group of facts is read from a token of its own"
             )
         if not self.cameras or not self.formats:
             raise SettingsError("a checkpoint needs at least one camera and one response format")

@@ -25,10 +25,11 @@ from model.driving.facts import (
 )
 from model.driving.scene import SEMANTIC_CLASSES
 from model.network.codec import TrajectoryCodec
+from model.network.fact_reader import likely
 from model.network.inputs import InputBuilder
-from model.network.intent import present_speeds
+from model.network.intent import IntentTrunk, present_speeds
 from model.network.patches import patchify
-from model.network.perception import PerceptionHeads
+from model.network.trajectory_head import TrajectoryHead
 from model.network.vla import LookTwiceVla
 from model.training.dense import FIRST_AGENT_CLASS, UNLABELLED
 from model.training.examples import Examples, example_frames
@@ -165,7 +166,7 @@ class GroundingLearner(nn.Module):
         text: Any = vla.config.text_config
         hidden = text.hidden_size
         self.dense_head = nn.Linear(hidden * slices, self._cell[0] * self._cell[1] * (_CLASSES + 3))
-        self.heads = PerceptionHeads(hidden, len(self.resampler.queries), codec)
+        self.trajectory = TrajectoryHead(IntentTrunk.width, codec)
         self.register_buffer("fact_weights", fact_weights())
 
     fact_weights: Tensor
@@ -209,11 +210,11 @@ class GroundingLearner(nn.Module):
         range_loss = (range_error * weights).sum() / weights.sum().clamp_min(1)
         moved = (dense[..., _CLASSES + 1 :] - motion.permute(0, 1, 3, 4, 2)).abs().sum(dim=-1)
         motion_loss = (moved * agents).sum() / agents.sum().clamp_min(1)
-        of_facts = fact_loss(self.heads.read(gathered), facts, self.fact_weights)
+        read = self.resampler.facts(gathered)
+        of_facts = fact_loss(read, facts, self.fact_weights)
         speeds = present_speeds(history)
-        state = self.resampler.intent.state(gathered, history, route, has_route)
-        guesses = self.heads.trajectory(state.float())
-        planned = self.heads.trajectory.loss(guesses, speeds, futures)
+        state = self.resampler.intent.state(likely(read), history, route, has_route)
+        planned = self.trajectory.loss(self.trajectory(state.float()), speeds, futures)
         loss = class_loss + range_loss + _MOTION_WEIGHT * motion_loss + of_facts
         return {
             "loss": loss + _PLAN_WEIGHT * planned["loss"],

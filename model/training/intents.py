@@ -20,6 +20,7 @@ from torch.utils.data import Dataset
 from model.driving.facts import FACTS, mirrored
 from model.driving.plan import GROUPS, TICKS, WORDS
 from model.network.codec import TrajectoryCodec
+from model.network.fact_reader import likely
 from model.network.intent import IntentTrunk, present_speeds
 from model.network.track_features import MIRRORED, without_route
 from model.network.trajectory_head import TrajectoryHead
@@ -189,9 +190,8 @@ class IntentLearner(nn.Module):
         assert vla.resampler is not None
         with torch.no_grad():
             gathered = vla.resampler.gather(seen.float(), history, route, has_route)
-        if self.training:
-            gathered = F.dropout(gathered, _DROPOUT)
-        state: Tensor = vla.resampler.intent.state(gathered, history, route, has_route)
+            facts = likely(vla.resampler.facts(gathered))
+        state: Tensor = vla.resampler.intent.state(facts, history, route, has_route)
         return state
 
     def _word_loss(self, state: Tensor, plan_bins: Tensor) -> Tensor:

@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from model.driving.facts import weighed
 from model.driving.intervals import ratio_interval
 from model.driving.tracks import MAX_TRACKS
 from model.evaluation.perception import Reading
 from model.network.codec import TrajectoryCodec
+from model.network.fact_reader import weighed
 from model.network.small_planner import SmallInputs, SmallKind
 from model.network.track_features import TRACK_FEATURES
 from model.training.small import SmallExamples, SmallSettings, fit_small, small_errors
@@ -59,7 +59,7 @@ def format_gate(rows: list[dict[str, Any]]) -> str:
 
 def _examples(reading: Reading, gate: Gate) -> SmallExamples:
     nobody = torch.zeros(len(reading.read), MAX_TRACKS, len(TRACK_FEATURES))
-    facts = None if gate == "none" else torch.from_numpy(weighed(getattr(reading, gate)))
+    facts = None if gate == "none" else weighed(torch.from_numpy(getattr(reading, gate)))
     inputs = SmallInputs(torch.from_numpy(reading.history), torch.from_numpy(reading.route), nobody, facts)
     return SmallExamples(inputs, torch.from_numpy(reading.future), torch.from_numpy(reading.episodes))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -22,7 +21,6 @@ from model.network.attention import MATMUL_ATTENTION
 from model.network.checkpoint import Loaded, create_nano, load, save
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus, nano_phrases
-from model.network.perception import PERCEPTION_FILE
 from model.network.settings import NANO_SETTINGS
 from model.network.vla import LookTwiceVla
 from model.network.vocabulary import Vocabulary, build_nano_tokenizer
@@ -153,15 +151,6 @@ def run(
         dtype=torch.bfloat16,
         details={"stages": [*stages, _about(recipe, examples, on_examples)]},
     )
-    _save_heads(recipe, learner, source if vision_source is None else vision_source, target)
-
-
-def _save_heads(recipe: Recipe, learner: nn.Module, source: Path, target: Path) -> None:
-    """Keep the heads that read the pictures, as long as tower and resampler are those they belong to."""
-    if isinstance(learner, GroundingLearner):
-        learner.heads.save(target)
-    elif (source / PERCEPTION_FILE).exists() and (recipe.vision_rate == 0 or not recipe.pictures):
-        shutil.copyfile(source / PERCEPTION_FILE, target / PERCEPTION_FILE)
 
 
 def vision_parts(vla: LookTwiceVla) -> list[nn.Module]:

@@ -20,6 +20,7 @@ from model.driving.hashing import hash_of
 from model.driving.whole_files import written_whole
 from model.network.checkpoint import Loaded
 from model.network.patches import patchify
+from model.network.precision import bfloat16_is_fast
 from model.training.examples import Examples, example_frames
 
 _BATCH: Final = 16
@@ -102,7 +103,7 @@ def _look(loaded: Loaded, patches: npt.NDArray[np.uint8], scenes: int) -> Tokens
     settings = loaded.settings
     grid = torch.tensor([settings.grid] * (scenes * len(settings.cameras)))
     device = loaded.model.device
-    with torch.autocast(device.type, torch.bfloat16):
+    with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16_is_fast(device.type)):
         tokens = loaded.model.vision(torch.from_numpy(patches).to(device), grid)
     return tokens.view(scenes, settings.vision_tokens, -1).half().cpu().numpy()
 

@@ -13,8 +13,6 @@ from model.driving.scene import LabelledScene
 from model.driving.scene_store import count_scenes, read_scenes
 from model.evaluation.perception import Reading, format_perception, perception_rows, read_facts
 from model.network.checkpoint import load
-from model.network.perception import load_heads
-from model.network.vla import VlaConfig
 from model.training.perception_gate import format_gate, perception_gate
 from model.training.small import SmallSettings
 
@@ -30,20 +28,15 @@ def tell_perception(
     """The table of every fact as JSON and as text; with ``gate_scenes`` to learn on, the gate's too.
 
     Raises:
-        PerceptionError: the checkpoint was not grounded.
-        ValueError: no scene has a route.
+        ValueError: the checkpoint has no resampler, or no scene has a route.
     """
     loaded = load(checkpoint)
-    config: VlaConfig = loaded.model.config
-    heads = load_heads(
-        checkpoint, config.text_config.hidden_size, loaded.settings.scene_queries, loaded.codec
-    )
 
     def reading(what: str, of: Iterable[LabelledScene], count: int) -> Reading:
         # Progress goes to stderr, so that stdout holds nothing but the table.
         with Progress(console=Console(stderr=True, quiet=quiet)) as progress:
             task = progress.add_task(what, total=count)
-            return read_facts(loaded, heads, of, lambda done: progress.update(task, completed=done))
+            return read_facts(loaded, of, lambda done: progress.update(task, completed=done))
 
     read = reading("scenes", scenes, len(scenes))
     rows = perception_rows(read)

@@ -5,15 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from model.bundled import SCENES
-from model.driving.facts import FACTS, SPEED_SCALE_MS, scene_facts, weighed
+from model.driving.facts import FACTS, SPEED_SCALE_MS, scene_facts
 from model.driving.scene_store import read_scenes
 from model.evaluation.perception import Reading, auc, format_perception, perception_rows, read_facts
 from model.network.checkpoint import load
-from model.network.perception import PerceptionHeads
-from model.network.vla import VlaConfig
 from model.training.perception_gate import format_gate, perception_gate
 from model.training.small import SmallSettings
 from tests.model.network.motions import made_up_motions
@@ -92,36 +89,18 @@ def test_auc_counts_ties_half() -> None:
 
 def test_facts_are_read_from_pictures(resampling_checkpoint: Path) -> None:
     loaded = load(resampling_checkpoint)
-    config: VlaConfig = loaded.model.config
-    hidden = config.text_config.hidden_size
-    torch.manual_seed(0)
-    heads = PerceptionHeads(hidden, loaded.settings.scene_queries, loaded.codec).eval()
     done: list[int] = []
     routed = [labelled for labelled in BUNDLED if labelled.scene.route is not None]
     unrouted = replace(routed[0], scene=replace(routed[0].scene, route=None))
-    reading = read_facts(loaded, heads, [unrouted, *routed], done.append)
+    reading = read_facts(loaded, [unrouted, *routed], done.append)
     assert done[-1] == len(routed) == len(reading.read)
     np.testing.assert_array_equal(reading.true, np.stack([scene_facts(labelled) for labelled in routed]))
     assert np.isfinite(reading.read).all()
-    other = read_facts(
-        loaded, heads, [replace(routed[0], scene=replace(routed[0].scene, clips=routed[1].scene.clips))]
-    )
+    elsewhere = replace(routed[0], scene=replace(routed[0].scene, clips=routed[1].scene.clips))
+    other = read_facts(loaded, [elsewhere])
     assert np.abs(other.read[0] - reading.read[0]).max() > 1e-3
     with pytest.raises(ValueError, match="no scene has a route"):
-        read_facts(loaded, heads, [unrouted])
-
-
-def test_what_is_read_counts_as_much_as_it_is_there() -> None:
-    true = facts(4).astype(np.float32)
-    inputs = weighed(true)
-    assert np.isfinite(inputs).all()
-    np.testing.assert_array_equal(inputs[1, : FACTS.index("own_1_present")], 0.0)
-    unsure = np.nan_to_num(true)
-    unsure[0, FACTS.index("own_0_present")] = 0.5
-    place = FACTS.index("own_0_speed")
-    assert weighed(unsure)[0, place] == pytest.approx(unsure[0, place] / 2)
-    road = FACTS.index("road_left_8m")
-    assert weighed(unsure)[0, road] == unsure[0, road]
+        read_facts(loaded, [unrouted])
 
 
 def test_the_gate_tells_what_facts_are_worth(resampling_checkpoint: Path) -> None:

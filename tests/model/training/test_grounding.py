@@ -9,7 +9,6 @@ import torch
 from model.driving.facts import FACTS, mirrored
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.network.checkpoint import Loaded, load
-from model.network.perception import PerceptionError, PerceptionHeads, load_heads
 from model.training.dense import DENSE_SHAPE
 from model.training.examples import Examples
 from model.training.grounding import (
@@ -90,23 +89,3 @@ def test_what_is_gathered_depends_on_pictures_history_and_route(
     ):
         _, other = learner.gather(**{key: batch[key] for key in names} | {name: change})
         assert not torch.allclose(as_it_is, other, atol=1e-4), name
-
-
-def test_heads_are_read_back_and_foreign_ones_refused(loaded: Loaded, tmp_path: Path) -> None:
-    heads = PerceptionHeads(256, 16, loaded.codec).eval()
-    heads.save(tmp_path)
-    again = load_heads(tmp_path, 256, 16, loaded.codec)
-    gathered = torch.randn(2, 16, 256)
-    assert torch.equal(heads.read(gathered), again.read(gathered))
-    with pytest.raises(PerceptionError, match="does not fit this checkpoint"):
-        load_heads(tmp_path, 128, 16, loaded.codec)
-    (tmp_path / "perception.safetensors").write_bytes(b"no heads")
-    with pytest.raises(PerceptionError, match="does not fit"):
-        load_heads(tmp_path, 256, 16, loaded.codec)
-    with pytest.raises(PerceptionError, match="was not grounded"):
-        load_heads(tmp_path / "nowhere", 256, 16, loaded.codec)
-
-
-def test_too_few_gathered_tokens_are_refused(loaded: Loaded) -> None:
-    with pytest.raises(ValueError, match="at least 12 queries, got 4"):
-        PerceptionHeads(256, 4, loaded.codec)

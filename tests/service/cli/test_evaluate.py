@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,6 @@ from model.bundled import SCENES
 from model.driving.scene_store import read_scenes
 from model.engines.engine import Event, PlanRequest
 from model.engines.torch.engine import TorchEngine
-from model.network.checkpoint import load
-from model.network.perception import PerceptionHeads
-from model.network.vla import VlaConfig
 from service.cli.commands import app
 
 
@@ -68,23 +64,16 @@ def test_a_ladder_is_climbed_once_and_told_again(
     assert not planned & {each.scene.scene_id for each in read_scenes(SCENES)}, "all draws are kept"
 
 
-def test_perception_needs_a_grounded_checkpoint_and_tells_facts_and_gate(
-    untrained_checkpoint: Path, resampling_checkpoint: Path, tmp_path: Path
+def test_perception_needs_a_resampler_and_tells_facts_and_gate(
+    untrained_checkpoint: Path, resampling_checkpoint: Path
 ) -> None:
     asked = ["evaluate", "--perception", "--json", "--checkpoint"]
     result = CliRunner().invoke(app, [*asked, str(untrained_checkpoint)])
     assert result.exit_code == 2
-    assert "perception.safetensors" in result.output
+    assert "has no resampler" in result.output
 
-    grounded = tmp_path / "grounded"
-    shutil.copytree(resampling_checkpoint, grounded)
-    loaded = load(grounded)
-    config: VlaConfig = loaded.model.config
-    PerceptionHeads(config.text_config.hidden_size, loaded.settings.scene_queries, loaded.codec).save(
-        grounded
-    )
     gate = ["--limit", "4", "--gate-scenes", str(SCENES), "--gate-steps", "20"]
-    result = CliRunner().invoke(app, [*asked, str(grounded), *gate])
+    result = CliRunner().invoke(app, [*asked, str(resampling_checkpoint), *gate])
     assert result.exit_code == 0, result.output
     told = json.loads(result.stdout.splitlines()[-1])
     assert [row["facts"] for row in told["gate"]] == ["none", "read", "true"]
