@@ -21,6 +21,7 @@ Camera = Literal[
     "back_right",
 ]
 Thinking = Literal["adaptive", "always", "never"]
+Codes = Literal["least_error", "drawn"]
 Branch = Literal["Action:", "Thinking:"]
 Cut = Literal["skipped", "shortened", "replaced"]
 AgentKind = Literal["vehicle", "pedestrian", "cone", "barrier"]
@@ -189,6 +190,11 @@ class ReflectControls(Asked):
         ge=1,
         le=600_000,
         description="Milliseconds from the request's arrival until the answer must be there; null for none.",
+    )
+    codes: Codes = Field(
+        default="least_error",
+        description="How trajectory codes are chosen: least_error takes the one of least expected error, "
+        "drawn draws them as words are.",
     )
     bind: bool = Field(
         default=False,

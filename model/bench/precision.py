@@ -11,10 +11,10 @@ import torch
 
 from model.driving.scene import Scene
 from model.engines.engine import Controls, DrawFinished, PlanRequest
+from model.engines.sampling import probabilities, uniform
 from model.engines.torch.batch import Batch, Feed
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.runner import Prompt, Runner
-from model.engines.torch.sampler import probabilities, uniform
 from model.formats.text import parse
 from model.network.checkpoint import load
 

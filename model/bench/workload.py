@@ -27,8 +27,13 @@ class Workload:
         With the next ``step`` a planner asks again a tenth of a second later: the same pictures and seed, a
         history that has moved on.
         """
+        # Drawn, as other engines' samplers draw them.
         controls = Controls(
-            thinking=self.thinking, n=self.n, temperature=self.temperature, deadline_ms=self.deadline_ms
+            thinking=self.thinking,
+            n=self.n,
+            temperature=self.temperature,
+            deadline_ms=self.deadline_ms,
+            codes="drawn",
         )
         return [
             PlanRequest(

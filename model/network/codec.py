@@ -123,6 +123,14 @@ class TrajectoryCodec:
         trajectories[..., 3] = curves[:, 2] / HEADING_WEIGHT_M
         return trajectories
 
+    def code_distances_m(self) -> FloatArray:
+        """float32 [6, K, K]: how far two codes of a stage leave trajectories apart, in metres.
+
+        Root mean square over the horizon of x, y and weighted heading.
+        """
+        vectors = self.code_vectors()
+        return np.stack([np.linalg.norm(each[:, None] - each, axis=-1) for each in vectors])
+
     def code_vectors(self) -> FloatArray:
         """float32 [6, K, d]: what each code adds, in metres of root mean square over the horizon."""
         return self.books / np.float32(np.sqrt(FUTURE_STEPS))

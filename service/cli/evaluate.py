@@ -40,6 +40,10 @@ def evaluate(
         float | None,
         typer.Option(help="Think when the think probability exceeds it, instead of by chance.", min=0, max=1),
     ] = None,
+    codes: Annotated[
+        Literal["least_error", "drawn"],
+        typer.Option(help="Trajectory codes: of least expected error, or drawn as words are."),
+    ] = "least_error",
     bind: Annotated[
         bool, typer.Option("--bind", help="Begin only trajectories that do what their plan says.")
     ] = False,
@@ -89,7 +93,9 @@ def evaluate(
         from model.engines.engine import Controls
         from model.evaluation.kept import KeptDraws
 
-        controls = Controls(n=n, temperature=temperature, think_threshold=think_threshold, bind=bind)
+        controls = Controls(
+            n=n, temperature=temperature, think_threshold=think_threshold, codes=codes, bind=bind
+        )
         labelled = list(_evenly(read_scenes(scenes, dense=False), count_scenes(scenes), limit))
         if perception:
             from service.cli.perception import tell_perception

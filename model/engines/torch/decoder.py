@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from model.engines.binding import Binding, binding_of
+from model.engines.codes import LeastError
 from model.engines.engine import (
     DraftFinished,
     Draw,
@@ -98,6 +99,7 @@ class Decoder:
         rows_a_tree = ROWS_A_TREE if shortcuts.shared_prompts else 1
         self._scheduler, self._memory = Scheduler(runner.rows, runner.prompts, rows_a_tree), runner.memory()
         self._vocabulary = runner.loaded.vocabulary
+        self._least_error = LeastError(runner.loaded.codec, self._vocabulary)
         self.counts = Counts()
 
     @property
@@ -133,6 +135,8 @@ class Decoder:
         origin = begin(plan_request, loaded.card, self._runner.formats)
         request = Request(plan_request, origin, self._clock() if submitted_s is None else submitted_s)
         request.binding = binding or binding_of(plan_request, loaded.codec, loaded.vocabulary)
+        if plan_request.controls.codes == "least_error":
+            request.least_error = self._least_error
         request.draws_a_tree = self._scheduler.draws_a_tree(request)
         request.plant(share=self._shortcuts.shared_rows)
         if not self._scheduler.fits(request):

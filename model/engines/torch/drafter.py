@@ -18,8 +18,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from model.engines.sampling import uniform
 from model.engines.torch.rows import Row
-from model.engines.torch.sampler import uniform
 from model.formats.pieces import FormatError
 
 Ids = npt.NDArray[np.int64]

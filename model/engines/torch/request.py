@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from model.engines.binding import Binding
+from model.engines.codes import LeastError
 from model.engines.engine import Controls, Draw, PlanRequest
 from model.engines.torch.memory import Memory
 from model.engines.torch.rows import Row
@@ -106,6 +107,7 @@ class Request:
         trees: of rows that have not ended.
         drafts: by draw, until the draw is answered.
         started: whether it has left the queue once.
+        least_error: chooses the trajectory codes, unless the control ``codes`` has them drawn.
         binding: where the caller's control ``bind`` asks for it.
     """
 
@@ -118,6 +120,7 @@ class Request:
     trees: list[Tree] = field(default_factory=list)
     drafts: dict[int, Draw] = field(default_factory=dict)
     started: bool = False
+    least_error: LeastError | None = None
     binding: Binding | None = None
 
     @property

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from model.engines.engine import Event, SectionFinished, TextWritten
 from model.engines.requests import branch_of
 from model.engines.response import Response, SectionText
+from model.engines.sampling import choose, probabilities, uniforms
 from model.engines.torch.deadlines import TimeFor
-from model.engines.torch.sampler import choose, probabilities, uniforms
 from model.formats.cursor import Allowed
 from model.formats.pieces import ACTION, BRANCH, THINKING
 from model.network.vocabulary import Vocabulary
@@ -88,6 +88,9 @@ class Row(Response):
         """
         allowed = self.cursor.allowed()
         left = self._controlled(allowed, logits, time_for)
+        least = self.request.least_error
+        if least is not None and (stage := least.stage(allowed.ids)) is not None:
+            return [(int(allowed.ids[least.choose(stage, logits, left)]), self.draws)]
         ids, controls = allowed.ids[left], self.request.controls
         numbers = uniforms(controls.seed, self.draws, len(self.tokens))
         places = choose(logits[left], controls.temperature, controls.top_p, numbers)

@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from model.engines.codes import LeastError
 from model.engines.engine import (
     MAX_DRAWS,
     DrawFinished,
@@ -26,6 +28,8 @@ from model.engines.response import Response, SectionText
 from model.formats.cursor import Cursor
 from model.formats.pieces import ACTION, BRANCH, THINKING
 from model.network.checkpoint import Parts
+
+IntArray = npt.NDArray[np.int64]
 
 _SEEDS: Final = 2**63
 _FAR: Final = 700.0
@@ -70,6 +74,7 @@ class Decoding:
         grammar: what may follow a cursor, for vLLM.
         request: what is asked.
         start: where its response begins.
+        least_error: chooses trajectory codes, unless the request has them drawn.
     """
 
     def __init__(
@@ -79,8 +84,10 @@ class Decoding:
         grammar: Callable[[Cursor], str],
         request: PlanRequest,
         start: Cursor,
+        least_error: LeastError,
     ) -> None:
         self._llm, self._parts, self._grammar = llm, parts, grammar
+        self._least_error = least_error if request.controls.codes == "least_error" else None
         self._request, self._start = request, start
         self._happened: asyncio.Queue[Event | Exception] = asyncio.Queue()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -155,15 +162,22 @@ class Decoding:
             temperature=controls.temperature,
             top_p=controls.top_p,
             seed=seed_of(controls.seed, first.index, len(first.tokens)),
-            max_tokens=first.cursor.compiled.longest(),
-            logprob_token_ids=self._branch_ids(first),
+            max_tokens=1 if self._stage(first) is not None else first.cursor.compiled.longest(),
+            logprob_token_ids=self._weighed_ids(first),
             structured_outputs=StructuredOutputsParams(grammar=self._grammar(first.cursor)),
             detokenize=False,
             output_kind=RequestOutputKind.DELTA,
         )
 
-    def _branch_ids(self, draw: _Walk) -> list[int] | None:
-        """The tokens whose probabilities decide the branch, where it is still to come."""
+    def _stage(self, draw: _Walk) -> int | None:
+        """Whose codes are to be weighed next; None where vLLM's own choice stands."""
+        return None if self._least_error is None else self._least_error.stage(draw.cursor.allowed().ids)
+
+    def _weighed_ids(self, draw: _Walk) -> list[int] | None:
+        """The tokens whose probabilities decide: codes that come next, or a branch that is to come."""
+        if self._stage(draw) is not None:
+            ids: list[int] = draw.cursor.allowed().ids.tolist()
+            return ids
         compiled = draw.cursor.compiled
         if draw.think_probability is not None or BRANCH not in compiled.format.sections():
             return None
@@ -172,25 +186,32 @@ class Decoding:
     def _walk(self, draw: _Walk, tokens: Sequence[int], logprobs: Sequence[Mapping[int, Any]] | None) -> bool:
         """Write what vLLM wrote; False when the draw is done, or goes on elsewhere."""
         for place, token in enumerate(tokens):
+            allowed, wanted, stage = draw.cursor.allowed(), token, self._stage(draw)
+            weighed = None if logprobs is None else logprobs[place]
+            if stage is not None and not _weighs(weighed, allowed.ids):
+                break
             draw.passes += 1
-            allowed, wanted = draw.cursor.allowed(), token
             if allowed.choice == BRANCH and len(allowed.ids) > 1:
-                assert logprobs is not None
-                wanted = self._decide(draw, token, logprobs[place])
+                assert weighed is not None
+                wanted = self._decide(draw, token, weighed)
+            if stage is not None:
+                wanted = self._code(stage, allowed.ids, weighed)
             fits = wanted in allowed.ids
             if fits:
                 self._tell(draw, draw.append(wanted, self._parts.vocabulary))
                 if self._request.live and (new := draw.new_text(self._parts.vocabulary)):
                     self._happened.put_nowait(TextWritten(draw.index, *new))
-            if fits and wanted == token and not draw.cursor.ending:
+            if stage is None and fits and wanted == token and not draw.cursor.ending:
                 continue
             self._tell(draw, draw.append_forced(self._parts.vocabulary))
             if draw.cursor.done:
                 self._finish(draw)
-            else:
-                self._go_on([draw])
-            return False
-        return True
+                return False
+            break
+        else:
+            return True
+        self._go_on([draw])
+        return False
 
     def _decide(self, draw: _Walk, token: int, logprobs: Mapping[int, Any]) -> int:
         """At the branch: the token that the controls decide for, vLLM's own where they leave it open."""
@@ -199,6 +220,13 @@ class Decoding:
         draw.think_probability = 1 / (1 + math.exp(min(action - thinking, _FAR)))
         branch = self._request.controls.branch(draw.think_probability)
         return token if branch is None else options[branch]
+
+    def _code(self, stage: int, ids: IntArray, weighed: Mapping[int, Any] | None) -> int:
+        """The code of least expected error among ``ids``, whose log-probabilities vLLM told."""
+        assert self._least_error is not None
+        assert weighed is not None
+        logits = np.array([weighed[int(id)].logprob for id in ids])
+        return int(ids[self._least_error.choose(stage, logits)])
 
     def _finish(self, draw: _Walk) -> None:
         for finished in read(
@@ -214,3 +242,8 @@ class Decoding:
     def _tell(self, draw: _Walk, sections: Iterable[SectionText]) -> None:
         for section in sections:
             self._happened.put_nowait(SectionFinished(draw.index, *section))
+
+
+def _weighs(weighed: Mapping[int, Any] | None, ids: IntArray) -> bool:
+    """Whether vLLM was asked for the probabilities of all ``ids``."""
+    return weighed is not None and all(int(id) in weighed for id in ids)

@@ -16,6 +16,7 @@ import numpy as np
 
 from model.driving.images import ImageError
 from model.driving.scene import Scene
+from model.engines.codes import LeastError
 from model.engines.engine import EngineError, Event, Load, ModelCard, PlanRequest, RequestError
 from model.engines.pictures import PictureThreads
 from model.engines.requests import begin
@@ -69,6 +70,7 @@ class VllmEngine:
         self._formats = {
             name: CompiledFormat(FORMATS[name], self._parts.vocabulary) for name in self._card.formats
         }
+        self._least_error = LeastError(self._parts.codec, self._parts.vocabulary)
         self._llm: Any = None
         self._running: dict[str, Decoding] = {}
         self._pictures = PictureThreads()
@@ -142,7 +144,7 @@ class VllmEngine:
             raise RequestError("deadline_ms needs the torch engine: vLLM cannot cut a text short and go on")
         if request.controls.bind:
             raise RequestError("bind needs the torch engine: vLLM has no grammar that depends on the plan")
-        decoding = Decoding(llm, self._parts, self._grammar_of, request, start)
+        decoding = Decoding(llm, self._parts, self._grammar_of, request, start, self._least_error)
         self._running[request.request_id] = decoding
         try:
             prompt = await self._pictures.run(lambda: self.prompt(request.scene, request.format))

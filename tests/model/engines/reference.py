@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from transformers import DynamicCache
 
 from model.engines.binding import binding_of
+from model.engines.codes import LeastError
 from model.engines.engine import Draw, PlanRequest
-from model.engines.torch.sampler import choose, probabilities, uniform
+from model.engines.sampling import choose, probabilities, uniform
 from model.formats.cf_vla import FORMATS
 from model.formats.cursor import CompiledFormat, Token
 from model.formats.pieces import BRANCH, Format
@@ -88,6 +89,7 @@ def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> t
     cursor = compiled.start(given)
     tokens: list[Token] = []
     binding = binding_of(request, loaded.codec, loaded.vocabulary)
+    least = LeastError(loaded.codec, loaded.vocabulary)
     think_probability = None
     shares: Shares = {}
     while not cursor.done:
@@ -105,8 +107,13 @@ def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> t
                 left = thinks == (think_probability > controls.think_threshold)
         if binding is not None and (bound := binding.leaves(allowed.ids, tokens)) is not None:
             left = bound
+        stage = least.stage(allowed.ids) if controls.codes == "least_error" else None
         number = np.array([uniform(controls.seed, index, len(tokens))])
-        token = int(allowed.ids[left][choose(scores[left], controls.temperature, controls.top_p, number)[0]])
+        if stage is None:
+            place = choose(scores[left], controls.temperature, controls.top_p, number)[0]
+            token = int(allowed.ids[left][place])
+        else:
+            token = int(allowed.ids[least.choose(stage, scores, left)])
         place = len(inputs.prompt.ids) + len(tokens)
         tokens.append(Token(token, cursor.section))
         cursor = cursor.advance(token)

@@ -8,10 +8,10 @@ import pytest
 
 from model.engines.engine import Controls, PlanRequest
 from model.engines.requests import branch_of
+from model.engines.sampling import uniform
 from model.engines.torch.drafter import _CONTEXTS, Drafter, _Ngrams, _Responses
 from model.engines.torch.request import Request, Tree
 from model.engines.torch.rows import Row
-from model.engines.torch.sampler import uniform
 from model.formats.cf_vla import CF_VLA
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import BRANCH, THINKING

@@ -26,12 +26,12 @@ from hypothesis import strategies as st
 
 from model.driving.plan import plan_from_bins
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thinking
+from model.engines.sampling import probabilities
 from model.engines.torch.deadlines import TimeFor
 from model.engines.torch.decoder import Decoder, Failed
 from model.engines.torch.request import Request
 from model.engines.torch.rows import Row
 from model.engines.torch.runner import Prompt, Runner
-from model.engines.torch.sampler import probabilities
 from model.engines.torch.shortcuts import Shortcuts
 from model.formats.cf_vla import FORMATS
 from model.formats.pieces import Format
@@ -107,6 +107,7 @@ def arrivals(draw: st.DrawFn) -> list[Arrival]:
             temperature=draw(st.sampled_from([0.0, 0.2, 0.7, 1.0, 1.5])),
             top_p=draw(st.sampled_from([1.0, 0.9, 0.5])),
             seed=draw(st.integers(0, 1000)),
+            codes=draw(st.sampled_from(["least_error", "drawn"])),
             # The clock stands still: deadlines only decide who gives way to whom, and make drafts.
             deadline_ms=draw(st.sampled_from([None, None, 2_000, 3_000])),
         )

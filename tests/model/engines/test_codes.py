@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model.engines.codes import LeastError
+from model.engines.sampling import probabilities
+from model.engines.torch.decoder import Decoder
+from model.engines.torch.runner import Runner
+from model.network.checkpoint import Loaded, load
+from tests.checkpoints import noisy_scene
+from tests.model.engines.decoding import decode, request
+from tests.model.engines.reference import reference_draws
+
+
+@pytest.fixture(scope="module")
+def loaded(untrained_checkpoint: Path) -> Loaded:
+    return load(untrained_checkpoint)
+
+
+@pytest.fixture(scope="module")
+def least(loaded: Loaded) -> LeastError:
+    return LeastError(loaded.codec, loaded.vocabulary)
+
+
+def test_distances_are_those_of_trajectories(loaded: Loaded) -> None:
+    codec = loaded.codec
+    history = noisy_scene(0).history
+    one, other = codec.decode(history[None].repeat(2, axis=0), [[3, 0, 0, 0, 0, 0], [7, 0, 0, 0, 0, 0]])
+    apart = one - other
+    squares = apart[:, 0] ** 2 + apart[:, 1] ** 2 + (apart[:, 3] * 4.5 / 3) ** 2
+    told = codec.code_distances_m()[0]
+    assert told[3, 7] == pytest.approx(np.sqrt(squares.mean()), rel=0.05)
+    assert told[3, 3] == 0
+
+
+@given(st.integers(0, 5), st.integers(0, 2**32 - 1))
+def test_no_other_code_is_expected_to_be_off_less(
+    loaded: Loaded, least: LeastError, stage: int, seed: int
+) -> None:
+    random = np.random.default_rng(seed)
+    logits = 3 * random.normal(size=loaded.codec.size)
+    left = random.random(len(logits)) < 0.5
+    left[0] = True
+    distances = loaded.codec.code_distances_m()[stage]
+    place = least.choose(stage, logits, left)
+    assert left[place]
+    believed = probabilities(logits[left])
+    expected = distances[left][:, left] @ believed
+    assert believed @ distances[left, place] == pytest.approx(expected.min(), abs=1e-6)
+
+
+def test_codes_are_told_from_words(loaded: Loaded, least: LeastError) -> None:
+    for stage in range(6):
+        ids = loaded.vocabulary.code_ids(stage)
+        assert least.stage(np.array(ids)) == stage
+        assert least.stage(np.array(ids[:2])) is None
+    assert least.stage(np.arange(loaded.codec.size)) is None
+
+
+@pytest.mark.usefixtures("inference")
+def test_draws_with_one_plan_end_alike_unless_codes_are_drawn(exact: Loaded) -> None:
+    asked = request("least", 1, "traj_only", n=4)
+    draws = decode(Decoder(Runner(exact, 8)), asked, request("drawn", 1, "traj_only", n=4, codes="drawn"))
+    least = [draws["least", index].codes for index in range(4)]
+    assert len(set(least)) == 1
+    assert least == [draw.codes for draw in reference_draws(exact, asked)]
+    assert len({draws["drawn", index].codes for index in range(4)}) > 1
