@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import io
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from clients.metadrive.actors import STEP_S
 from clients.metadrive.annotate import to_ego
 from clients.metadrive.drive import Shot
+from clients.metadrive.lettering import Colour, write_in_box
 from model.driving.cameras import FRONT_CAMERAS, CameraSpec
 from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
 from model.driving.trajectory import FloatArray
 
-_SCALE: Final = 3
-_PANEL_PX: Final = 250
+_CAMERA_PX: Final = 560
+_ABOVE_PX: Final = 300
+_TEXT_PX: Final = 330
+_MARGIN_PX: Final = 14
+_LETTERS_PX: Final = 17
 _METRES_AHEAD: Final = 60.0
-_CHOSEN, _OTHER, _INK, _PAPER = (232, 119, 34), (120, 160, 205), (235, 235, 235), (28, 32, 38)
+_METRES_BEHIND: Final = 15.0
+_CHOSEN: Final = (232, 119, 34)
+_OTHER: Final = (120, 160, 205)
+_INK: Final = (235, 235, 235)
+_PAPER: Final = (28, 32, 38)
 _KINDS: Final = {
     "vehicle": (150, 60, 60),
     "pedestrian": (240, 200, 60),
@@ -29,81 +36,89 @@ _KINDS: Final = {
     "barrier": (240, 140, 40),
 }
 _FRAME_MS: Final = 400
-_LINE: Final = 62
+_COLOURS: Final = 255
 
 
 class Film:
-    """Gathers frames; write them with `save`."""
+    """Gathers frames; write them with `save`.
+
+    A frame shows both cameras, beside them the road from above and the plan in words.
+    """
 
     def __init__(self) -> None:
         self._frames: list[Image.Image] = []
-        self._font = ImageFont.load_default(size=14)
 
     def add(self, shot: Shot) -> None:
         """One moment."""
-        spec = FRONT_CAMERAS[0]
-        wide = next(picture for picture in shot.pictures if picture.camera == spec.name)
-        view = Image.open(io.BytesIO(wide.jpeg)).convert("RGB")
-        view = view.resize((spec.width * _SCALE, spec.height * _SCALE), Image.Resampling.BICUBIC)
-        draw = ImageDraw.Draw(view)
-        if shot.planned is not None:
-            for trajectory in shot.planned.others:
-                _line_in_view(draw, spec, trajectory, _OTHER, 1)
-            _line_in_view(draw, spec, shot.planned.trajectory, _CHOSEN, 3)
-        above = _from_above(shot, view.height)
-        frame = Image.new("RGB", (view.width + above.width, view.height + _PANEL_PX), _PAPER)
-        frame.paste(view, (0, 0))
-        frame.paste(above, (view.width, 0))
-        self._write(ImageDraw.Draw(frame), shot, view.height + 10)
+        views = [_view(shot, spec.resized(_CAMERA_PX)) for spec in FRONT_CAMERAS]
+        height = sum(view.height for view in views)
+        frame = Image.new("RGB", (_CAMERA_PX + _ABOVE_PX + _TEXT_PX, height), _PAPER)
+        for row, view in enumerate(views):
+            frame.paste(view, (0, row * view.height))
+        frame.paste(_from_above(shot, _ABOVE_PX, height), (_CAMERA_PX, 0))
+        left = _CAMERA_PX + _ABOVE_PX + _MARGIN_PX
+        box = (left, _MARGIN_PX, frame.width - _MARGIN_PX, height - _MARGIN_PX)
+        write_in_box(ImageDraw.Draw(frame), box, _words(shot), _LETTERS_PX)
         self._frames.append(frame)
 
     def save(self, path: Path) -> None:
         """Write an animated GIF; raises `ValueError` without frames."""
         if not self._frames:
             raise ValueError("a film needs at least one frame")
-        first, *others = (frame.quantize(96) for frame in self._frames)
+        first, *others = (frame.quantize(_COLOURS) for frame in self._frames)
         first.save(path, save_all=True, append_images=others, duration=_FRAME_MS, loop=0, optimize=True)
 
-    def _write(self, draw: ImageDraw.ImageDraw, shot: Shot, top: int) -> None:
-        ego = shot.log.ego[shot.step]
-        head = f"{shot.driver}    {shot.step * STEP_S:4.1f} s    {ego[3] * 3.6:3.0f} km/h"
-        draw.text((12, top), head, fill=_INK, font=self._font)
-        if shot.planned is None:
-            return
-        words = shot.planned.words.replace("- ", "").replace("\n  ", "\n   ")
-        draw.multiline_text((12, top + 24), words, fill=_INK, font=self._font, spacing=2)
-        told = shot.planned.thinking or "(no second look)"
-        draw.multiline_text(
-            (300, top + 24), textwrap.fill(told, _LINE), fill=_CHOSEN if shot.planned.thinking else _OTHER,
-            font=self._font, spacing=4,
-        )  # fmt: skip
+
+def _words(shot: Shot) -> list[tuple[str, Colour]]:
+    """The paragraphs beside the pictures, with their colours."""
+    ego = shot.log.ego[shot.step]
+    told = [(f"{shot.driver} · {shot.step * STEP_S:.1f} s · {ego[3] * 3.6:.0f} km/h", _INK), ("", _INK)]
+    if shot.planned is None:
+        return told
+    plan = shot.planned.words.replace("  - ", "    ").replace("- ", "").rstrip()
+    thinking = shot.planned.thinking
+    look = (f"Second look: {thinking}", _CHOSEN) if thinking else ("No second look.", _OTHER)
+    return [*told, (plan, _INK), ("", _INK), look]
+
+
+def _view(shot: Shot, spec: CameraSpec) -> Image.Image:
+    """A camera's picture with the trajectories on the road."""
+    taken = next(picture for picture in shot.pictures if picture.camera == spec.name)
+    view = Image.open(io.BytesIO(taken.jpeg)).convert("RGB")
+    view = view.resize((spec.width, spec.height), Image.Resampling.BICUBIC)
+    draw = ImageDraw.Draw(view)
+    if shot.planned is not None:
+        for trajectory in shot.planned.others:
+            _line_in_view(draw, spec, trajectory, _OTHER, 1)
+        _line_in_view(draw, spec, shot.planned.trajectory, _CHOSEN, 3)
+    return view
 
 
 def _line_in_view(
     draw: ImageDraw.ImageDraw,
     spec: CameraSpec,
     trajectory: FloatArray,
-    colour: tuple[int, int, int],
+    colour: Colour,
     width: int,
 ) -> None:
     """A trajectory on the road, as the camera would see it."""
     ground = np.column_stack([trajectory[:, :2], np.zeros(len(trajectory))])
     column, row, depth = spec.project(ground).T
     seen = depth > 1.0
-    points = [(float(x) * _SCALE, float(y) * _SCALE) for x, y in zip(column[seen], row[seen], strict=True)]
+    points = [(float(x), float(y)) for x, y in zip(column[seen], row[seen], strict=True)]
     if len(points) > 1:
         draw.line(points, fill=colour, width=width, joint="curve")
 
 
-def _from_above(shot: Shot, height: int) -> Image.Image:
+def _from_above(shot: Shot, width: int, height: int) -> Image.Image:
     """Lanes, others and trajectories from above, the way ahead upwards."""
-    scale = height / (_METRES_AHEAD + 15.0)
-    image = Image.new("RGB", (int(0.8 * height), height), (52, 58, 66))
+    scale = height / (_METRES_AHEAD + _METRES_BEHIND)
+    image = Image.new("RGB", (width, height), (52, 58, 66))
     draw = ImageDraw.Draw(image)
     ego = shot.log.ego[shot.step]
 
     def place(points: Sequence[Sequence[float]] | np.ndarray) -> list[tuple[float, float]]:
-        return [(image.width / 2 - y * scale, height - (x + 15.0) * scale) for x, y in points]
+        return [(image.width / 2 - y * scale, height - (x + _METRES_BEHIND) * scale) for x, y in points]
 
     for lane in shot.log.road_map.lanes:
         near = to_ego(lane.centre, ego)

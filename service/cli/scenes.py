@@ -102,7 +102,7 @@ def import_(
                 f"{folder} holds no scene: that takes four pictures of each camera half a second apart, and "
                 "poses from 1.5 s before the last of them to 6.4 s after it"
             )
-        typer.echo(f"{count} scenes in {out}")
+        typer.echo(f"{count} {'scene' if count == 1 else 'scenes'} in {out}")
 
 
 def _recordings(folder: Path, told: list[str], width: int) -> Iterable[Recording]:
@@ -178,7 +178,7 @@ def show(
         from model.driving.scene_store import read_scenes
 
         out.parent.mkdir(parents=True, exist_ok=True)
-        contact_sheet(islice(read_scenes(path, dense=False), 0, limit * every, every), out)
+        contact_sheet(islice(read_scenes(path), 0, limit * every, every), out)
         typer.echo(str(out))
 
 

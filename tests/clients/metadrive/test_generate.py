@@ -7,8 +7,10 @@ import multiprocessing
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -129,4 +131,14 @@ def test_a_contact_sheet_shows_every_scene(filmed: Filmed, tmp_path: Path) -> No
     contact_sheet(filmed.scenes[:2], tmp_path / "two.png", columns=2)
     with Image.open(tmp_path / "three.png") as three, Image.open(tmp_path / "two.png") as two:
         assert three.width == two.width
-        assert three.height == 2 * two.height
+        assert 1.8 * two.height < three.height < 2 * two.height  # two rows, one legend
+
+
+def test_a_contact_sheet_leaves_no_room_for_what_is_not_there(filmed: Filmed, tmp_path: Path) -> None:
+    assert filmed.scenes[0].dense
+    contact_sheet(filmed.scenes[:1], tmp_path / "dense.png")
+    contact_sheet([replace(filmed.scenes[0], dense=())], tmp_path / "plain.png")
+    with Image.open(tmp_path / "dense.png") as dense, Image.open(tmp_path / "plain.png") as plain:
+        assert plain.width < dense.width
+        white = (np.asarray(plain.convert("L")) == 255).mean(axis=0)
+    assert (white < 0.5).all()
