@@ -1,12 +1,18 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from PIL import Image
 
-from tests.browser.pictures import INSPECTOR, KEY, PLAN, revision
+from tests.browser.pictures import FOLDER, INSPECTOR, KEY, PLAN, revision
 
 
 @pytest.mark.parametrize("path", [PLAN, INSPECTOR], ids=lambda path: str(path.name))
-def test_pictures_show_the_checkpoint_that_is_shipped(path: object) -> None:
-    with Image.open(str(path)) as picture:
+def test_pictures_show_the_checkpoint_that_is_shipped(path: Path) -> None:
+    with Image.open(path) as picture:
         assert picture.info.get(KEY) == revision(), "make pictures"
+
+
+def test_no_picture_is_made_by_hand() -> None:
+    assert set(FOLDER.iterdir()) == {PLAN, INSPECTOR}
