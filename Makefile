@@ -13,13 +13,17 @@ VLLM_PIP := $(VLLM_BIN)/pip install --quiet --disable-pip-version-check -c deplo
 # What vLLM's CPU build brings along but never imports there, and what is linked to CUDA.
 VLLM_UNUSED := torchaudio torchcodec triton
 
-.PHONY: plan test check lint-api pictures deploy-check sim vllm test-vllm system-packages clean
+.PHONY: plan test test-readme check lint-api pictures deploy-check sim vllm test-vllm system-packages clean
 
 plan: $(VENV)/.serve
 	$(BIN)/looktwice plan
 
 test: $(VENV)/.dev $(BIN)/promtool system-packages check
 	$(BIN)/python -m pytest
+
+# README and docs/own-cameras.md to the letter, in a clean clone of the commit that is checked out; takes minutes.
+test-readme:
+	$(PYTHON) -m tests.docs.clean_clone
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -1,0 +1,201 @@
+"""`make test-readme`: the README and docs/own-cameras.md followed to the letter in a clean clone.
+
+It clones the commit that is checked out and runs every block of commands in order, against the real service. The
+README's Python runs in an environment that holds nothing but what the README names. Of every command that the
+README lists it asks for the help. This takes a network and minutes, so `make test` leaves it out. It makes the
+environments itself, so it needs nothing but Python.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import product, takewhile
+from pathlib import Path
+from typing import Final
+from urllib.error import URLError
+from urllib.request import urlopen
+
+ROOT: Final = Path(__file__).parents[2]
+PORT: Final = 8000
+ELSEWHERE: Final = {"make test"}
+"""What continuous integration runs in a clean clone anyway, and takes half an hour."""
+ACTIVATE: Final = "source .venv/bin/activate"
+SERVE: Final = "looktwice serve"
+_READY_S: Final = 120.0
+_LONGEST_S: Final = 1800.0
+_STOP_S: Final = 60.0
+_COLUMNS: Final = 200
+"""So that no option's name is cut in a help text."""
+
+
+class Faulty(Exception):
+    """A command that does not do what the page says."""
+
+
+def blocks(page: str) -> list[tuple[str, str]]:
+    """Language and text of a page's fenced blocks."""
+    return re.findall(r"^```(\w*)\n(.*?)^```", page, re.S | re.M)
+
+
+def lines(block: str) -> list[str]:
+    """A block's commands: without comments, continued lines joined."""
+    bare = (re.sub(r"\s+#.*", "", line) for line in block.replace("\\\n", " ").splitlines())
+    return [" ".join(line.split()) for line in bare if line.strip()]
+
+
+def listed(page: str) -> list[tuple[str, list[str]]]:
+    """The `looktwice` commands that a page's text names, alternatives one by one, and the options it shows."""
+    text = re.sub(r"^```.*?^```", "", page, flags=re.S | re.M).replace("\\|", "|")
+    found = []
+    for words in re.findall(r"`looktwice ([^`]+)`", text):
+        names = takewhile(lambda word: re.fullmatch(r"[a-z|-]+", word) and word[0] != "-", words.split())
+        options = re.findall(r"--[a-z-]+", words)
+        found += [(" ".join(each), options) for each in product(*(name.split("|") for name in names))]
+    return found
+
+
+class Newcomer:
+    """Somebody in a folder, with a shell that remembers whether the environment was activated."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.activated = False
+
+    def environment(self) -> dict[str, str]:
+        kept = {
+            name: value for name, value in os.environ.items() if name not in ("VIRTUAL_ENV", "PYTHONPATH")
+        }
+        venv = Path(sys.prefix)
+        paths = [path for path in kept["PATH"].split(":") if Path(path) != venv / "bin"]
+        if self.activated:
+            paths.insert(0, str(self.folder / ".venv" / "bin"))
+        return kept | {"PATH": ":".join(paths), "COLUMNS": str(_COLUMNS)}
+
+    def run(self, command: str, *, folder: Path | None = None) -> str:
+        """Run a command to its end and say how long it took; raises `Faulty` where it fails."""
+        began = time.monotonic()
+        done = subprocess.run(
+            ["bash", "-c", command],
+            cwd=folder or self.folder,
+            env=self.environment(),
+            text=True,
+            timeout=_LONGEST_S,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            check=False,
+        )
+        print(f"{time.monotonic() - began:6.1f} s  {command.splitlines()[0][:110]}", flush=True)
+        if done.returncode:
+            raise Faulty(f"{command}\nended with {done.returncode}:\n{done.stdout[-3000:]}")
+        return done.stdout
+
+    @contextmanager
+    def service(self) -> Iterator[None]:
+        """The service, started as the README says; ended as Ctrl-C ends it."""
+        began = time.monotonic()
+        with tempfile.TemporaryFile("w+") as log:
+            running = subprocess.Popen(
+                SERVE.split(), cwd=self.folder, env=self.environment(), stdout=log, stderr=log
+            )
+            try:
+                while not _is_ready():
+                    if running.poll() is not None or time.monotonic() - began > _READY_S:
+                        log.seek(0)
+                        raise Faulty(f"{SERVE} does not get ready:\n{log.read()[-3000:]}")
+                    time.sleep(0.2)
+                print(f"{time.monotonic() - began:6.1f} s  {SERVE}, until it is ready", flush=True)
+                yield
+            finally:
+                running.send_signal(signal.SIGINT)
+                code = running.wait(_STOP_S)
+        if code:
+            raise Faulty(f"{SERVE} ended with {code}")
+
+
+def _is_ready() -> bool:
+    try:
+        with urlopen(f"http://localhost:{PORT}/readyz", timeout=5) as answer:
+            return bool(answer.status == 200)
+    except (URLError, OSError):
+        return False
+
+
+def run_block(newcomer: Newcomer, block: str) -> None:
+    """A block of commands, one after the other."""
+    for command in lines(block):
+        if command == ACTIVATE:
+            newcomer.run(command)
+            newcomer.activated = True
+        elif command == SERVE or command in ELSEWHERE:
+            continue
+        else:
+            asks = command.startswith("curl -s ")
+            told = newcomer.run(command.replace("curl -s ", "curl -s --fail-with-body ", 1))
+            if asks and '"draws"' not in told:
+                raise Faulty(f"{command}\nanswers without draws:\n{told[:1000]}")
+
+
+def follow_readme(newcomer: Newcomer) -> None:
+    """Everything in the README."""
+    page = (newcomer.folder / "README.md").read_text()
+    rest = [(language, block) for language, block in blocks(page) if language in ("bash", "python")]
+    while not newcomer.activated:
+        run_block(newcomer, rest.pop(0)[1])
+    assert rest, "nothing behind the service"
+    for command, options in listed(page):
+        told = newcomer.run(f"looktwice {command} --help")
+        if missing := [option for option in options if option not in told]:
+            raise Faulty(f"looktwice {command} has no {', '.join(missing)}")
+    for target in sorted(set(re.findall(r"`make ([a-z-]+)`", page))):
+        newcomer.run(f"make --dry-run {target}")
+    with newcomer.service():
+        for language, block in rest:
+            if language == "bash":
+                run_block(newcomer, block)
+            else:
+                run_python(newcomer, block)
+
+
+def run_python(newcomer: Newcomer, code: str) -> None:
+    """A snippet in an environment with the client alone, outside the clone."""
+    folder = newcomer.folder.parent / "client"
+    if not folder.exists():
+        newcomer.run(f"python3 -m venv {folder}/.venv")
+        newcomer.run(f"{folder}/.venv/bin/pip install --quiet -c constraints.txt . pyarrow")
+    (folder / "snippet.py").write_text(code)
+    told = newcomer.run(".venv/bin/python snippet.py", folder=folder)
+    if "done" not in told:
+        raise Faulty(f"the snippet says:\n{told[-1000:]}")
+
+
+def main() -> None:
+    """Follow both pages; the exit status says whether all went as they say."""
+    with socket.socket() as probe:
+        if not probe.connect_ex(("localhost", PORT)):
+            sys.exit(f"something listens at port {PORT} already")
+    with tempfile.TemporaryDirectory() as folder:
+        newcomer = Newcomer(Path(folder))
+        try:
+            newcomer.run(f"git clone --quiet {ROOT} looktwice")
+            newcomer.folder /= "looktwice"
+            follow_readme(newcomer)
+            began = time.monotonic()
+            for language, block in blocks((newcomer.folder / "docs" / "own-cameras.md").read_text()):
+                if language == "bash":
+                    run_block(newcomer, block)
+            print(f"{time.monotonic() - began:6.1f} s  docs/own-cameras.md in all", flush=True)
+        except Faulty as fault:
+            sys.exit(str(fault))
+
+
+if __name__ == "__main__":
+    main()
