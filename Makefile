@@ -13,22 +13,33 @@ VLLM_PIP := $(VLLM_BIN)/pip install --quiet --disable-pip-version-check -c deplo
 # What vLLM's CPU build brings along but never imports there, and what is linked to CUDA.
 VLLM_UNUSED := torchaudio torchcodec triton
 
-.PHONY: plan test test-readme check lint-api pictures deploy-check sim vllm test-vllm system-packages clean
+# No browser, no simulator, no Ray, no trained model: under two minutes on one core.
+FAST_TESTS := tests/model/formats tests/model/driving tests/service
+NOT_FAST := tests/service/cli tests/service/vllm tests/service/test_fuzz.py
+
+.PHONY: plan test test-fast test-readme lint docs lint-api pictures deploy-check sim vllm test-vllm system-packages clean
 
 plan: $(VENV)/.serve
 	$(BIN)/looktwice plan
 
-test: $(VENV)/.dev $(BIN)/promtool system-packages check
+test: $(VENV)/.dev $(BIN)/promtool system-packages lint
 	$(BIN)/python -m pytest
+
+test-fast: $(VENV)/.dev
+	$(BIN)/python -m pytest -q $(FAST_TESTS) $(NOT_FAST:%=--ignore=%)
 
 # README and docs/own-cameras.md to the letter, in a clean clone of the commit that is checked out; takes minutes.
 test-readme:
 	$(PYTHON) -m tests.docs.clean_clone
 
-check: $(VENV)/.dev
+lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# The pages of docs/ as a site in build/site (mkdocs.yml).
+docs: $(VENV)/.dev
+	$(BIN)/mkdocs build
 
 # Our API's description by somebody else's rules (.spectral.yaml); takes npm.
 lint-api: $(VENV)/.dev

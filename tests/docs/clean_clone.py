@@ -1,9 +1,9 @@
 """`make test-readme`: the README and docs/own-cameras.md followed to the letter in a clean clone.
 
-It clones the commit that is checked out and runs every block of commands in order, against the real service. The
-README's Python runs in an environment that holds nothing but what the README names. Of every command that the
-README lists it asks for the help. This takes a network and minutes, so `make test` leaves it out. It makes the
-environments itself, so it needs nothing but Python.
+It clones the commit that is checked out and runs every block of commands in order, against the real service.
+The README's Python runs in an environment that holds nothing but what the README names. Of every command that
+the README lists it asks for the help. This takes a network and minutes, so `make test` leaves it out. Nothing
+but Python is needed, since the environments are made on the way.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def lines(block: str) -> list[str]:
 
 
 def listed(page: str) -> list[tuple[str, list[str]]]:
-    """The `looktwice` commands that a page's text names, alternatives one by one, and the options it shows."""
+    """The `looktwice` commands in a page's text, alternatives one by one, and the options it shows."""
     text = re.sub(r"^```.*?^```", "", page, flags=re.S | re.M).replace("\\|", "|")
     found = []
     for words in re.findall(r"`looktwice ([^`]+)`", text):
