@@ -151,6 +151,7 @@ def follow_readme(newcomer: Newcomer) -> None:
     while not newcomer.activated:
         run_block(newcomer, rest.pop(0)[1])
     assert rest, "nothing behind the service"
+    check_pins(newcomer)
     for command, options in listed(page):
         told = newcomer.run(f"looktwice {command} --help")
         if missing := [option for option in options if option not in told]:
@@ -163,6 +164,21 @@ def follow_readme(newcomer: Newcomer) -> None:
                 run_block(newcomer, block)
             else:
                 run_python(newcomer, block)
+
+
+def check_pins(newcomer: Newcomer) -> None:
+    """Everything that was installed has its version in constraints.txt."""
+    pinned = {_package(line) for line in (newcomer.folder / "constraints.txt").read_text().splitlines()}
+    installed = newcomer.run("pip list --format=freeze --exclude-editable --disable-pip-version-check")
+    loose = (
+        {_package(line) for line in installed.splitlines() if "==" in line} - pinned - {"pip", "setuptools"}
+    )
+    if loose:
+        raise Faulty(f"not pinned in constraints.txt: {', '.join(sorted(loose))}")
+
+
+def _package(line: str) -> str:
+    return re.sub(r"[-_.]+", "-", line.partition("==")[0]).lower()
 
 
 def run_python(newcomer: Newcomer, code: str) -> None:
