@@ -62,9 +62,10 @@ def main() -> None:
     path, count = Path(sys.argv[1]), int(sys.argv[2])
     differing = Counter(dict.fromkeys(WAYS, 0))
     with serve(TorchEngine(CHECKPOINT), Settings()) as served:
-        for labelled in islice(read_scenes(path, dense=False), count):
+        for done, labelled in enumerate(islice(read_scenes(path, dense=False), count), 1):
             differing.update(compare(served.http, labelled.scene))
-    print(f"draws of {count} scenes that differ: {dict(differing)}")
+            if done in (1, count) or done % 10 == 0:
+                print(f"draws of {done} scenes that differ: {dict(differing)}", flush=True)
 
 
 if __name__ == "__main__":
