@@ -13,9 +13,10 @@ VLLM_PIP := $(VLLM_BIN)/pip install --quiet --disable-pip-version-check -c deplo
 # What vLLM's CPU build brings along but never imports there, and what is linked to CUDA.
 VLLM_UNUSED := torchaudio torchcodec triton
 
-# No browser, no simulator, no Ray, no trained model: under two minutes on one core.
+# No browser, no simulator, no Ray, no processes of the service, no long oracle: under two minutes on one core.
 FAST_TESTS := tests/model/formats tests/model/driving tests/service
-NOT_FAST := tests/service/cli tests/service/vllm tests/service/test_fuzz.py
+NOT_FAST := $(addprefix tests/service/,cli vllm test_connection.py test_fuzz.py test_server.py test_trust.py test_views.py) \
+	tests/model/driving/pdm/test_oracle.py tests/model/formats/test_grammar_export.py
 
 .PHONY: plan test test-fast test-readme lint docs lint-api pictures deploy-check sim vllm test-vllm system-packages clean
 
@@ -26,7 +27,7 @@ test: $(VENV)/.dev $(BIN)/promtool system-packages lint
 	$(BIN)/python -m pytest
 
 test-fast: $(VENV)/.dev
-	$(BIN)/python -m pytest -q $(FAST_TESTS) $(NOT_FAST:%=--ignore=%)
+	$(BIN)/python -m pytest -q $(FAST_TESTS) $(addprefix --ignore=,$(NOT_FAST))
 
 # README and docs/own-cameras.md to the letter, in a clean clone of the commit that is checked out; takes minutes.
 test-readme:
