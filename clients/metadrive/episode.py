@@ -43,15 +43,30 @@ def run_episode(
     Raises:
         MapError: no map fits the seed.
     """
+    *_, world = worlds_of_episode(seed, duration_s, drifts=drifts, lapses=lapses)
+    return world.log()
+
+
+def worlds_of_episode(
+    seed: int, duration_s: float = 48.0, *, drifts: bool = False, lapses: bool = False
+) -> Iterator[World]:
+    """The episode of `run_episode` as it goes on: one and the same world at every step of 0.1 s.
+
+    It may be forked or copied at any of them, and must not be moved by anybody else.
+
+    Raises:
+        MapError: no map fits the seed.
+    """
     world = make_world(seed, duration_s, Lapses(seed) if lapses else None)
     drifter = Drifter(seed) if drifts else None
     near = world.remember()
+    yield world
     while not world.ended:
         if drifter is not None:
             drifter.step(world.now * STEP_S, world.ego)
         world.move(near, world.drive_as_expert)
         near = world.remember()
-    return world.log()
+        yield world
 
 
 def make_world(seed: int, duration_s: float = 48.0, lapses: Lapses | None = None) -> World:

@@ -24,6 +24,9 @@ _RETURN_S: Final = 2.2
 _SHORTEST_RETURN_M: Final = 12.0
 _STEEPEST_RAD: Final = 0.8
 """A car that stands more askew than this is first turned so far: rails cannot be left at right angles."""
+OFF_ROUTE_M: Final = 2.75
+"""A car whose centre is farther from the middle of every lane of its route has left the route: a metre beyond
+the edge of a lane of 3.5 m, in the lane of those who come towards it or in a road that is not its own."""
 
 HitKind = Literal["standing vehicle", "moving vehicle", "oncoming vehicle", "pedestrian", "obstacle"]
 
@@ -44,6 +47,7 @@ class Forked:
         collided_s: when it collided, seconds from the fork; None where it did not.
         hit: what it collided with, or None.
         off_road_s: when it first left the road, or None.
+        off_route_s: when it first left all lanes of its route (`OFF_ROUTE_M`), or None; on rails none does.
     """
 
     trajectory: FloatArray
@@ -52,6 +56,7 @@ class Forked:
     collided_s: float | None
     hit: HitKind | None
     off_road_s: float | None
+    off_route_s: float | None
 
     @property
     def is_safe(self) -> bool:
@@ -126,11 +131,14 @@ def _run(world: World, steps: int, way: Array | None) -> Forked:
     start, began_m = world.now, world.ego.progress
     near = world.nearby()
     off_road_s: float | None = None
+    off_route_s: float | None = None
     for step in range(steps):
         world.move(near, world.drive_as_expert if way is None else _follower(world, way, step * STEP_S))
         near = world.remember()
         if off_road_s is None and world.is_off_road:
             off_road_s = (step + 1) * STEP_S
+        if off_route_s is None and _is_off_route(world.ego):
+            off_route_s = (step + 1) * STEP_S
         if world.outcome == "collision":
             break
     driven = world.live.ego[start : world.now + 1]
@@ -141,7 +149,12 @@ def _run(world: World, steps: int, way: Array | None) -> Forked:
         None if world.hit is None else (world.now - start) * STEP_S,
         None if world.hit is None else kind_of(world.hit),
         off_road_s,
+        off_route_s,
     )
+
+
+def _is_off_route(ego: Vehicle) -> bool:
+    return isinstance(ego, FreeVehicle) and abs(ego.offset_m) > OFF_ROUTE_M
 
 
 def _follower(world: World, way: Array, age_s: float) -> Callable[[list[Body]], None]:

@@ -219,7 +219,7 @@ def write_manifest(out_dir: Path, config: GenerateConfig) -> dict[str, Any]:
     manifest = {
         "generator_version": GENERATOR_VERSION,
         "scene_version": SCENE_VERSION,
-        "simulator": f"metadrive-simulator {simulator.version()}",
+        "simulator": simulator.described(),
         "config": asdict(config),
         "scenes": sum(episode["scenes"] for episode in episodes),
         "dropped": sum(episode["dropped"] for episode in episodes),

@@ -125,3 +125,8 @@ def version() -> str:
         return installed_version("metadrive-simulator")
     except PackageNotFoundError as error:
         raise SimulatorMissing("MetaDrive is not installed; install it with `make sim`") from error
+
+
+def described() -> str:
+    """The installed simulator with its version, as manifests of scenes tell it."""
+    return f"metadrive-simulator {version()}"

@@ -1,0 +1,187 @@
+"""What comes of a plan: followed in a fork of the world, it holds or fails, and at what.
+
+A plan is followed by a car with a driver's limits while everybody else reacts (`clients.metadrive.fork`), and
+is compared with the expert's own way on from the same moment, followed by the same car. Bounds of comfort are
+those of NAVSIM (`model.driving.pdm.comfort`). All other thresholds are the constants here: chosen on training
+scenes, where the expert's own trajectories pass them (docs/labelling.md has the figures).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Literal, cast
+
+import numpy as np
+
+from clients.metadrive.episode import World
+from clients.metadrive.fork import Forked, HitKind, fork_along, fork_expert
+from clients.metadrive.tracking import WHEELBASE_M
+from model.driving.pdm import world as pdm
+from model.driving.pdm.comfort import comfort
+from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
+from model.driving.trajectory import STEP_S, FloatArray
+
+OUTCOMES_VERSION: Final = 1
+"""Of these rules and of the car that follows; raised when the same plan may fare otherwise."""
+
+BEHIND_RATIO: Final = 0.8
+"""Whoever drives less than this share of the expert's way falls behind ..."""
+AHEAD_RATIO: Final = 1.25
+"""... and whoever drives more than this share of it goes too far ..."""
+LEAST_GAP_M: Final = 5.0
+"""... if at least so many metres are between them, as in NAVSIM's progress."""
+
+FailureName = Literal["collision", "off_road", "off_route", "comfort", "behind", "ahead"]
+
+_BODY: Final = pdm.Vehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2, EGO_LENGTH_M / 2, WHEELBASE_M)
+"""Measured from its centre, as all our poses are."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a plan fared when it was followed for 6.4 s.
+
+    Attributes:
+        fails: at what, in the order collision, road, route, comfort, progress; empty where it holds.
+        collided_s, hit: when it collided, and with what; None where it did not.
+        off_road_s, off_route_s: when it first left the road, the lanes of its route; None where it did not.
+        uncomfortable_s, uncomfortable: when the ride first broke a bound of comfort, and which; None where it
+            did not, or collided before. Told even where the expert's own way breaks one, and then no failure.
+        driven_m, expert_m: along the route, by this plan and by the expert from the same moment.
+    """
+
+    fails: tuple[FailureName, ...]
+    collided_s: float | None
+    hit: HitKind | None
+    off_road_s: float | None
+    off_route_s: float | None
+    uncomfortable_s: float | None
+    uncomfortable: str | None
+    driven_m: float
+    expert_m: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing went wrong."""
+        return not self.fails
+
+    @property
+    def behind_m(self) -> float:
+        """How many metres less than the expert it drove along the route; below 0 where it drove more."""
+        return self.expert_m - self.driven_m
+
+    @property
+    def progress(self) -> float:
+        """Its share of the expert's way; 1 where the expert stands."""
+        return self.driven_m / self.expert_m if self.expert_m > 0 else 1.0
+
+    def to_json(self) -> dict[str, Any]:
+        """As a record keeps it."""
+        return asdict(self) | {"fails": list(self.fails)}
+
+    @classmethod
+    def from_json(cls, told: Mapping[str, Any]) -> Outcome:
+        """Read what `to_json` told."""
+        return cls(**{**told, "fails": cast("tuple[FailureName, ...]", tuple(told["fails"]))})
+
+
+@dataclass(frozen=True)
+class MomentOutcomes:
+    """How the expert and some plans fared from one moment on.
+
+    Attributes:
+        expert: of the expert's own way on, followed by the same car as the plans are.
+        plans: of each plan, in their order.
+    """
+
+    expert: Outcome
+    plans: tuple[Outcome, ...]
+
+
+def outcomes_at(
+    world: World, trajectories: Sequence[FloatArray], driven: Forked | None = None
+) -> MomentOutcomes:
+    """Follow each of some trajectories [64, 4] of the ego frame of now, each in a fork of its own.
+
+    Args:
+        world: at the moment; nothing happens in it.
+        trajectories: of the plans.
+        driven: the expert's fork from this moment, where it is there already.
+
+    Raises:
+        ForkError: the episode has ended.
+    """
+    driven = fork_expert(world) if driven is None else driven
+    expert = judged(fork_along(world, driven.trajectory), driven.driven_m)
+    strict = expert.uncomfortable is None
+    plans = (fork_along(world, trajectory) for trajectory in trajectories)
+    return MomentOutcomes(
+        expert, tuple(judged(plan, driven.driven_m, needs_comfort=strict) for plan in plans)
+    )
+
+
+def judged(followed: Forked, expert_m: float, *, needs_comfort: bool = False) -> Outcome:
+    """The outcome of a followed plan where the expert drives ``expert_m`` along the route.
+
+    Args:
+        followed: what came of the plan.
+        expert_m: as far as the expert comes from the same moment.
+        needs_comfort: whether a broken bound of comfort is a failure. It is none where the expert breaks one
+            itself: a person who runs into the road leaves no comfortable way.
+    """
+    uncomfortable_s, uncomfortable = _discomfort(followed)
+    behind_m = expert_m - followed.driven_m
+    collided = followed.collided_s is not None
+    found: dict[FailureName, bool] = {
+        "collision": collided,
+        "off_road": followed.off_road_s is not None,
+        "off_route": followed.off_route_s is not None,
+        "comfort": needs_comfort and uncomfortable is not None,
+        # A drive that a collision ended is shorter for that reason alone.
+        "behind": not collided and behind_m > LEAST_GAP_M and followed.driven_m < BEHIND_RATIO * expert_m,
+        "ahead": not collided and -behind_m > LEAST_GAP_M and followed.driven_m > AHEAD_RATIO * expert_m,
+    }
+    return Outcome(
+        tuple(name for name, failed in found.items() if failed),
+        _tenths(followed.collided_s),
+        followed.hit,
+        _tenths(followed.off_road_s),
+        _tenths(followed.off_route_s),
+        uncomfortable_s,
+        uncomfortable,
+        round(followed.driven_m, 2),
+        round(expert_m, 2),
+    )
+
+
+def _discomfort(followed: Forked) -> tuple[float | None, str | None]:
+    """When a ride first breaks a bound of comfort, and which; neither of one that ends in a collision."""
+    if followed.collided_s is not None:
+        return None, None
+    found = comfort(_states(followed)[None], _BODY, "v2.2")
+    if found.holds[0]:
+        return None, None
+    return _tenths((int(found.first_step[0]) + 1) * STEP_S), found.bound[0]
+
+
+def _states(followed: Forked) -> pdm.Array:
+    """A ride as NAVSIM's states [k, 11]; sideways acceleration is what a turn at that speed makes."""
+    track, speed = followed.trajectory.astype(np.float64), followed.speeds_ms.astype(np.float64)
+    states = np.zeros((len(track), pdm.STATE_SIZE))
+    states[:, pdm.X], states[:, pdm.Y], states[:, pdm.HEADING] = track[:, 0], track[:, 1], track[:, 3]
+    yaw_rate = _rate(track[:, 3])
+    states[:, pdm.SPEED], states[:, pdm.ACCELERATION] = speed, _rate(speed)
+    states[:, pdm.ACCELERATION_Y] = yaw_rate * speed
+    states[:, pdm.YAW_RATE], states[:, pdm.YAW_ACCELERATION] = yaw_rate, _rate(yaw_rate)
+    return states
+
+
+def _rate(values: pdm.Array) -> pdm.Array:
+    """Backward differences; the first is the second's."""
+    rate = np.diff(values) / STEP_S
+    return np.concatenate([rate[:1], rate])
+
+
+def _tenths(seconds: float | None) -> float | None:
+    return None if seconds is None else round(seconds, 1)
