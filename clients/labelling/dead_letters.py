@@ -10,7 +10,7 @@ from clients.labelling.ledger import Ledger, Stage
 from model.driving.whole_files import written_whole
 
 FILE: Final = "dead_letters.jsonl"
-_STAGES: Final[tuple[Stage, ...]] = ("rollout", "label")
+_STAGES: Final[tuple[Stage, ...]] = ("rollout", "outcomes", "label")
 
 
 def write_dead_letters(ledger: Ledger, folder: Path) -> int:

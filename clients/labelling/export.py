@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from clients.labelling.ledger import Ledger, LedgerError, Run
+from clients.labelling.ledger import Entry, Ledger, LedgerError, Run
+from clients.labelling.outcomes import followed_plans, plans_that_hold
 from clients.labelling.teachers.prompt import camera_line
 from model.driving.images import media_type
 from model.driving.plan import parse_plan
@@ -49,22 +50,42 @@ def right_plans(ledger: Ledger, label: Run, plan_iou: float) -> Iterator[Labelle
     """
     rollout = _rollout_of(ledger, label)
     for entry in ledger.entries(rollout):
-        expert = parse_plan(entry.record["expert_plan"])
         right = (draw["plan"] for draw in entry.record["free"] if draw["plan_iou"] >= plan_iou)
-        for plan in dict.fromkeys(right):
-            yield LabelledReflection(
-                scene_id=entry.scene_id,
-                predicted_plan=parse_plan(plan),
-                reflection="",
-                expert_plan=expert,
-                key=entry.key,
-                model=rollout.config["model"],
-                model_revision=rollout.config["revision"],
-                teacher="",
-                teacher_revision="",
-                attempts=0,
-                labelled_at=entry.ended_at,
-            )
+        yield from _to_act_on(rollout, entry, dict.fromkeys(right))
+
+
+def held_plans(ledger: Ledger, label: Run) -> Iterator[LabelledReflection]:
+    """The model's own plans that hold when they are followed, from all scenes of the labels' rollout.
+
+    Raises:
+        LedgerError: no plan of that rollout was followed.
+    """
+    rollout = _rollout_of(ledger, label)
+    followed = followed_plans(ledger, rollout)
+    for entry in ledger.entries(rollout):
+        if entry.key in followed:
+            free = entry.record["free"]
+            held = (free[draw]["plan"] for draw in plans_that_hold(entry, followed[entry.key]))
+            yield from _to_act_on(rollout, entry, held)
+
+
+def _to_act_on(rollout: Run, entry: Entry, plans: Iterable[str]) -> Iterator[LabelledReflection]:
+    """Plans of a rolled-out scene with no reflection on them."""
+    expert = parse_plan(entry.record["expert_plan"])
+    for plan in plans:
+        yield LabelledReflection(
+            scene_id=entry.scene_id,
+            predicted_plan=parse_plan(plan),
+            reflection="",
+            expert_plan=expert,
+            key=entry.key,
+            model=rollout.config["model"],
+            model_revision=rollout.config["revision"],
+            teacher="",
+            teacher_revision="",
+            attempts=0,
+            labelled_at=entry.ended_at,
+        )
 
 
 def _rollout_of(ledger: Ledger, label: Run) -> Run:

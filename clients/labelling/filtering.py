@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from clients.labelling.ledger import Entry
+from clients.labelling.outcomes import Followed, plans_that_fail
 from clients.labelling.rollout import min_ade_m
 
 QUIET = "quiet"
@@ -76,13 +77,30 @@ class Filtered:
 
 def filtered(entries: Iterable[Entry], thresholds: Thresholds) -> list[Filtered]:
     """Every rolled-out scene, kept or not."""
-    found = []
-    for entry in entries:
-        free, prefilled_m = entry.record["free"], min_ade_m(entry.record["prefilled"])
-        overlap = sum(draw["plan_iou"] for draw in free) / len(free)
-        draws = thresholds.keep(free, prefilled_m)
-        found.append(Filtered(entry, min_ade_m(free), prefilled_m, overlap, draws))
-    return found
+    return [
+        _filtered(entry, thresholds.keep(entry.record["free"], min_ade_m(entry.record["prefilled"])))
+        for entry in entries
+    ]
+
+
+def _filtered(entry: Entry, draws: tuple[int, ...]) -> Filtered:
+    free, prefilled = entry.record["free"], entry.record["prefilled"]
+    overlap = sum(draw["plan_iou"] for draw in free) / len(free)
+    return Filtered(entry, min_ade_m(free), min_ade_m(prefilled), overlap, draws)
+
+
+def filtered_by_outcome(entries: Iterable[Entry], followed: Mapping[str, Followed]) -> list[Filtered]:
+    """Every rolled-out scene whose plans were followed; kept are the plans that fail (`plans_that_fail`).
+
+    Args:
+        entries: rollouts.
+        followed: what came of their plans, by their keys.
+    """
+    return [
+        _filtered(entry, plans_that_fail(entry, followed[entry.key]))
+        for entry in entries
+        if entry.key in followed
+    ]
 
 
 def summary(scenes: Iterable[Filtered]) -> dict[str, Any]:

@@ -19,12 +19,12 @@ from typing import Any, Final, Literal, NamedTuple, Self
 from clients.labelling.teachers.teacher import Answer
 from model.driving.hashing import hash_of
 
-Stage = Literal["rollout", "label"]
+Stage = Literal["rollout", "outcomes", "label"]
 State = Literal["done", "dead"]
 Record = Mapping[str, Any]
 
 FILE: Final = "ledger.sqlite"
-SCHEMA_VERSION: Final = 2
+SCHEMA_VERSION: Final = 3
 """Of records; part of every key, so that a newer one does not take an older one's work for its own."""
 
 _TABLES: Final = """
@@ -201,6 +201,16 @@ class Ledger:
     def has(self, key: str) -> bool:
         """Whether a piece of work has ended, well or not."""
         return self._db.execute("SELECT 1 FROM outcomes WHERE key = ?", (key,)).fetchone() is not None
+
+    def find(self, key: str) -> Entry | None:
+        """What is done under that key."""
+        row = self._db.execute(
+            "SELECT scene_id, record, ended_at FROM outcomes WHERE key = ? AND state = 'done'", (key,)
+        ).fetchone()
+        if row is None:
+            return None
+        scene_id, record, ended_at = row
+        return Entry(key, scene_id, "done", json.loads(record), ended_at)
 
     def finish(self, run: Run, key: str, scene_id: str, record: Record) -> None:
         """A piece of work is done."""

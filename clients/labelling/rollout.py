@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -28,9 +29,11 @@ from model.driving.metrics import displacement_errors
 from model.driving.plan import Plan, plan_iou
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
+from model.driving.trajectory import FUTURE_STEPS, FloatArray
 
 PATIENCE = Patience(timeout_s=120.0, attempts=1)
 """Who waits how long is the pipeline's to say."""
+_PACKED: Final = np.dtype("<f4")
 
 
 @dataclass(frozen=True)
@@ -129,9 +132,21 @@ def _draws(result: PlanResult, labelled: LabelledScene, expert: Plan | None) -> 
                 "plan": str(draw.plan),
                 "plan_iou": round(plan_iou(draw.plan, expert), 4),
                 "think_probability": draw.think_probability,
+                "trajectory": packed(draw.trajectory),
             }
         told.append(row)
     return told
+
+
+def packed(trajectory: FloatArray) -> str:
+    """A trajectory [64, 4] as a record keeps it, to the last bit: float32, little-endian, in base64."""
+    return base64.b64encode(np.ascontiguousarray(trajectory, _PACKED).tobytes()).decode()
+
+
+def unpacked(text: str) -> FloatArray:
+    """The trajectory [64, 4] that `packed` made text of."""
+    values = np.frombuffer(base64.b64decode(text, validate=True), _PACKED)
+    return values.reshape(FUTURE_STEPS, 4).astype(np.float32)
 
 
 def min_ade_m(draws: Sequence[Mapping[str, Any]]) -> float:

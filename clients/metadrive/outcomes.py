@@ -131,7 +131,9 @@ def judged(followed: Forked, expert_m: float, *, needs_comfort: bool = False) ->
             itself: a person who runs into the road leaves no comfortable way.
     """
     uncomfortable_s, uncomfortable = _discomfort(followed)
-    behind_m = expert_m - followed.driven_m
+    # An expert that backs out from behind an obstacle asks nobody to drive backwards.
+    due_m = max(expert_m, 0.0)
+    behind_m = due_m - followed.driven_m
     collided = followed.collided_s is not None
     found: dict[FailureName, bool] = {
         "collision": collided,
@@ -139,8 +141,8 @@ def judged(followed: Forked, expert_m: float, *, needs_comfort: bool = False) ->
         "off_route": followed.off_route_s is not None,
         "comfort": needs_comfort and uncomfortable is not None,
         # A drive that a collision ended is shorter for that reason alone.
-        "behind": not collided and behind_m > LEAST_GAP_M and followed.driven_m < BEHIND_RATIO * expert_m,
-        "ahead": not collided and -behind_m > LEAST_GAP_M and followed.driven_m > AHEAD_RATIO * expert_m,
+        "behind": not collided and behind_m > LEAST_GAP_M and followed.driven_m < BEHIND_RATIO * due_m,
+        "ahead": not collided and -behind_m > LEAST_GAP_M and followed.driven_m > AHEAD_RATIO * due_m,
     }
     return Outcome(
         tuple(name for name, failed in found.items() if failed),

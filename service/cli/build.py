@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import tempfile
-from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain, islice
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from clients.labelling.pipeline import Job, Limits, Tally
     from clients.labelling.teachers.openai import OpenAiSettings
     from clients.labelling.teachers.teacher import Teacher
+    from model.driving.reflection_store import LabelledReflection
 
 app = typer.Typer(
     help="Build a counterfactual data set: rollout, filter, label, export.", no_args_is_help=True
@@ -110,6 +111,53 @@ def rollout(
         _report(run, tally, as_json, left_out=len(unlabelled))
 
 
+@app.command()
+def outcomes(
+    folder: Folder,
+    scenes: Annotated[
+        Path, typer.Argument(help="Generated scenes, with their manifest: a file or a folder.")
+    ],
+    workers: Annotated[int, typer.Option(help="Processes that follow plans.", min=1)] = 2,
+    max_error_rate: MaxErrorRate = 0.1,
+    retry_dead: RetryDead = False,
+    limit: Limit = None,
+    dry_run: DryRun = 0,
+    run: RunId = None,
+    as_json: Json = False,
+) -> None:
+    """Follow the model's own plans in the simulator: which hold, which fail, and at what."""
+    from collections import Counter
+
+    from clients.labelling.outcomes import Followed, config_of, follow_all
+    from clients.labelling.pipeline import Limits
+
+    limits = Limits(max_error_rate=max_error_rate, at_most=dry_run or limit)
+    counts: dict[str, Any] = {}
+
+    async def follow(ledger: Ledger) -> tuple[Run, Tally]:
+        rollout = ledger.the_run("rollout", run)
+        begun = ledger.run("outcomes", config_of(rollout))
+        if retry_dead:
+            ledger.forget_dead(begun)
+        total = None if limits.at_most else min(ledger.count(rollout), _count(scenes))
+        with _progress(begun, total, quiet=as_json) as show:
+            tally = follow_all(ledger, begun, rollout, scenes, workers, limits, show)
+        found = [Followed.of(entry.record) for entry in ledger.entries(begun)]
+        plans = [plan for each in found for plan in each.plans]
+        counts.update(
+            scenes=len(found),
+            expert_holds=sum(each.expert.holds for each in found),
+            plans=len(plans),
+            plans_hold=sum(plan.holds for plan in plans),
+            fails=dict(Counter(name for plan in plans for name in plan.fails)),
+        )
+        return begun, tally
+
+    with told():
+        begun, tally = _stage(folder, follow, dry=dry_run > 0)
+        _report(begun, tally, as_json, **counts)
+
+
 @app.command("filter")
 def choose(
     folder: Folder,
@@ -125,25 +173,38 @@ def choose(
         ),
     ] = None,
     everything: Annotated[bool, typer.Option(help="Keep all scenes.")] = False,
+    outcomes: Annotated[
+        bool,
+        typer.Option("--outcomes", help="Keep the plans that fail when followed, instead of by minADE."),
+    ] = False,
     run: RunId = None,
     as_json: Json = False,
 ) -> None:
     """Keep the scenes whose plan is what goes wrong; writes filter.png."""
-    from clients.labelling.filtering import Thresholds, filtered, summary
+    from clients.labelling.filtering import Thresholds, filtered, filtered_by_outcome, summary
     from clients.labelling.ledger import Ledger
+    from clients.labelling.outcomes import followed_plans
     from clients.labelling.scatter import scatter
     from model.driving.scene_store import row_groups, scene_files
 
     thresholds = Thresholds(epsilon, gain, plan_iou, everything)
     with told(), Ledger(folder) as ledger:
+        if outcomes and thresholds != Thresholds():
+            raise ValueError(
+                "--outcomes asks what came of plans: no --epsilon, --gain, --plan-iou, --everything"
+            )
         rollout = ledger.the_run("rollout", run)
         entries = ledger.entries(rollout)
         if scenes is not None:
             wanted = {name for file in scene_files(scenes) for group in row_groups(file) for name in group}
             entries = (entry for entry in entries if entry.scene_id in wanted)
-        found = filtered(entries, thresholds)
+        found = (
+            filtered_by_outcome(entries, followed_plans(ledger, rollout))
+            if outcomes
+            else filtered(entries, thresholds)
+        )
         ledger.keep(rollout, ((scene.entry.key, scene.draws) for scene in found if scene.kept))
-        scatter(found, thresholds, folder / "filter.png")
+        scatter(found, None if outcomes else thresholds, folder / "filter.png")
         result = summary(found)
     if as_json:
         typer.echo(json.dumps(result))
@@ -251,24 +312,40 @@ def export(
             max=1,
         ),
     ] = None,
+    right_outcomes: Annotated[
+        bool,
+        typer.Option(
+            "--right-outcomes",
+            help="parquet: also the model's plans that hold when followed, to be acted on.",
+        ),
+    ] = False,
     plans_per_scene: PlansPerScene = 1,
     seed: LabelSeed = 0,
     run: Annotated[str | None, typer.Option("--run", help="Which labels (openai-batch: rollout).")] = None,
 ) -> None:
     """Write what was labelled, or what is still to be asked."""
     from clients.labelling.batch import batch_requests
-    from clients.labelling.export import reflections, right_plans, write_messages
+    from clients.labelling.export import held_plans, reflections, right_plans, write_messages
     from clients.labelling.ledger import Ledger
     from model.driving.reflection_store import write_reflections
 
     with told(), Ledger(folder) as ledger:
-        if right_iou is not None and form != "parquet":
+        if (right_iou is not None or right_outcomes) and form != "parquet":
             raise ValueError(
-                f"--form {form} has no place for plans that are right: --right-iou needs parquet"
+                f"--form {form} has no place for plans that are right: "
+                "--right-iou and --right-outcomes need parquet"
+            )
+        if right_iou is not None and right_outcomes:
+            raise ValueError(
+                "a plan is right by its agreement or by its outcome: --right-iou or --right-outcomes"
             )
         if form == "parquet":
             labels = ledger.the_run("label", run)
-            right = () if right_iou is None else right_plans(ledger, labels, right_iou)
+            right: Iterable[LabelledReflection] = ()
+            if right_iou is not None:
+                right = right_plans(ledger, labels, right_iou)
+            elif right_outcomes:
+                right = held_plans(ledger, labels)
             count = write_reflections(to, chain(reflections(ledger, labels), right))
         elif scenes is None:
             raise ValueError(f"--form {form} needs --scenes")

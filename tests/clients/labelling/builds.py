@@ -8,13 +8,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
 from clients.labelling.ledger import Ledger, Run
-from clients.labelling.rollout import Sampling, config_of, key_of
+from clients.labelling.rollout import Sampling, config_of, key_of, packed
 from clients.wire import ModelName
 from model.driving.plan import parse_plan
 from model.driving.scene import LabelledScene
@@ -59,7 +60,8 @@ def rolled_out(folder: Path, count: int) -> Run:
 
 
 def rollout_record(free_m: float = 2.0, prefilled_m: float = 0.5, tags: tuple[str, ...] = ()) -> Any:
-    draw = {"plan": str(KEEP_ON), "plan_iou": 0.5, "branch": "Action:", "think_probability": 0.1}
+    trajectory = packed(np.zeros((64, 4), np.float32))
+    draw = {"plan": str(KEEP_ON), "plan_iou": 0.5, "think_probability": 0.1, "trajectory": trajectory}
     return {
         "tags": list(tags),
         "expert_plan": str(SLOW_DOWN),

@@ -13,10 +13,20 @@ from fastapi import FastAPI
 
 from clients.labelling.ledger import Ledger, Run
 from clients.labelling.pipeline import Limits, StageStopped, Tally, work_through
-from clients.labelling.rollout import PATIENCE, Sampling, config_of, jobs, key_of, roll_out
+from clients.labelling.rollout import (
+    PATIENCE,
+    Sampling,
+    config_of,
+    jobs,
+    key_of,
+    packed,
+    roll_out,
+    unpacked,
+)
 from clients.planner import AsyncPlannerClient
 from clients.wire import ModelName
 from model.driving.labeller import expert_plan
+from model.driving.metrics import displacement_errors
 from model.driving.scene_store import read_scenes
 from model.engines.engine import RequestError
 from service.settings import Settings
@@ -72,7 +82,15 @@ def test_a_scene_is_planned_freely_and_with_the_expert_s_plan(
     assert len(record["free"]) == len(record["prefilled"]) == 2
     assert all(draw["ade_m"] > 0 and draw["tokens"] > 0 for draw in record["free"] + record["prefilled"])
     assert all(0 <= draw["plan_iou"] <= 1 for draw in record["free"])
+    for draw in record["free"]:
+        errors = displacement_errors(unpacked(draw["trajectory"])[None], labelled().future)
+        assert errors.min_ade_m == pytest.approx(draw["ade_m"], abs=1e-3)
     assert json.dumps(record)
+
+
+def test_a_packed_trajectory_is_the_same_to_the_last_bit() -> None:
+    trajectory = np.random.default_rng(1).normal(0, 40, (64, 4)).astype(np.float32)
+    np.testing.assert_array_equal(unpacked(packed(trajectory)), trajectory)
 
 
 def test_a_scene_the_service_refuses_is_a_dead_letter(

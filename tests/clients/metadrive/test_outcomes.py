@@ -97,6 +97,7 @@ def jerky() -> Forked:
         (forked(), 51.0, ("ahead",)),
         (forked(driven_m=4.5), 0.0, ()),
         (forked(driven_m=5.5), 0.0, ("ahead",)),
+        (forked(driven_m=0.0), -7.5, ()),
         (forked(collided_s=2.1, hit="standing vehicle", driven_m=20.0), 64.0, ("collision",)),
         (forked(off_road_s=3.0, off_route_s=2.5), 64.0, ("off_road", "off_route")),
         (jerky(), 64.0, ("comfort",)),
