@@ -1,34 +1,12 @@
-"""Outcomes: whether the model's own plans hold when they are followed in the simulator, draw by draw.
-
-Worker processes take whole episodes: each is driven once for all its scenes. The ledger stays with whoever
-gave the command; what is entered there is not done again.
-"""
+"""Outcomes in a build: which of a rollout's plans hold when followed, and which are to be corrected."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
-from itertools import groupby, islice
-from pathlib import Path
-from typing import Any, Final
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 from clients.labelling.ledger import Entry, Ledger, LedgerError, Record, Run
-from clients.labelling.pipeline import ERRORS_COUNT_FROM, Limits, StageStopped, Tally
-from clients.labelling.rollout import key_of, unpacked
-from clients.metadrive.outcomes import OUTCOMES_VERSION, MomentOutcomes, Outcome
-from clients.metadrive.replay import EpisodeSetting, Moment, ReplayError, outcomes_of_episode, setting_of
-from model.driving.hashing import hash_of
-from model.driving.scene_store import read_scenes
-from model.driving.trajectory import FloatArray
-
-_EPISODES_A_PROCESS: Final = 20
-"""Then it is replaced, so that its memory stays bounded."""
+from model.driving.outcome import OUTCOMES_VERSION, Outcome
 
 
 @dataclass(frozen=True)
@@ -49,16 +27,6 @@ class Followed:
         return cls(
             Outcome.from_json(record["expert"]), tuple(Outcome.from_json(each) for each in record["plans"])
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _Work:
-    """A scene's place in the ledger, its moment, and the trajectories that are followed from it."""
-
-    key: str
-    rollout: str
-    moment: Moment
-    trajectories: tuple[FloatArray, ...]
 
 
 def config_of(rollout: Run) -> Record:
@@ -107,131 +75,3 @@ def _draws_of(entry: Entry) -> dict[str, list[int]]:
     for draw, told in enumerate(entry.record["free"]):
         found.setdefault(told["plan"], []).append(draw)
     return found
-
-
-def follow_all(
-    ledger: Ledger,
-    run: Run,
-    rollout: Run,
-    scenes: Path,
-    workers: int,
-    limits: Limits = Limits(),
-    on_progress: Callable[[Tally], None] = lambda _: None,
-) -> Tally:
-    """Follow the free draws of every rolled-out scene, and enter what comes of them.
-
-    Args:
-        ledger: with the rollout.
-        run: what the outcomes belong to.
-        rollout: whose draws.
-        scenes: generated scenes, a file or a folder; those that were not rolled out are passed over.
-        workers: processes.
-        limits: ``at_most`` and ``max_error_rate`` count here.
-        on_progress: told after every scene.
-
-    Raises:
-        ReplayError: these scenes' worlds cannot be made again.
-        StageStopped: too many errors, or a process died; what is entered stays.
-    """
-    setting = setting_of(scenes)
-    tally, began_s, faults = Tally(), time.monotonic(), 0
-    waiting = _episodes(_works(ledger, run, rollout, scenes, setting, tally), limits.at_most)
-    begun: dict[Future[list[tuple[str, MomentOutcomes | str]]], dict[str, _Work]] = {}
-    with ProcessPoolExecutor(
-        workers,
-        multiprocessing.get_context("spawn"),
-        initializer=_end_with_parent,
-        max_tasks_per_child=_EPISODES_A_PROCESS,
-    ) as pool:
-        try:
-            while True:
-                while len(begun) <= workers and (works := next(waiting, None)) is not None:
-                    asked = [(work.moment, work.trajectories) for work in works]
-                    future = pool.submit(_follow_episode, works[0].moment.seed, setting, asked)
-                    begun[future] = {work.moment.scene_id: work for work in works}
-                if not begun:
-                    break
-                for ended in wait(begun, return_when=FIRST_COMPLETED).done:
-                    works_of = begun.pop(ended)
-                    for scene_id, found in ended.result():
-                        faults += _enter(ledger, run, works_of[scene_id], found, tally)
-                        on_progress(tally)
-                    count = tally.done + tally.dead
-                    if count >= ERRORS_COUNT_FROM and faults > limits.max_error_rate * count:
-                        raise StageStopped(
-                            f"{faults} of {count} scenes could not be followed; see dead letters"
-                        )
-        except BrokenProcessPool as error:
-            raise StageStopped(
-                "a process that followed plans died (too little memory?); the same command goes on"
-            ) from error
-        finally:
-            for future in begun:
-                future.cancel()
-    tally.seconds = time.monotonic() - began_s
-    return tally
-
-
-def _enter(ledger: Ledger, run: Run, work: _Work, found: MomentOutcomes | str, tally: Tally) -> bool:
-    """Enter what came of a scene; returns whether something went wrong."""
-    if isinstance(found, str):
-        ledger.bury(run, work.key, work.moment.scene_id, found)
-        tally.dead += 1
-        return True
-    record: dict[str, Any] = {
-        "rollout": work.rollout,
-        "expert": found.expert.to_json(),
-        "plans": [plan.to_json() for plan in found.plans],
-    }
-    ledger.finish(run, work.key, work.moment.scene_id, record)
-    tally.done += 1
-    return False
-
-
-def _episodes(works: Iterator[_Work], at_most: int | None) -> Iterator[list[_Work]]:
-    """What is to be done, episode by episode as far as files hold them together."""
-    for _, episode in groupby(islice(works, at_most), lambda work: work.moment.seed):
-        yield list(episode)
-
-
-def _works(
-    ledger: Ledger, run: Run, rollout: Run, scenes: Path, setting: EpisodeSetting, tally: Tally
-) -> Iterator[_Work]:
-    """The rolled-out scenes whose plans were not followed yet; the others are counted."""
-    begun: set[str] = set()
-    for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None):
-        entry = ledger.find(key_of(rollout, labelled))
-        if entry is None:
-            continue
-        key = hash_of(run.id, entry.key, asdict(setting))
-        if ledger.has(key) or key in begun:
-            tally.earlier += 1
-            continue
-        begun.add(key)
-        yield _Work(key, entry.key, Moment.of(labelled), _trajectories(entry))
-
-
-def _trajectories(entry: Entry) -> tuple[FloatArray, ...]:
-    return tuple(unpacked(draw["trajectory"]) for draw in entry.record["free"])
-
-
-def _follow_episode(
-    seed: int, setting: EpisodeSetting, asked: list[tuple[Moment, tuple[FloatArray, ...]]]
-) -> list[tuple[str, MomentOutcomes | str]]:
-    """One episode in a process of its own; what cannot be followed is told as text."""
-    return [
-        (scene_id, str(found) if isinstance(found, ReplayError) else found)
-        for scene_id, found in outcomes_of_episode(seed, setting, asked)
-    ]
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent does, however that ends: nobody is left who would take its work."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from clients.metadrive.actors import STEP_S, Body, Drift, Obstacle, Pedestrian, 
 from clients.metadrive.episode import World
 from clients.metadrive.roads import Array, RoadMap
 from clients.metadrive.tracking import FreeVehicle, world_trajectory
+from model.driving.outcome import HitKind
 from model.driving.trajectory import FUTURE_STEPS, FloatArray, to_ego_frame
 
 _RETURN_S: Final = 2.2
@@ -27,8 +28,6 @@ _STEEPEST_RAD: Final = 0.8
 OFF_ROUTE_M: Final = 2.75
 """A car whose centre is farther from the middle of every lane of its route has left the route: a metre beyond
 the edge of a lane of 3.5 m, in the lane of those who come towards it or in a road that is not its own."""
-
-HitKind = Literal["standing vehicle", "moving vehicle", "oncoming vehicle", "pedestrian", "obstacle"]
 
 
 class ForkError(ValueError):

@@ -8,22 +8,20 @@ scenes, where the expert's own trajectories pass them (docs/labelling.md has the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Final, Literal, cast
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from clients.metadrive.episode import World
-from clients.metadrive.fork import Forked, HitKind, fork_along, fork_expert
+from clients.metadrive.fork import Forked, fork_along, fork_expert
 from clients.metadrive.tracking import WHEELBASE_M
+from model.driving.outcome import FailureName, Outcome
 from model.driving.pdm import world as pdm
 from model.driving.pdm.comfort import comfort
 from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
 from model.driving.trajectory import STEP_S, FloatArray
-
-OUTCOMES_VERSION: Final = 1
-"""Of these rules and of the car that follows; raised when the same plan may fare otherwise."""
 
 BEHIND_RATIO: Final = 0.8
 """Whoever drives less than this share of the expert's way falls behind ..."""
@@ -32,58 +30,8 @@ AHEAD_RATIO: Final = 1.25
 LEAST_GAP_M: Final = 5.0
 """... if at least so many metres are between them, as in NAVSIM's progress."""
 
-FailureName = Literal["collision", "off_road", "off_route", "comfort", "behind", "ahead"]
-
 _BODY: Final = pdm.Vehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2, EGO_LENGTH_M / 2, WHEELBASE_M)
 """Measured from its centre, as all our poses are."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a plan fared when it was followed for 6.4 s.
-
-    Attributes:
-        fails: at what, in the order collision, road, route, comfort, progress; empty where it holds.
-        collided_s, hit: when it collided, and with what; None where it did not.
-        off_road_s, off_route_s: when it first left the road, the lanes of its route; None where it did not.
-        uncomfortable_s, uncomfortable: when the ride first broke a bound of comfort, and which; None where it
-            did not, or collided before. Told even where the expert's own way breaks one, and then no failure.
-        driven_m, expert_m: along the route, by this plan and by the expert from the same moment.
-    """
-
-    fails: tuple[FailureName, ...]
-    collided_s: float | None
-    hit: HitKind | None
-    off_road_s: float | None
-    off_route_s: float | None
-    uncomfortable_s: float | None
-    uncomfortable: str | None
-    driven_m: float
-    expert_m: float
-
-    @property
-    def holds(self) -> bool:
-        """Whether nothing went wrong."""
-        return not self.fails
-
-    @property
-    def behind_m(self) -> float:
-        """How many metres less than the expert it drove along the route; below 0 where it drove more."""
-        return self.expert_m - self.driven_m
-
-    @property
-    def progress(self) -> float:
-        """Its share of the expert's way; 1 where the expert stands."""
-        return self.driven_m / self.expert_m if self.expert_m > 0 else 1.0
-
-    def to_json(self) -> dict[str, Any]:
-        """As a record keeps it."""
-        return asdict(self) | {"fails": list(self.fails)}
-
-    @classmethod
-    def from_json(cls, told: Mapping[str, Any]) -> Outcome:
-        """Read what `to_json` told."""
-        return cls(**{**told, "fails": cast("tuple[FailureName, ...]", tuple(told["fails"]))})
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,8 @@ def outcomes(
     """Follow the model's own plans in the simulator: which hold, which fail, and at what."""
     from collections import Counter
 
-    from clients.labelling.outcomes import Followed, config_of, follow_all
+    from clients.labelling.follow import follow_all
+    from clients.labelling.outcomes import Followed, config_of
     from clients.labelling.pipeline import Limits
 
     limits = Limits(max_error_rate=max_error_rate, at_most=dry_run or limit)

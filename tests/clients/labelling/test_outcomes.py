@@ -17,7 +17,7 @@ from clients.labelling.outcomes import (
     plans_that_fail,
     plans_that_hold,
 )
-from clients.metadrive.outcomes import FailureName, Outcome
+from model.driving.outcome import FailureName, Outcome
 from tests.clients.labelling.builds import GO_FASTER, rolled_out, rollout_record
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN
 
