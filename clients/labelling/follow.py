@@ -1,34 +1,27 @@
 """Follow: the free draws of a rollout in the simulator, scene by scene (`clients.metadrive.outcomes`).
 
-Worker processes take whole episodes: each is driven once for all its scenes. The ledger stays with whoever
-gave the command; what is entered there is not done again.
+Worker processes do it (`clients.metadrive.workers`). The ledger stays with whoever gave the command; what is
+entered there is not done again.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from itertools import groupby, islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from clients.labelling.ledger import Entry, Ledger, Run
 from clients.labelling.pipeline import ERRORS_COUNT_FROM, Limits, StageStopped, Tally
 from clients.labelling.rollout import key_of, unpacked
 from clients.metadrive.outcomes import MomentOutcomes
-from clients.metadrive.replay import EpisodeSetting, Moment, ReplayError, outcomes_of_episode, setting_of
+from clients.metadrive.replay import EpisodeSetting, Moment, setting_of
+from clients.metadrive.workers import Asked, WorkerDied, follow_episodes
 from model.driving.hashing import hash_of
 from model.driving.scene_store import read_scenes
 from model.driving.trajectory import FloatArray
-
-_EPISODES_A_PROCESS: Final = 20
-"""Then it is replaced, so that its memory stays bounded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,39 +60,22 @@ def follow_all(
     """
     setting = setting_of(scenes)
     tally, began_s, faults = Tally(), time.monotonic(), 0
-    waiting = _episodes(_works(ledger, run, rollout, scenes, setting, tally), limits.at_most)
-    begun: dict[Future[list[tuple[str, MomentOutcomes | str]]], dict[str, _Work]] = {}
-    with ProcessPoolExecutor(
-        workers,
-        multiprocessing.get_context("spawn"),
-        initializer=_end_with_parent,
-        max_tasks_per_child=_EPISODES_A_PROCESS,
-    ) as pool:
-        try:
-            while True:
-                while len(begun) <= workers and (works := next(waiting, None)) is not None:
-                    asked = [(work.moment, work.trajectories) for work in works]
-                    future = pool.submit(_follow_episode, works[0].moment.seed, setting, asked)
-                    begun[future] = {work.moment.scene_id: work for work in works}
-                if not begun:
-                    break
-                for ended in wait(begun, return_when=FIRST_COMPLETED).done:
-                    works_of = begun.pop(ended)
-                    for scene_id, found in ended.result():
-                        faults += _enter(ledger, run, works_of[scene_id], found, tally)
-                        on_progress(tally)
-                    count = tally.done + tally.dead
-                    if count >= ERRORS_COUNT_FROM and faults > limits.max_error_rate * count:
-                        raise StageStopped(
-                            f"{faults} of {count} scenes could not be followed; see dead letters"
-                        )
-        except BrokenProcessPool as error:
-            raise StageStopped(
-                "a process that followed plans died (too little memory?); the same command goes on"
-            ) from error
-        finally:
-            for future in begun:
-                future.cancel()
+    works: dict[str, _Work] = {}
+
+    def episodes() -> Iterator[list[Asked]]:
+        for episode in _episodes(_works(ledger, run, rollout, scenes, setting, tally), limits.at_most):
+            works.update((work.moment.scene_id, work) for work in episode)
+            yield [(work.moment, work.trajectories) for work in episode]
+
+    try:
+        for scene_id, found in follow_episodes(episodes(), setting, workers):
+            faults += _enter(ledger, run, works.pop(scene_id), found, tally)
+            on_progress(tally)
+            count = tally.done + tally.dead
+            if count >= ERRORS_COUNT_FROM and faults > limits.max_error_rate * count:
+                raise StageStopped(f"{faults} of {count} scenes could not be followed; see dead letters")
+    except WorkerDied as error:
+        raise StageStopped(f"{error}; the same command goes on") from error
     tally.seconds = time.monotonic() - began_s
     return tally
 
@@ -145,25 +121,3 @@ def _works(
 
 def _trajectories(entry: Entry) -> tuple[FloatArray, ...]:
     return tuple(unpacked(draw["trajectory"]) for draw in entry.record["free"])
-
-
-def _follow_episode(
-    seed: int, setting: EpisodeSetting, asked: list[tuple[Moment, tuple[FloatArray, ...]]]
-) -> list[tuple[str, MomentOutcomes | str]]:
-    """One episode in a process of its own; what cannot be followed is told as text."""
-    return [
-        (scene_id, str(found) if isinstance(found, ReplayError) else found)
-        for scene_id, found in outcomes_of_episode(seed, setting, asked)
-    ]
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent does, however that ends: nobody is left who would take its work."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()

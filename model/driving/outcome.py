@@ -42,6 +42,12 @@ class Outcome:
         return not self.fails
 
     @property
+    def rank(self) -> int:
+        """2 where it holds; 0 where it hurts: it collides, or leaves the road or its route; 1 otherwise."""
+        hurts = any(name in ("collision", "off_road", "off_route") for name in self.fails)
+        return 0 if hurts else 1 + self.holds
+
+    @property
     def behind_m(self) -> float:
         """How many metres less than the expert it drove along the route; below 0 where it drove more."""
         return self.expert_m - self.driven_m

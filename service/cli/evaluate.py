@@ -85,6 +85,14 @@ def evaluate(
     gate_steps: Annotated[
         int, typer.Option(help="perception: training steps of those planners.", min=1)
     ] = 8000,
+    outcomes: Annotated[
+        bool,
+        typer.Option(
+            "--outcomes",
+            help="What second looks bring when plans are followed in the simulator; nothing else.",
+        ),
+    ] = False,
+    workers: Annotated[int, typer.Option(help="outcomes: processes that follow plans.", min=1)] = 2,
     as_json: Json = False,
 ) -> None:
     """Evaluate open loop: baselines, with and without route, expert plans given, images shuffled."""
@@ -107,6 +115,13 @@ def evaluate(
         def engine_of(folder: Path) -> Engine:
             made = make_engine(folder, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
             return made if keep is None else KeptDraws(made, keep)
+
+        if outcomes:
+            told_as, text = _outcomes(
+                scenes, labelled, engine_of(checkpoint), controls, rows, workers, keep, quiet=as_json
+            )
+            typer.echo(json.dumps(told_as) if as_json else text)
+            return
 
         report: Report | LadderReport
         if preset == "ladder":
@@ -133,6 +148,43 @@ def evaluate(
             run = _run(evaluate, labelled, made, variants, n, rows, quiet=as_json)
             report = asyncio.run(run)
         typer.echo(json.dumps(report.to_json()) if as_json else str(report))
+
+
+def _outcomes(
+    folder: Path,
+    scenes: Sequence[LabelledScene],
+    engine: Engine,
+    controls: Controls,
+    rows: int,
+    workers: int,
+    keep: Path | None,
+    *,
+    quiet: bool,
+) -> tuple[dict[str, Any], str]:
+    """What comes of first plans and of second looks, as JSON and as text."""
+    from clients.metadrive.replay import Moment, setting_of
+    from model.evaluation.report import evaluate_variants
+    from service.cli.outcomes import follow_pairs, outcome_pairs
+
+    # What cannot be followed is refused before anything is planned.
+    setting = setting_of(folder)
+    for each in scenes:
+        Moment.of(each)
+    if "cf_vla" not in engine.card.formats:
+        raise ValueError(f"{engine.card.name} writes no plans that could be looked at twice")
+    pairs = outcome_pairs(controls, engine.card.inputs)
+    variants = [variant for pair in pairs for variant in (pair.never, pair.adaptive)]
+    draws: dict[str, dict[str, Sequence[Draw]]] = {variant.name: {} for variant in variants}
+
+    def keep_draws(variant: Variant, labelled: LabelledScene, of: Sequence[Draw]) -> None:
+        draws[variant.name][labelled.scene.scene_id] = of
+
+    evaluate = partial(evaluate_variants, on_draws=keep_draws)
+    asyncio.run(_run(evaluate, scenes, engine, variants, controls.n, rows, quiet=quiet))
+    file = None if keep is None else keep.with_name(f"{keep.name}.outcomes")
+    tables = follow_pairs(pairs, scenes, draws, setting, workers, file, quiet=quiet)
+    told_as = {"second_looks": [{"given": given} | table.to_json() for given, table in tables.items()]}
+    return told_as, "\n\n".join(f"given the {given}:\n{table}" for given, table in tables.items())
 
 
 def _small_planner(folder: Path) -> tuple[str, Callable[[LabelledScene], FloatArray]]:

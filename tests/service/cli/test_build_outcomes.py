@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from clients.labelling.ledger import FILE, Ledger
 from clients.labelling.outcomes import Followed
-from clients.metadrive import simulator
+from clients.metadrive.generate import MANIFEST
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.reflection_store import read_reflections
 from model.engines.torch.engine import TorchEngine, TorchSettings
@@ -25,22 +25,7 @@ from service.cli.commands import app
 from service.settings import Settings
 from tests.service.serving import serve
 
-if not simulator.is_installed():
-    pytest.skip("MetaDrive is not installed (make sim)", allow_module_level=True)
-
-from clients.metadrive.generate import MANIFEST, GenerateConfig, write_block, write_manifest
-
-CONFIG = GenerateConfig(stride_s=1.0, duration_s=12.0, dense=False, lapses=True)
 DRAWS = 2
-
-
-@pytest.fixture(scope="module")
-def generated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three short episodes."""
-    folder = tmp_path_factory.mktemp("scenes")
-    write_block(folder, range(2, 5), CONFIG)
-    write_manifest(folder, CONFIG)
-    return folder
 
 
 @pytest.fixture(scope="module")

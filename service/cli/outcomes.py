@@ -1,0 +1,174 @@
+"""`looktwice evaluate --outcomes`: what second looks bring, by what comes of plans that are followed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+from rich.progress import Progress
+
+from clients.metadrive.kept_outcomes import KeptOutcomes, key_of
+from clients.metadrive.outcomes import MomentOutcomes
+from clients.metadrive.replay import EpisodeSetting, Moment, ReplayError
+from clients.metadrive.workers import Asked, follow_episodes
+from model.driving.scene import LabelledScene
+from model.driving.trajectory import FloatArray
+from model.engines.engine import Controls, Draw, EngineError
+from model.evaluation.outcomes import FollowedDraw, OutcomeTable, outcome_table
+from model.evaluation.variants import Variant
+
+MOST_UNPAIRED: Final = 0.02
+"""Of all draws: sums of a batch of another shape differ in their last bits, and now and then a word does."""
+
+DrawsOf = Mapping[str, Sequence[Draw]]
+"""The draws of a variant, by scene."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The two runs over the same scenes that are compared.
+
+    Attributes:
+        given: what of a scene the model is given beside pictures and history.
+        never: the run that never thinks: its draws show what first plans lead to.
+        adaptive: the run that thinks where it chooses to.
+    """
+
+    given: str
+    never: Variant
+    adaptive: Variant
+
+
+def outcome_pairs(controls: Controls, inputs: Sequence[str]) -> list[Pair]:
+    """The runs for a checkpoint that takes ``inputs``: with the route, and where it can with tracks too."""
+    adaptive = replace(controls, thinking="adaptive")
+    never = replace(controls, thinking="never", think_threshold=None)
+    givens = [("route", False), ("route + tracks", True)]
+    return [
+        Pair(
+            given,
+            Variant(f"never thinks, {given}", controls=never, route=True, tracks=tracks),
+            Variant(f"adaptive, {given}", controls=adaptive, route=True, tracks=tracks),
+        )
+        for given, tracks in (givens if "tracks" in inputs else givens[:1])
+    ]
+
+
+def followed_table(
+    scenes: Sequence[LabelledScene],
+    never: DrawsOf,
+    adaptive: DrawsOf,
+    setting: EpisodeSetting,
+    workers: int,
+    kept: KeptOutcomes,
+    on_scene: Callable[[], None] = lambda: None,
+) -> OutcomeTable:
+    """Follow the draws of both runs in every scene, and tell what second looks bring.
+
+    Args:
+        scenes: generated ones.
+        never, adaptive: draws of both runs in all of them, made with the same seeds.
+        setting: of the scenes' episodes.
+        workers: processes.
+        kept: outcomes that are known; new ones are added.
+        on_scene: called after each scene.
+
+    Raises:
+        EngineError: the runs do not begin with the same first plans.
+        ReplayError: a scene's world cannot be made again.
+        WorkerDied: a process died.
+    """
+    asked = {
+        labelled.scene.scene_id: _asked(
+            labelled, never[labelled.scene.scene_id], adaptive[labelled.scene.scene_id]
+        )
+        for labelled in scenes
+    }
+    keys = {scene_id: key_of(each, setting) for scene_id, each in asked.items()}
+    found: dict[str, MomentOutcomes] = {}
+    for scene_id, key in keys.items():
+        if (known := kept.find(key)) is not None:
+            found[scene_id] = known
+            on_scene()
+    rest = [each for scene_id, each in asked.items() if scene_id not in found]
+    for scene_id, outcomes in follow_episodes(_episodes(rest), setting, workers):
+        if isinstance(outcomes, str):
+            raise ReplayError(outcomes)
+        kept.keep(keys[scene_id], outcomes)
+        found[scene_id] = outcomes
+        on_scene()
+    draws: list[FollowedDraw | None] = []
+    held = [labelled for labelled in scenes if found[labelled.scene.scene_id].expert.holds]
+    for labelled in held:
+        name = labelled.scene.scene_id
+        draws += _draws(labelled.episode_id, never[name], adaptive[name], found[name])
+    paired = [draw for draw in draws if draw is not None]
+    unpaired = len(draws) - len(paired)
+    if unpaired > MOST_UNPAIRED * len(draws):
+        raise EngineError(
+            f"{unpaired} of {len(draws)} draws begin with another plan when the engine never thinks: "
+            "with the same seed they must not, and cannot be compared"
+        )
+    return outcome_table(paired, len(held), len(scenes) - len(held), unpaired)
+
+
+def _asked(labelled: LabelledScene, never: Sequence[Draw], adaptive: Sequence[Draw]) -> Asked:
+    """The trajectories of all first plans, then those of the second looks."""
+    trajectories: list[FloatArray] = [draw.trajectory for draw in never]
+    trajectories += [draw.trajectory for draw in adaptive if _looked(draw)]
+    return Moment.of(labelled), trajectories
+
+
+def _looked(draw: Draw) -> bool:
+    return draw.branch == "Thinking:"
+
+
+def _draws(
+    episode_id: str, never: Sequence[Draw], adaptive: Sequence[Draw], found: MomentOutcomes
+) -> Iterator[FollowedDraw | None]:
+    """Draws with their outcomes; None for those whose runs do not begin with the same plan."""
+    looks = iter(found.plans[len(never) :])
+    for alone, draw, first in zip(never, adaptive, found.plans[: len(never)], strict=True):
+        last = next(looks) if _looked(draw) else first
+        if alone.plan != draw.plan or draw.think_probability is None:
+            yield None
+        else:
+            yield FollowedDraw(episode_id, draw.think_probability, first, _looked(draw), last)
+
+
+def _episodes(asked: Sequence[Asked]) -> Iterator[list[Asked]]:
+    by_seed = sorted(asked, key=lambda each: each[0].seed)
+    for _, episode in groupby(by_seed, lambda each: each[0].seed):
+        yield list(episode)
+
+
+def follow_pairs(
+    pairs: Sequence[Pair],
+    scenes: Sequence[LabelledScene],
+    draws: Mapping[str, DrawsOf],
+    setting: EpisodeSetting,
+    workers: int,
+    keep: Path | None,
+    *,
+    quiet: bool,
+) -> dict[str, OutcomeTable]:
+    """The tables of all pairs by what is given; ``draws`` by the variants' names.
+
+    Raises as `followed_table` does.
+    """
+    kept = KeptOutcomes(keep)
+    # Progress goes to stderr, so that stdout holds nothing but the table.
+    with Progress(console=Console(stderr=True, quiet=quiet)) as progress:
+        task = progress.add_task("plans followed", total=len(scenes) * len(pairs))
+
+        def table(pair: Pair) -> OutcomeTable:
+            never, adaptive = draws[pair.never.name], draws[pair.adaptive.name]
+            return followed_table(
+                scenes, never, adaptive, setting, workers, kept, lambda: progress.advance(task)
+            )
+
+        return {pair.given: table(pair) for pair in pairs}
