@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 
 from clients.labelling.checks import FailedCheck
 from clients.labelling.ledger import Entry, Ledger, Record, Run
+from clients.labelling.outcomes import Followed, failure_of, followed_entries
 from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
 from clients.labelling.rollout import key_of
 from clients.labelling.teachers.teacher import (
@@ -24,6 +25,7 @@ from clients.labelling.teachers.teacher import (
     ask,
 )
 from model.driving.hashing import annotations_hash, hash_of
+from model.driving.outcome import Outcome, in_words
 from model.driving.plan import parse_plan
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
@@ -64,8 +66,10 @@ def questions(
 ) -> Iterator[Asked]:
     """What a teacher is to be asked: each kept scene with some of the plans that were kept of it.
 
-    Which plans is left to chance, once and for all for a scene and a seed.
+    Which plans is left to chance, once and for all for a scene and a seed. Where plans were followed, a
+    question says what its plan failed at.
     """
+    followed = followed_entries(ledger, rollout)
     for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None, group=group):
         kept = ledger.kept(key_of(rollout, labelled))
         if kept is None:
@@ -73,7 +77,9 @@ def questions(
         entry, draws = kept
         annotations = annotations_hash(labelled)
         for text in predicted_plans(entry, draws, plans_per_scene, seed):
-            yield Asked(entry, _question(labelled, entry, text, seed), annotations)
+            fate = followed.get(entry.key)
+            failure = None if fate is None else failure_of(text, entry, Followed.of(fate.record))
+            yield Asked(entry, _question(labelled, entry, text, seed, failure), annotations)
 
 
 def predicted_plans(entry: Entry, draws: Sequence[int], count: int, seed: int) -> list[str]:
@@ -87,7 +93,12 @@ def predicted_plans(entry: Entry, draws: Sequence[int], count: int, seed: int) -
 def jobs(run: Run, asked: Iterator[Asked]) -> Iterator[Job[Asked]]:
     """Questions as pieces of work."""
     for each in asked:
-        key = hash_of(run.id, each.entry.key, str(each.question.predicted), each.annotations)
+        question = each.question
+        parts: list[str] = [run.id, each.entry.key, str(question.predicted), each.annotations]
+        # Another hint, another question; without one it is as it always was.
+        if question.outcome is not None:
+            parts.append(in_words(question.outcome))
+        key = hash_of(*parts)
         yield Job(key, each.entry.scene_id, each)
 
 
@@ -122,6 +133,7 @@ def record(asked: Asked, reflection: Reflection) -> Record:
     return {
         "rollout": asked.entry.key,
         "predicted_plan": str(asked.question.predicted),
+        "failure": None if asked.question.outcome is None else in_words(asked.question.outcome),
         "expert_plan": str(asked.question.expert),
         "reflection": reflection.text,
         "attempts": reflection.attempts,
@@ -138,6 +150,8 @@ def _told(failed: Sequence[FailedCheck]) -> list[str]:
     return [f"{each.check}: {each.detail}" for each in failed]
 
 
-def _question(labelled: LabelledScene, entry: Entry, predicted: str, seed: int) -> Question:
+def _question(
+    labelled: LabelledScene, entry: Entry, predicted: str, seed: int, failure: Outcome | None
+) -> Question:
     expert = parse_plan(entry.record["expert_plan"])
-    return Question(labelled.scene, parse_plan(predicted), expert, Surroundings.of(labelled), seed)
+    return Question(labelled.scene, parse_plan(predicted), expert, Surroundings.of(labelled), seed, failure)

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import ray
 
 from clients import wire
-from clients.labelling import label, rollout
+from clients.labelling import label, outcomes, rollout
 from clients.labelling.ledger import Entered, Entry, Ledger, Run
 from clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
 from clients.labelling.rollout import PATIENCE, Sampling, roll_out
@@ -35,6 +35,7 @@ class Chunk:
         done: keys that are not to be done again.
         begun: answers to questions that were broken off; for labelling.
         kept: rollouts of scenes that were kept, with their draws; for labelling.
+        followed: what came of their plans, where they were followed; for labelling.
     """
 
     file: Path
@@ -42,6 +43,7 @@ class Chunk:
     done: frozenset[str]
     begun: Entered
     kept: tuple[tuple[Entry, list[int]], ...] = ()
+    followed: tuple[Entry, ...] = ()
 
 
 class Work(Protocol):
@@ -99,6 +101,9 @@ class LabelWork:
             book.run(run.stage, run.config)
         for entry, _ in chunk.kept:
             book.finish(self.rollout, entry.key, entry.scene_id, entry.record)
+        outcomes_run = book.run("outcomes", outcomes.config_of(self.rollout))
+        for entry in chunk.followed:
+            book.finish(outcomes_run, entry.key, entry.scene_id, entry.record)
         book.keep(self.rollout, [(entry.key, draws) for entry, draws in chunk.kept])
         book.take_over(self.run, chunk.begun)
         asked = label.questions(
@@ -129,6 +134,7 @@ def chunks(ledger: Ledger, run: Run, scenes: Path, rollout: Run | None = None) -
     """The row groups of scene files; with a ``rollout`` those with kept scenes, and what is kept."""
     kept: dict[str, list[tuple[Entry, list[int]]]] = {}
     begun = ledger.begun(run)
+    followed = {} if rollout is None else outcomes.followed_entries(ledger, rollout)
     if rollout is not None:
         for entry in ledger.entries(rollout):
             found = ledger.kept(entry.key)
@@ -138,7 +144,9 @@ def chunks(ledger: Ledger, run: Run, scenes: Path, rollout: Run | None = None) -
         for group, names in enumerate(row_groups(file)):
             mine = tuple(each for name in names for each in kept.get(name, ()))
             if rollout is None or mine:
-                yield Chunk(file.resolve(), group, frozenset(ledger.keys_of(run, names)), begun, mine)
+                fates = tuple(followed[entry.key] for entry, _ in mine if entry.key in followed)
+                done = frozenset(ledger.keys_of(run, names))
+                yield Chunk(file.resolve(), group, done, begun, mine, fates)
 
 
 def work_on_ray(

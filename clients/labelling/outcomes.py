@@ -40,11 +40,25 @@ def followed_plans(ledger: Ledger, rollout: Run) -> Mapping[str, Followed]:
     Raises:
         LedgerError: nothing is.
     """
+    found = followed_entries(ledger, rollout)
+    if not found:
+        raise LedgerError("no plan of that rollout was followed: run `looktwice build outcomes` first")
+    return {key: Followed.of(entry.record) for key, entry in found.items()}
+
+
+def followed_entries(ledger: Ledger, rollout: Run) -> dict[str, Entry]:
+    """What is entered of a rollout's plans that were followed, by the rollout's keys; may be empty."""
     config = config_of(rollout)
     run = next((run for run in ledger.runs("outcomes") if run.config == config), None)
-    if run is None:
-        raise LedgerError("no plan of that rollout was followed: run `looktwice build outcomes` first")
-    return {entry.record["rollout"]: Followed.of(entry.record) for entry in ledger.entries(run)}
+    return {} if run is None else {entry.record["rollout"]: entry for entry in ledger.entries(run)}
+
+
+def failure_of(plan: str, entry: Entry, followed: Followed) -> Outcome | None:
+    """What a free draw's plan came to where it fails (`plans_that_fail`); None where it does not."""
+    free = entry.record["free"]
+    failing = (draw for draw in plans_that_fail(entry, followed) if free[draw]["plan"] == plan)
+    draw = next(failing, None)
+    return None if draw is None else followed.plans[draw]
 
 
 def plans_that_fail(entry: Entry, followed: Followed) -> tuple[int, ...]:

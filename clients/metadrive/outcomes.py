@@ -79,8 +79,7 @@ def judged(followed: Forked, expert_m: float, *, needs_comfort: bool = False) ->
             itself: a person who runs into the road leaves no comfortable way.
     """
     uncomfortable_s, uncomfortable = _discomfort(followed)
-    # An expert that backs out from behind an obstacle asks nobody to drive backwards.
-    due_m = max(expert_m, 0.0)
+    due_m = max(expert_m, 0.0)  # see `Outcome.behind_m`
     behind_m = due_m - followed.driven_m
     collided = followed.collided_s is not None
     found: dict[FailureName, bool] = {

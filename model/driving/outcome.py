@@ -49,8 +49,11 @@ class Outcome:
 
     @property
     def behind_m(self) -> float:
-        """How many metres less than the expert it drove along the route; below 0 where it drove more."""
-        return self.expert_m - self.driven_m
+        """How many metres less than the expert it drove along the route; below 0 where it drove more.
+
+        An expert that backs out from behind an obstacle asks nobody to drive backwards.
+        """
+        return max(self.expert_m, 0.0) - self.driven_m
 
     @property
     def progress(self) -> float:
@@ -65,3 +68,28 @@ class Outcome:
     def from_json(cls, told: Mapping[str, Any]) -> Outcome:
         """Read what `to_json` told."""
         return cls(**{**told, "fails": cast("tuple[FailureName, ...]", tuple(told["fails"]))})
+
+
+def in_words(outcome: Outcome) -> str:
+    """What a failing plan comes to, such as ``collides with an obstacle after 2.1 s``; "" where it holds."""
+    return ", ".join(_told(name, outcome) for name in outcome.fails)
+
+
+def _told(name: FailureName, outcome: Outcome) -> str:
+    match name:
+        case "collision":
+            hit = outcome.hit or "obstacle"
+            return (
+                f"collides with {'an' if hit[0] in 'aeiou' else 'a'} {hit} after {outcome.collided_s:.1f} s"
+            )
+        case "off_road":
+            return f"leaves the road after {outcome.off_road_s:.1f} s"
+        case "off_route":
+            return f"leaves the lanes of its route after {outcome.off_route_s:.1f} s"
+        case "comfort":
+            bound = (outcome.uncomfortable or "").replace("_", " ")
+            return f"has too much {bound} after {outcome.uncomfortable_s:.1f} s"
+        case "behind":
+            return f"falls behind by {outcome.behind_m:.0f} m"
+        case "ahead":
+            return f"goes {-outcome.behind_m:.0f} m too far"

@@ -8,6 +8,7 @@ from typing import Final
 
 from clients.labelling.checks import MOST_WORDS, FailedCheck
 from clients.labelling.teachers.teacher import Question
+from model.driving.outcome import in_words
 from model.driving.plan import WORDS
 from model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE, Clip
 
@@ -80,6 +81,13 @@ def user_message(question: Question, complaints: Sequence[FailedCheck]) -> list[
     parts.append(
         Text(f"The better plan, for you alone:\n{question.expert}\nYour plan:\n{question.predicted}")
     )
+    if question.outcome is not None:
+        parts.append(
+            Text(
+                f"A hint, for you alone: driven as it is, your plan {in_words(question.outcome)}. "
+                "Look for what shows that now, and name it only as far as you see it."
+            )
+        )
     if complaints:
         told = "\n".join(f"- {each.detail}" for each in dict.fromkeys(complaints))
         parts.append(Text(f"You wrote a paragraph before that cannot be used. This time:\n{told}"))

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from clients.labelling.checks import FailedCheck
+from clients.labelling.teachers.preference import remedies_first
 from clients.labelling.teachers.teacher import AnnotationsMissing, Answer, NothingInView, Question
 from model.driving.direction import Change, wanted_changes
 from model.driving.plan import Group, Plan, format_tick
@@ -49,7 +50,7 @@ class RuleTeacher:
         scene, predicted, expert = question.scene, question.predicted, question.expert
         chance = random.Random(f"{scene.scene_id}/{question.seed}/{len(complaints)}/{predicted}")
         view = view_of(scene, question.surroundings)
-        changes = wanted_changes(predicted, expert)
+        changes = remedies_first(wanted_changes(predicted, expert), question.outcome)
         if not changes:
             return Answer(_nothing_to_change(view, chance))
         told = (_on(min(each), view, predicted, expert, chance) for each in changes)

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple, Protocol
 
 from clients.labelling.checks import FailedCheck, check_reflection
 from clients.labelling.teachers.patience import TryLater
+from model.driving.outcome import Outcome
 from model.driving.plan import Plan
 from model.driving.scene import Scene
 from model.driving.view import Surroundings
@@ -77,6 +78,8 @@ class Question:
         expert: the better plan, which the answer leads to and must not mention.
         surroundings: annotations of the scene, where there are some.
         seed: asked again with another one, a teacher may say it otherwise.
+        outcome: what the predicted plan came to when it was followed, where that is known and it failed: a
+            hint at what to look for, which no driver can know and no answer may tell.
     """
 
     scene: Scene
@@ -84,6 +87,7 @@ class Question:
     expert: Plan
     surroundings: Surroundings | None = None
     seed: int = 0
+    outcome: Outcome | None = None
 
 
 class Teacher(Protocol):

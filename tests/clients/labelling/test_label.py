@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from clients.labelling import outcomes
 from clients.labelling.batch import BatchError, batch_requests, read_results, take_results
 from clients.labelling.checks import FailedCheck
 from clients.labelling.export import DATASET, PARTS_FILE, reflections, right_plans, write_messages
@@ -15,6 +16,7 @@ from clients.labelling.label import Asked, config_of, jobs, labeller, predicted_
 from clients.labelling.ledger import Entry, Ledger, LedgerError, Run
 from clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
 from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from clients.labelling.teachers.prompt import Text, user_message
 from clients.labelling.teachers.rules import RuleTeacher
 from clients.labelling.teachers.teacher import (
     Answer,
@@ -23,6 +25,7 @@ from clients.labelling.teachers.teacher import (
     TeacherClosed,
     TeacherError,
 )
+from model.driving.outcome import Outcome
 from model.driving.reflection_store import ReflectionFileError, read_reflections, write_reflections
 from model.driving.scene_store import read_scenes, write_scenes
 from tests.clients.labelling.builds import (
@@ -87,6 +90,46 @@ def test_every_kept_scene_is_asked_about(ledger: Ledger, file: Path) -> None:
         assert entry.record["predicted_plan"] == str(KEEP_ON)
         assert entry.record["expert_plan"] == str(SLOW_DOWN)
         assert (entry.record["attempts"], entry.record["failed_checks"]) == (1, [])
+
+
+class Attentive(Scripted):
+    """Remembers its questions."""
+
+    def __init__(self) -> None:
+        super().__init__(Answer(GOOD))
+        self.questions: list[Question] = []
+
+    async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
+        self.questions.append(question)
+        return await super().reflect(question, complaints)
+
+
+def test_a_question_tells_what_its_plan_failed_at(ledger: Ledger, file: Path) -> None:
+    teacher = Attentive()
+    run, _ = labelled(ledger, file, teacher)
+    assert {question.outcome for question in teacher.questions} == {None}
+
+    rollout = ledger.the_run("rollout")
+    followed = ledger.run("outcomes", outcomes.config_of(rollout))
+    holds = Outcome((), None, None, None, None, None, None, 60.0, 60.0)
+    late = replace(holds, fails=("behind",), driven_m=42.0)
+    for entry, first in zip(ledger.entries(rollout), (late, late, holds), strict=False):
+        record = {
+            "rollout": entry.key,
+            "expert": holds.to_json(),
+            "plans": [first.to_json(), holds.to_json()],
+        }
+        ledger.finish(followed, f"o-{entry.key}", entry.scene_id, record)
+    again = Attentive()
+    _, tally = labelled(ledger, file, again)
+    assert (tally.done, tally.earlier) == (2, SCENES - 2), "another hint is another question"
+    assert {question.outcome for question in again.questions} == {late}
+    told = [entry.record["failure"] for entry in ledger.entries(run)]
+    assert sorted(told, key=str) == [None] * SCENES + ["falls behind by 18 m"] * 2
+    parts = user_message(again.questions[0], ())
+    assert any(isinstance(part, Text) and "your plan falls behind by 18 m" in part.text for part in parts)
+    parts = user_message(teacher.questions[0], ())
+    assert not any(isinstance(part, Text) and "A hint" in part.text for part in parts)
 
 
 def test_plans_are_chosen_by_chance_once_and_for_all() -> None:
