@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from model.engines.engine import Draw, DrawFinished, Engine, PlanRequest
-from model.formats.cf_vla import FORMATS
+from model.formats.cf_vla import formats_of
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import FormatError
 from model.formats.text import parse
@@ -113,8 +113,10 @@ class PlainVllm(Contender):
         from model.network.checkpoint import read_parts
 
         self._engine, self._max_tokens = engine, max_tokens
-        self._vocabulary = read_parts(checkpoint).vocabulary
-        self._formats = {name: CompiledFormat(each, self._vocabulary) for name, each in FORMATS.items()}
+        parts = read_parts(checkpoint)
+        self._vocabulary = parts.vocabulary
+        formats = formats_of(parts.settings.reflection)
+        self._formats = {name: CompiledFormat(each, self._vocabulary) for name, each in formats.items()}
 
     async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
         """Answer requests that arrive at once."""
@@ -154,8 +156,9 @@ class Transformers(Contender):
         from model.network.checkpoint import load
 
         self._loaded = load(checkpoint, dtype, device)
+        formats = formats_of(self._loaded.settings.reflection)
         self._formats = {
-            name: CompiledFormat(each, self._loaded.vocabulary) for name, each in FORMATS.items()
+            name: CompiledFormat(each, self._loaded.vocabulary) for name, each in formats.items()
         }
         self._max_tokens, self._cache = max_tokens, cache
 

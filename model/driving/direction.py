@@ -8,16 +8,27 @@ the opposite.
 from __future__ import annotations
 
 import re
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
-from model.driving.plan import TICKS, Group, Plan
+from model.driving.plan import GROUPS, TICKS, Group, Plan
 
 Change = Literal["slower", "faster", "left", "right", "straight", "lane_left", "lane_right", "keep_lane"]
+CHANGES: Final[tuple[Change, ...]] = get_args(Change)
+"""Track by track, in the order of a plan's tracks."""
 
-_LEVEL: Final = {"Accelerate": 1.0, "Keep Speed": 0.0, "Decelerate": -1.0, "Wait": -1.0, "Reverse": -1.0}
+_LEVEL: Final = {"Accelerate": 1, "Keep Speed": 0, "Decelerate": -1, "Wait": -1, "Reverse": -1}
 _CHANGE_OF: Final[dict[Group, dict[str, Change]]] = {
     "lateral": {"Left Turn": "left", "Right Turn": "right", "Straight": "straight"},
     "lane": {"Left Lane Change": "lane_left", "Right Lane Change": "lane_right", "Keep Lane": "keep_lane"},
+}
+_GAINS: Final[dict[Change, dict[str, int]]] = {
+    "slower": {word: -level for word, level in _LEVEL.items()},
+    "faster": _LEVEL,
+    **{
+        change: {word: int(each == change) for word, each in words.items()}
+        for words in _CHANGE_OF.values()
+        for change in words.values()
+    },
 }
 _PACE: Final[dict[Change, tuple[str, ...]]] = {"slower": ("Decelerate", "Wait"), "faster": ("Accelerate",)}
 MIN_TICKS: Final = 5
@@ -114,15 +125,37 @@ def wanted_changes(before: Plan, after: Plan) -> list[frozenset[Change]]:
 
     Tracks that differ for less than half a second are left out, and those whose change has no direction.
     """
-    found: list[frozenset[Change]] = []
-    levels = [
-        sum(_LEVEL[plan.word_at("longitudinal", tick) or "Keep Speed"] for tick in range(TICKS))
-        for plan in (before, after)
-    ]
-    if abs(levels[1] - levels[0]) >= MIN_TICKS:
-        found.append(frozenset({"slower" if levels[1] < levels[0] else "faster"}))
-    found += [_longer(before, after, group) for group in _CHANGE_OF]
-    return [changes for changes in found if changes]
+    return [changes for group in GROUPS if (changes := track_changes(before, after, group))]
+
+
+def track_changes(before: Plan, after: Plan, group: Group) -> frozenset[Change]:
+    """The directions, each for half a second or longer, in which one track changes."""
+    return frozenset(
+        change
+        for change in CHANGES
+        if group_of(change) == group and done(after, change) >= needed(before, change)
+    )
+
+
+def group_of(change: Change) -> Group:
+    """The track that a change is of."""
+    return next((group for group, words in _CHANGE_OF.items() if change in words.values()), "longitudinal")
+
+
+def gain(change: Change, word: str) -> int:
+    """How much a tick with a word of the change's track counts for it: -1, 0 or 1."""
+    return _GAINS[change][word]
+
+
+def done(plan: Plan, change: Change) -> int:
+    """How much a plan does of what a change asks for more of, in ticks."""
+    track = plan.track(group_of(change)) or ()
+    return sum((action.end - action.start) * gain(change, action.word) for action in track)
+
+
+def needed(before: Plan, change: Change) -> int:
+    """How much a plan has to do, as `done` counts, to be changed in a direction; beyond `TICKS` none can."""
+    return done(before, change) + MIN_TICKS
 
 
 def told_changes(text: str) -> dict[Change, int]:
@@ -187,15 +220,6 @@ def _done_in(plan: Plan) -> set[Change]:
     for group, changes in _CHANGE_OF.items():
         ticks |= {change: _ticks(plan, group, word) for word, change in changes.items()}
     return {change for change, count in ticks.items() if count >= MIN_TICKS}
-
-
-def _longer(before: Plan, after: Plan, group: Group) -> frozenset[Change]:
-    """The words of a track that ``after`` says for longer."""
-    return frozenset(
-        change
-        for word, change in _CHANGE_OF[group].items()
-        if _ticks(after, group, word) - _ticks(before, group, word) >= MIN_TICKS
-    )
 
 
 def _ticks(plan: Plan, group: Group, *words: str) -> int:

@@ -6,9 +6,9 @@ No torch here; a vocabulary is anything that satisfies `Vocabulary`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -24,12 +24,14 @@ from model.formats.pieces import (
     FreeText,
     Literal,
     Maybe,
+    Narrowing,
     Piece,
     Section,
     Sequence,
     Shorthand,
     Texts,
     Values,
+    narrowing_sections,
 )
 from model.formats.plan_tracks import with_given
 from model.formats.starts import check, first_bytes
@@ -96,6 +98,10 @@ class Ways(NamedTuple):
 Active = Run | AtChoice | InText | AtCode | Ways
 Rest = tuple[Piece, str, "Rest"] | None
 """What comes behind the active piece: a linked list of pieces with the section each stands in."""
+Written = tuple[Token, "Written"] | None
+"""The tokens written in sections that narrow what comes behind them: a linked list, the last one first."""
+_MOST_EXPANDED: Final = 8192
+"""Shorthands whose meaning is remembered: those that plans narrow are many."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +140,7 @@ class CompiledFormat:
         self._first_bytes: dict[Piece, frozenset[int]] = {}
         self.sentence_ends = frozenset(id for mark in ".!?" for id in self.literal(mark)[-1:])
         """Ids of the tokens that end a sentence."""
+        self._narrowing = narrowing_sections(format.body)
         check(self)
 
     def start(self, given: Mapping[str, Plan] | None = None) -> Cursor:
@@ -142,7 +149,7 @@ class CompiledFormat:
         Raises:
             FormatError: ``given`` names a section without a plan, or a plan beyond the format.
         """
-        return self._enter((self.body(given), "", None))
+        return self._enter((self.body(given), "", None), None)
 
     def body(self, given: Mapping[str, Plan] | None = None) -> Piece:
         """The format's declaration, with the plans of the sections in ``given`` forced; see `start`."""
@@ -173,8 +180,25 @@ class CompiledFormat:
     def expanded(self, piece: Shorthand) -> Piece:
         """What a shorthand stands for."""
         if piece not in self._expanded:
+            if len(self._expanded) >= _MOST_EXPANDED:
+                self._expanded.clear()
             self._expanded[piece] = piece.expand()
         return self._expanded[piece]
+
+    def narrowed(self, piece: Narrowing, tokens: Iterable[Token]) -> Piece:
+        """What ``piece`` stands for behind tokens; see `Narrowing.narrowed`."""
+        ids: dict[str, list[int]] = {section: [] for section in piece.sections}
+        for token in tokens:
+            if token.section in ids:
+                ids[token.section].append(token.id)
+        return piece.narrowed({section: self._vocabulary.decode(each) for section, each in ids.items()})
+
+    def noted(self, written: Written, section: str, ids: Iterable[int]) -> Written:
+        """``written`` and further tokens, as far as they narrow anything."""
+        if section in self._narrowing:
+            for token in ids:
+                written = (Token(token, section), written)
+        return written
 
     def text(self, piece: FreeText) -> TextRules:
         """What the tokens of a free text may be."""
@@ -223,14 +247,14 @@ class CompiledFormat:
             self._tries[texts] = build_trie(texts, self.literal)
         return self._tries[texts]
 
-    def _enter(self, rest: Rest) -> Cursor:
+    def _enter(self, rest: Rest, written: Written) -> Cursor:
         """The cursor at the first token of ``rest``."""
         while rest is not None:
             piece, section, after = rest
             match piece:
                 case Literal(text):
                     if ids := self.literal(text):
-                        return Cursor(self, Run(ids, 0), section, after)
+                        return Cursor(self, Run(ids, 0), section, after, written)
                     rest = after
                 case Sequence(parts):
                     for part in reversed(parts):
@@ -239,25 +263,28 @@ class CompiledFormat:
                 case Section(name, body):
                     rest = (body, name, after)
                 case Choice():
-                    return self._at_node(piece, self.trie(piece), section, after)
+                    return self._at_node(piece, self.trie(piece), section, after, written)
                 case Maybe(inner):
-                    return self._either(self._enter((inner, section, after)), self._enter(after))
+                    there = self._enter((inner, section, after), written)
+                    return self._either(there, self._enter(after, written))
                 case FreeText():
-                    return Cursor(self, InText(piece, BEGUN), section, after)
+                    return Cursor(self, InText(piece, BEGUN), section, after, written)
                 case Codes():
-                    return Cursor(self, AtCode(piece, 0), section, after)
+                    return Cursor(self, AtCode(piece, 0), section, after, written)
+                case Narrowing():
+                    rest = (self.narrowed(piece, reversed(list(_each(written)))), section, after)
                 case Shorthand():
                     rest = (self.expanded(piece), section, after)
-        return Cursor(self, None, "", None)
+        return Cursor(self, None, "", None, written)
 
-    def _at_node(self, choice: Choice, node: Node, section: str, rest: Rest) -> Cursor:
+    def _at_node(self, choice: Choice, node: Node, section: str, rest: Rest, written: Written) -> Cursor:
         """The cursor at a node of a choice's trie; where an option may end there, also behind it."""
         if node.option is None:
-            return Cursor(self, AtChoice(choice, node), section, rest)
-        then = self._enter((choice.options[node.option].then, section, rest))
+            return Cursor(self, AtChoice(choice, node), section, rest, written)
+        then = self._enter((choice.options[node.option].then, section, rest), written)
         if not node.children:
             return then
-        return self._either(Cursor(self, AtChoice(choice, node), section, rest), then)
+        return self._either(Cursor(self, AtChoice(choice, node), section, rest, written), then)
 
     def _either(self, one: Cursor, other: Cursor) -> Cursor:
         """The cursor where the next token tells which of two it is; `check` makes sure that it can."""
@@ -265,7 +292,7 @@ class CompiledFormat:
         for cursor in (one, other):
             assert cursor.active is not None
             ways += cursor.active.ways if isinstance(cursor.active, Ways) else [(cursor.active, cursor.rest)]
-        return Cursor(self, Ways(tuple(ways)), one.section, None)
+        return Cursor(self, Ways(tuple(ways)), one.section, None, one.written)
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,6 +306,8 @@ class Cursor:
     """The section the next token belongs to."""
     rest: Rest = field(repr=False)
     """What comes behind the active piece; None where that is told with its `Ways`."""
+    written: Written = field(default=None, repr=False)
+    """What narrows the pieces that are still to come."""
 
     @property
     def done(self) -> bool:
@@ -316,7 +345,8 @@ class Cursor:
             if isinstance(cursor.active, Run):
                 ids, position = cursor.active
                 run += [Token(token, cursor.section) for token in ids[position:]]
-                cursor = cursor.compiled._enter(cursor.rest)
+                written = self.compiled.noted(cursor.written, cursor.section, ids[position:])
+                cursor = cursor.compiled._enter(cursor.rest, written)
                 continue
             allowed = cursor.allowed().ids
             if len(allowed) != 1:
@@ -327,26 +357,28 @@ class Cursor:
 
     def advance(self, token: int) -> Cursor:
         """The cursor behind ``token``; raises `FormatError` when it is not allowed here."""
+        written = self.compiled.noted(self.written, self.section, (token,))
         match self.active:
             case Run(ids, position) if ids[position] == token:
                 if position + 1 < len(ids):
-                    return self._at(Run(ids, position + 1))
-                return self.compiled._enter(self.rest)
+                    return self._at(Run(ids, position + 1), written)
+                return self.compiled._enter(self.rest, written)
             case AtChoice(choice, node) if token in node.children:
-                return self.compiled._at_node(choice, node.children[token], self.section, self.rest)
+                then = node.children[token]
+                return self.compiled._at_node(choice, then, self.section, self.rest, written)
             case InText(piece, state):
                 rules = self.compiled.text(piece)
-                then = rules.after(state, token)
-                if then is not None:
-                    if then.matched < rules.end:
-                        return self._at(InText(piece, then))
+                behind = rules.after(state, token)
+                if behind is not None:
+                    if behind.matched < rules.end:
+                        return self._at(InText(piece, behind), written)
                     if rules.end < len(rules.stop):
-                        return self._at(Run(rules.stop, rules.end))
-                    return self.compiled._enter(self.rest)
+                        return self._at(Run(rules.stop, rules.end), written)
+                    return self.compiled._enter(self.rest, written)
             case AtCode(piece, place) if _holds(self.compiled.codes(piece, place), token):
                 if place + 1 < piece.count:
-                    return self._at(AtCode(piece, place + 1))
-                return self.compiled._enter(self.rest)
+                    return self._at(AtCode(piece, place + 1), written)
+                return self.compiled._enter(self.rest, written)
             case Ways():
                 for way in self._ways():
                     if _holds(way.allowed().ids, token):
@@ -368,12 +400,21 @@ class Cursor:
             return self.compiled.text(piece).stop[state.matched]
         return None
 
-    def _at(self, active: Active) -> Cursor:
-        return Cursor(self.compiled, active, self.section, self.rest)
+    def _at(self, active: Active, written: Written) -> Cursor:
+        return Cursor(self.compiled, active, self.section, self.rest, written)
 
     def _ways(self) -> list[Cursor]:
         assert isinstance(self.active, Ways)
-        return [Cursor(self.compiled, active, self.section, rest) for active, rest in self.active.ways]
+        return [
+            Cursor(self.compiled, active, self.section, rest, self.written)
+            for active, rest in self.active.ways
+        ]
+
+
+def _each(written: Written) -> Iterator[Token]:
+    while written is not None:
+        token, written = written
+        yield token
 
 
 def _holds(ids: npt.NDArray[np.int64], token: int) -> bool:

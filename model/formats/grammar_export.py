@@ -2,9 +2,9 @@
 
 Every token is named by its id (``<[17]>``), so text is split into tokens as in training. Equal parts are
 written once, as rules of their own: such engines compile a grammar anew for every request. The grammar says
-what the cursor allows, but for two things about plans that would make it many times as long: it does not
-count a track's meta-actions, and a word may follow itself. Whoever decodes with it walks a `Cursor` along
-and takes over where that refuses a token.
+what the cursor allows, but for what would make it many times as long: it does not
+count a track's meta-actions, a word may follow itself, and what is written narrows nothing that comes behind
+it. Whoever decodes with it walks a `Cursor` along and takes over where that refuses a token.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ class _Exporter:
     def __init__(self, cursor: Cursor) -> None:
         self._cursor, self._compiled = cursor, cursor.compiled
         self._rules: dict[str, str] = {}
+        self._shorthands: dict[Shorthand, str] = {}
         self._names: dict[str | Piece | tuple[FreeText, TextState], str] = {}
         self._open: list[tuple[str, Piece | tuple[FreeText, TextState]]] = []  # with a name, but no rule yet
 
@@ -91,9 +92,13 @@ class _Exporter:
             case Codes(_, count):
                 return self._codes(piece, range(count))
             case Track() | TrackWord():
-                return self._later(replace(piece, segments_left=MAX_SEGMENTS, previous=None))
+                free = replace(piece, segments_left=MAX_SEGMENTS, previous=None, aim=None)
+                return self._later(replace(free, ticks=0) if isinstance(free, TrackWord) else free)
             case Shorthand():
-                return self._of(self._compiled.expanded(piece))
+                if piece not in self._shorthands:
+                    text = self._of(self._compiled.expanded(piece))
+                    self._shorthands[piece] = text and self._named(text)
+                return self._shorthands[piece]
 
     def _later(self, piece: Track | TrackWord) -> str:
         if piece not in self._names:

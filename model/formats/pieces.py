@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, TypeAlias
+from typing import ClassVar, Final, TypeAlias
 from typing import Literal as Literal_
 
 from model.driving.plan import Plan
@@ -240,6 +240,20 @@ class Compound(Shorthand):
         return None
 
 
+class Narrowing(Shorthand):
+    """A shorthand that stands for less behind some responses: what was written before narrows it.
+
+    `expand` tells all that it may stand for, in whichever response.
+    """
+
+    sections: ClassVar[tuple[str, ...]]
+    """The sections that narrow it, which must have ended before it."""
+
+    @abstractmethod
+    def narrowed(self, written: Mapping[str, str]) -> Piece:
+        """What it stands for behind the texts of `sections`; raises `FormatError` where nothing is left."""
+
+
 @dataclass(frozen=True)
 class Record(Shorthand):
     """A piece whose values become one mapping; every piece in it that has a value has a name."""
@@ -286,6 +300,12 @@ def holds(piece: Piece) -> int | None:
             return 1 if holds(inner) == 0 else None
         case _:
             return 1
+
+
+def narrowing_sections(piece: Piece) -> frozenset[str]:
+    """The sections whose texts narrow something within ``piece``."""
+    own = frozenset(piece.sections) if isinstance(piece, Narrowing) else frozenset()
+    return own.union(*map(narrowing_sections, _children(piece)))
 
 
 def repeatable(piece: Piece) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Final
+from functools import cache
+from typing import ClassVar, Final
 
+from model.driving.direction import Change, done, gain, group_of, needed
+from model.driving.phrases import Facts, PhraseError, agrees, read_facts
 from model.driving.plan import (
     GROUPS,
     TICKS,
@@ -19,12 +22,14 @@ from model.driving.plan import (
     parse_plan,
     plan_from_bins,
 )
+from model.driving.plan import Track as DrivingTrack
 from model.formats.pieces import (
     Choice,
     Compound,
     FormatError,
     Literal,
     Maybe,
+    Narrowing,
     Option,
     Piece,
     Section,
@@ -33,6 +38,9 @@ from model.formats.pieces import (
     Value,
 )
 
+FIRST_PLAN: Final = "plan"
+REFLECTION: Final = "thinking"
+"""The sections that a revised plan is narrowed by."""
 MAX_SEGMENTS: Final = 12
 """Meta-actions in one track at most: the labeller's shortest is 0.5 s, and responses stay bounded."""
 
@@ -41,10 +49,17 @@ _BULLETS: Final = re.compile(r"(?:(?:  )?- .*\n?)*")
 
 @dataclass(frozen=True)
 class PlanTracks(Compound):
-    """A plan's bullet text over ``groups``; only partitions of the horizon can be written."""
+    """A plan's bullet text over ``groups``; only partitions of the horizon can be written.
+
+    Attributes:
+        kept: tracks that are forced.
+        aims: what other tracks have to reach.
+    """
 
     groups: tuple[Group, ...] = GROUPS
     name: str | None = None
+    kept: tuple[tuple[Group, DrivingTrack], ...] = ()
+    aims: tuple[Aim, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.groups or self.groups != tuple(group for group in GROUPS if group in self.groups):
@@ -52,18 +67,21 @@ class PlanTracks(Compound):
 
     def expand(self) -> Sequence:
         """The plan in simpler pieces."""
-        return Sequence(
-            tuple(
-                piece
-                for group in self.groups
-                for piece in (Literal(f"- {group}\n"), Track(group, start=0, segments_left=MAX_SEGMENTS))
-            )
-        )
+        kept, aims = dict(self.kept), {group_of(aim.change): aim for aim in self.aims}
+        parts: list[Piece] = []
+        for group in self.groups:
+            if group in kept:
+                parts += _written_out(group, kept[group])
+            else:
+                start = Track(group, start=0, segments_left=MAX_SEGMENTS, aim=aims.get(group))
+                parts += [Literal(f"- {group}\n"), start]
+        return Sequence(tuple(parts))
 
     def join(self, parts: tuple[Value, ...]) -> Plan:
         """The plan of end times and words, as they are read in turns."""
-        tracks: dict[str, tuple[MetaAction, ...]] = {}
-        texts, start, groups = iter(map(str, parts)), 0, iter(self.groups)
+        tracks: dict[str, DrivingTrack] = {**dict(self.kept)}
+        texts, start = iter(map(str, parts)), 0
+        groups = iter(group for group in self.groups if group not in tracks)
         actions: list[MetaAction] = []
         for time, word in zip(texts, texts, strict=True):
             end = int(time.replace(".", ""))
@@ -81,12 +99,19 @@ class PlanTracks(Compound):
         tracks = plan_from_bins(value.bins()).tracks()
         if tuple(group for group, _ in tracks) != self.groups:
             raise FormatError(f"a plan with the groups {', '.join(self.groups)} is needed, got {tracks}")
+        kept = dict(self.kept)
         for group, track in tracks:
             if len(track) > MAX_SEGMENTS:
                 raise FormatError(f"track {group} has more than {MAX_SEGMENTS} meta-actions")
+            if kept.get(group, track) != track:
+                raise FormatError(f"track {group} is to stay as it is: {kept[group]}")
+        for aim in self.aims:
+            if done(value, aim.change) < aim.ticks:
+                raise FormatError(f"track {group_of(aim.change)} does too little {aim.change}")
         return tuple(
             text
-            for _, track in tracks
+            for group, track in tracks
+            if group not in kept
             for action in track
             for text in (format_tick(action.end), f" {action.word}")
         )
@@ -102,44 +127,92 @@ class PlanTracks(Compound):
 
 
 @dataclass(frozen=True)
+class Aim:
+    """What a track has to do more of: at least ``ticks`` of it, counted as in `direction.done`."""
+
+    change: Change
+    ticks: int
+
+    def behind(self, word: str, ticks: int, left: int) -> Aim | None:
+        """What is left to do behind some ticks of a word; None where nothing can go wrong any more."""
+        rest = Aim(self.change, self.ticks - ticks * gain(self.change, word))
+        worst = min(gain(self.change, each) for each in WORDS[group_of(self.change)])
+        return rest if rest.ticks > worst * left else None
+
+
+@cache
+def _most(change: Change, previous: str, left: int, segments_left: int) -> int:
+    """The most that ``left`` ticks behind a word can do for a change, in so many meta-actions."""
+    gains = {word: gain(change, word) for word in WORDS[group_of(change)] if word != previous}
+    best = max(gains.values())
+    if best > 0 or left < 2 or segments_left < 2:
+        return best * left
+    # The only word that does it stands before, so the next best one comes between, as short as possible.
+    return best + left - 1
+
+
+@dataclass(frozen=True)
 class Track(Shorthand):
     """The rest of one track from the tick ``start`` on, in at most ``segments_left`` meta-actions.
 
-    No word follows itself: ``previous`` is the word before ``start``.
+    No word follows itself: ``previous`` is the word before ``start``. ``aim`` is what the rest has to reach.
     """
 
     group: Group
     start: int
     segments_left: int
     previous: str | None = None
+    aim: Aim | None = None
 
     def expand(self) -> Sequence:
         """One meta-action's times in simpler pieces, and its word behind each end time."""
         first = TICKS if self.segments_left == 1 else self.start + 1
-        ends = tuple(
-            Option(format_tick(end), TrackWord(self.group, end, self.segments_left - 1, self.previous))
-            for end in range(first, TICKS + 1)
-        )
+        words = (self._word(end) for end in range(first, TICKS + 1))
+        ends = tuple(Option(format_tick(word.end), word) for word in words if word.words())
         return Sequence((Literal(f"  - {format_tick(self.start)}s-"), Choice(ends)))
+
+    def _word(self, end: int) -> TrackWord:
+        # Without an aim a word does not depend on how long it is said.
+        ticks = 0 if self.aim is None else end - self.start
+        return TrackWord(self.group, end, self.segments_left - 1, self.previous, self.aim, ticks)
 
 
 @dataclass(frozen=True)
 class TrackWord(Shorthand):
-    """The word of the meta-action that ends at the tick ``end``, and the rest of its track."""
+    """The word of the meta-action that ends at the tick ``end``, and the rest of its track.
+
+    With an ``aim`` the meta-action takes so many ``ticks``.
+    """
 
     group: Group
     end: int
     segments_left: int
     previous: str | None
+    aim: Aim | None = None
+    ticks: int = 0
 
     def expand(self) -> Sequence:
         """The words in simpler pieces; behind each the rest of the track, if there is one."""
         words = []
-        for word in WORDS[self.group]:
-            if word != self.previous:
-                rest = (Track(self.group, self.end, self.segments_left, word),) if self.end < TICKS else ()
-                words.append(Option(f" {word}", Sequence((Literal("\n"), *rest))))
+        for word in self.words():
+            aim = self.aim and self.aim.behind(word, self.ticks, TICKS - self.end)
+            rest = (Track(self.group, self.end, self.segments_left, word, aim),) if self.end < TICKS else ()
+            words.append(Option(f" {word}", Sequence((Literal("\n"), *rest))))
         return Sequence((Literal("s:"), Choice(tuple(words))))
+
+    def words(self) -> list[str]:
+        """The words that can be written here; with an aim those behind which it can be reached."""
+        aim, left = self.aim, TICKS - self.end
+        return [
+            word
+            for word in WORDS[self.group]
+            if word != self.previous
+            and (
+                aim is None
+                or self.ticks * gain(aim.change, word) + _most(aim.change, word, left, self.segments_left)
+                >= aim.ticks
+            )
+        ]
 
 
 @dataclass(frozen=True)
@@ -157,10 +230,7 @@ class GivenPlan(Compound):
         plan = plan_from_bins(self.plan.bins())
         parts: list[Piece] = []
         for group, track in plan.tracks():
-            parts.append(Literal(f"- {group}\n"))
-            for action in track:
-                texts = (f"  - {format_tick(action.start)}s-", format_tick(action.end))
-                parts += map(Literal, (*texts, "s:", f" {action.word}", "\n"))
+            parts += _written_out(group, track)
         return Sequence(tuple(parts))
 
     def join(self, parts: tuple[Value, ...]) -> Plan:
@@ -172,6 +242,58 @@ class GivenPlan(Compound):
         if not isinstance(value, Plan) or value.bins().tolist() != self.plan.bins().tolist():
             raise FormatError(f"another plan is given: {self.plan}")
         return ()
+
+
+@dataclass(frozen=True)
+class RevisedPlan(Narrowing):
+    """A plan behind a reflection in phrases: it changes in the directions that are stated, and in no other.
+
+    Tracks that nothing is stated of are those of the first plan.
+
+    Attributes:
+        given: what the plan is, where the caller gives it.
+    """
+
+    given: Plan | None = None
+    sections: ClassVar[tuple[str, ...]] = (FIRST_PLAN, REFLECTION)
+
+    def expand(self) -> Piece:
+        """Any plan."""
+        return PlanTracks() if self.given is None else GivenPlan(self.given)
+
+    def narrowed(self, written: Mapping[str, str]) -> Piece:
+        """The plans that a reflection leads to; raises `FormatError` where that is not the given one."""
+        first, facts = written_plan(written[FIRST_PLAN]), _facts(written[REFLECTION])
+        if self.given is not None:
+            if not agrees(facts, first, self.given):
+                raise FormatError(f"the plan behind {str(facts)!r} changes otherwise: {self.given}")
+            return GivenPlan(self.given)
+        stated = {group_of(change) for change in facts.changes}
+        kept = tuple((group, track) for group, track in first.tracks() if group not in stated)
+        return PlanTracks(
+            kept=kept, aims=tuple(Aim(change, needed(first, change)) for change in facts.changes)
+        )
+
+
+def written_plan(text: str) -> Plan:
+    """The plan in the text of a section; none of its tracks where it is empty."""
+    # The words that lead to a plan's first bullet belong to the format.
+    return parse_plan(text[text.index("- ") :]) if "- " in text else Plan()
+
+
+def _facts(text: str) -> Facts:
+    try:
+        return read_facts(text.strip("\n"))
+    except PhraseError as error:
+        raise FormatError(str(error)) from error
+
+
+def _written_out(group: Group, track: DrivingTrack) -> Iterator[Piece]:
+    """A track in the pieces that the model would write it in."""
+    yield Literal(f"- {group}\n")
+    for action in track:
+        texts = (f"  - {format_tick(action.start)}s-", format_tick(action.end))
+        yield from map(Literal, (*texts, "s:", f" {action.word}", "\n"))
 
 
 def with_given(body: Piece, given: Mapping[str, Plan]) -> Piece:
@@ -200,7 +322,7 @@ def _with_given(piece: Piece, given: Mapping[str, Plan], section: str, left: set
             )
         case Maybe(inner, name):
             return Maybe(_with_given(inner, given, section, left), name)
-        case PlanTracks(_, name) if section in given:
+        case PlanTracks() | RevisedPlan() if section in given:
             left.discard(section)
             plan = given[section]
             for group, track in plan_from_bins(plan.bins()).tracks():
@@ -208,6 +330,8 @@ def _with_given(piece: Piece, given: Mapping[str, Plan], section: str, left: set
                     raise FormatError(
                         f"section {section!r}: track {group} has more meta-actions than the format allows"
                     )
-            return GivenPlan(plan, name)
+            if isinstance(piece, RevisedPlan):
+                return RevisedPlan(plan)
+            return GivenPlan(plan, piece.name)
         case _:
             return piece

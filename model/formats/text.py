@@ -14,6 +14,7 @@ from model.formats.pieces import (
     FreeText,
     Literal,
     Maybe,
+    Narrowing,
     Option,
     Piece,
     Record,
@@ -51,6 +52,7 @@ def parse(compiled: CompiledFormat, text: str, given: Mapping[str, Plan] | None 
 class _Reader:
     def __init__(self, compiled: CompiledFormat, text: str) -> None:
         self._compiled, self._text, self.position = compiled, text, 0
+        self._section, self._texts = "", dict[str, str]()
         self.sections: dict[str, _Parts] = {}
 
     def section(self, name: str) -> _Parts:
@@ -66,7 +68,9 @@ class _Reader:
                 for part in parts:
                     self.read(part, values)
             case Section(name, body):
+                before, self._section = self._section, name
                 self.read(body, self.section(name))
+                self._section = before
             case Choice(_, name):
                 option = self._option(piece)
                 values.append((name, option.text))
@@ -87,8 +91,21 @@ class _Reader:
                 values.append((name, {field: value for field, value in fields if field is not None}))
             case Compound():
                 values.append((piece.name, self._compound(piece)))
+            case Narrowing():
+                written = {section: self._texts.get(section, "") for section in piece.sections}
+                try:
+                    narrowed = piece.narrowed(written)
+                except FormatError as error:
+                    raise self.error(error.message) from error
+                self.read(narrowed, values)
             case Shorthand():
                 self.read(self._compiled.expanded(piece), values)
+
+    def _go_to(self, end: int) -> None:
+        """What is up to ``end`` was read; it belongs to the innermost section."""
+        read = self._text[self.position : end]
+        self._texts[self._section] = self._texts.get(self._section, "") + read
+        self.position = end
 
     def error(self, message: str) -> FormatError:
         """An error at the position."""
@@ -99,14 +116,15 @@ class _Reader:
         if not self._text.startswith(text, self.position):
             found = self._text[self.position : self.position + len(text)]
             raise self.error(f"expected {text!r}, found {found!r}")
-        self.position += len(text)
+        self._go_to(self.position + len(text))
 
     def _option(self, choice: Choice) -> Option:
         # What follows a shorter option never goes on as a longer one does.
         found = choice.texts.longest_at(self._text, self.position)
         if found is None:
             raise self.error(f"expected one of {', '.join(map(repr, choice.texts.position_of))}")
-        position, self.position = found
+        position, end = found
+        self._go_to(end)
         return choice.options[position]
 
     def _free_text(self, piece: FreeText) -> str:
@@ -118,7 +136,7 @@ class _Reader:
             self._compiled.text(piece).spell(text)
         except FormatError as error:
             raise self.error(error.message) from error
-        self.position = end + len(piece.stop)
+        self._go_to(end + len(piece.stop))
         return text
 
     def _codes(self, piece: Codes) -> tuple[int, ...]:
@@ -127,7 +145,8 @@ class _Reader:
             found = self._compiled.spellings(piece, place).longest_at(self._text, self.position)
             if found is None:
                 raise self.error(f"expected {piece.alphabet} code {place + 1} of {piece.count}")
-            code, self.position = found
+            code, end = found
+            self._go_to(end)
             codes.append(code)
         return tuple(codes)
 

@@ -14,6 +14,7 @@ from model.formats.pieces import (
     FreeText,
     Literal,
     Maybe,
+    Narrowing,
     Piece,
     Record,
     Section,
@@ -135,6 +136,8 @@ class _Writer:
                 within = _InOrder(values, f"section {section!r}")
                 self.write(self._compiled.expanded(piece), section, within)
                 within.finish()
+            case Narrowing():
+                self.write(self._compiled.narrowed(piece, self.tokens), section, source)
             case Shorthand():
                 self.write(self._compiled.expanded(piece), section, source)
 

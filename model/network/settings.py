@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 from model.driving.facts import FACT_GROUPS
 from model.driving.scene import CAMERAS, CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE
+from model.formats.cf_vla import ReflectionLanguage
 from model.network.intent import INTENT_TOKENS
 
 CONFIG_KEY: Final = "looktwice"
@@ -26,6 +27,7 @@ class VlaSettings:
     Attributes:
         name: the checkpoint's name, shown to users.
         formats: response formats it was trained on.
+        reflection: what its reflections are written in (`model.formats.cf_vla.formats_of`).
         cameras: cameras it looks at, in the order of the prompt.
         image_width, image_height: pixels that pictures are resized to; multiples of a merged patch.
         codec_size: trajectory codes per stage.
@@ -39,6 +41,7 @@ class VlaSettings:
 
     name: str = "looktwice-nano"
     formats: tuple[str, ...] = ("cf_vla", "traj_only")
+    reflection: ReflectionLanguage = "free_text"
     cameras: tuple[str, ...] = (FRONT_WIDE, FRONT_TELE)
     image_width: int = 224
     image_height: int = 112
@@ -65,6 +68,10 @@ class VlaSettings:
             raise SettingsError(
                 f"scene_tokens must be 0 or at least {LEAST_SCENE_TOKENS}, got {self.scene_tokens}: "
                 "every group of facts is read from a token of its own"
+            )
+        if self.reflection not in (languages := get_args(ReflectionLanguage)):
+            raise SettingsError(
+                f"unknown language of reflections {self.reflection!r}; known are {', '.join(languages)}"
             )
         if not self.cameras or not self.formats:
             raise SettingsError("a checkpoint needs at least one camera and one response format")
@@ -132,6 +139,11 @@ class VlaSettings:
 
 
 NANO_SETTINGS: Final = VlaSettings(
-    image_width=336, image_height=168, temporal_patch_size=4, with_tracks=True, scene_tokens=18
+    reflection="phrases",
+    image_width=336,
+    image_height=168,
+    temporal_patch_size=4,
+    with_tracks=True,
+    scene_tokens=18,
 )
 """Of the model that is trained from scratch: motion is seen within one patch, over all four frames."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
 from model.driving.trajectory import HISTORY_STEPS, STEP_S, present_speed
-from model.formats.cf_vla import FORMATS
+from model.formats.cf_vla import formats_of
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import CODES
 from model.network.codec import TrajectoryCodec
@@ -123,7 +123,8 @@ class ResponseDataset(Dataset[Sample]):
         self._soft = SoftCodes(codec, codec.vectors(examples.history, examples.future))
         self._random = np.random.default_rng(seed)
         self._weights, self._pictures, self._vocabulary = weights, pictures, vocabulary
-        self._formats = {name: CompiledFormat(FORMATS[name], vocabulary) for name in ("cf_vla", "traj_only")}
+        formats = formats_of(inputs.settings.reflection)
+        self._formats = {name: CompiledFormat(format, vocabulary) for name, format in formats.items()}
         for reflection in reflections:
             # Before hours of training: the format must be able to say it.
             no_codes = [0] * CODES

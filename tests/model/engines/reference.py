@@ -16,7 +16,7 @@ from model.engines.binding import binding_of
 from model.engines.codes import LeastError
 from model.engines.engine import Draw, PlanRequest
 from model.engines.sampling import choose, probabilities, uniform
-from model.formats.cf_vla import FORMATS
+from model.formats.cf_vla import formats_of
 from model.formats.cursor import CompiledFormat, Token
 from model.formats.pieces import BRANCH, Format
 from model.formats.text import parse
@@ -58,9 +58,10 @@ Shares = dict[int, npt.NDArray[np.float64]]
 
 
 def reference_draws(
-    loaded: Loaded, request: PlanRequest, formats: Mapping[str, Format] = FORMATS
+    loaded: Loaded, request: PlanRequest, formats: Mapping[str, Format] | None = None
 ) -> list[Draw]:
     """All draws of a request, each from its own prompt."""
+    formats = formats or formats_of(loaded.settings.reflection)
     return [draw for draw, _ in reference(loaded, request, formats)]
 
 

@@ -33,7 +33,7 @@ from model.engines.torch.request import Request
 from model.engines.torch.rows import Row
 from model.engines.torch.runner import Prompt, Runner
 from model.engines.torch.shortcuts import Shortcuts
-from model.formats.cf_vla import FORMATS
+from model.formats.cf_vla import formats_of
 from model.formats.pieces import Format
 from model.network.checkpoint import Loaded, load
 from model.network.settings import NANO_SETTINGS, VlaSettings
@@ -136,7 +136,9 @@ mixes = st.builds(
 
 Formats = Mapping[str, Format]
 made_up: st.SearchStrategy[Formats] = st.one_of(
-    st.just(FORMATS), branching_formats().map(lambda format: {**FORMATS, "cf_vla": format})
+    st.just(formats_of("free_text")),
+    st.just(formats_of("phrases")),
+    branching_formats().map(lambda format: {**formats_of("free_text"), "cf_vla": format}),
 )
 """Those that there are, or one that nobody thought of in the place of `cf_vla`."""
 

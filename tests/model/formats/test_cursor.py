@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, parse_plan
-from model.formats.cf_vla import CF_VLA, FORMATS, MAX_THINKING_TOKENS, TRAJ_ONLY
+from model.formats.cf_vla import CF_VLA, MAX_THINKING_TOKENS, TRAJ_ONLY, formats_of
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import Format, FormatError, Value, Values
 from model.formats.plan_tracks import MAX_SEGMENTS
@@ -16,6 +16,7 @@ from tests.model.formats.strategies import VOCABULARY, branching_formats, cf_vla
 from tests.model.formats.test_laws import walk
 
 COMPILED = CompiledFormat(CF_VLA, VOCABULARY)
+FORMATS = formats_of("free_text")
 FULL = parse_plan("".join(f"- {group}\n  - 0.0s-6.4s: {WORDS[group][0]}\n" for group in GROUPS))
 PLAN = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n- lateral\n  - 0.0s-6.4s: Straight\n")
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.driving.plan import WORDS
-from model.formats.cf_vla import CF_VLA, FORMATS
+from model.formats.cf_vla import CF_VLA, formats_of
 from model.formats.cursor import AtChoice, CompiledFormat, Cursor
 from model.formats.grammar_export import to_lark
 from model.formats.pieces import Values
@@ -21,6 +21,7 @@ from tests.model.formats.test_laws import walk
 from tests.model.formats.vocabulary import SPECIAL
 
 COMPILED = CompiledFormat(CF_VLA, VOCABULARY)
+FORMATS = formats_of("free_text")
 PHRASED = CompiledFormat(PHRASES, VOCABULARY)
 
 

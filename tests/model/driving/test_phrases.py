@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model.driving.direction import CHANGES, done, group_of, needed, track_changes, wanted_changes
+from model.driving.phrases import (
+    NOTHING,
+    Bend,
+    Clear,
+    Facts,
+    PhraseError,
+    Room,
+    Statement,
+    Thing,
+    agrees,
+    corrected,
+    facts_of,
+    read_facts,
+)
+from model.driving.plan import GROUPS, Plan, parse_plan
+from tests.model.driving.strategies import facts
+from tests.model.formats.strategies import plans
+
+SLOWER = Statement(Thing("vehicle", "my lane", 25, "standing"), "too close", "slower")
+STAY = Statement(Clear(), "unnecessary", "keep_lane")
+
+
+def plan(longitudinal: str = "Keep Speed", lateral: str = "Straight", lane: str = "Keep Lane") -> Plan:
+    words = {"longitudinal": longitudinal, "lateral": lateral, "lane": lane}
+    return parse_plan("".join(f"- {group}\n  - 0.0s-6.4s: {word}\n" for group, word in words.items()))
+
+
+@given(facts())
+def test_facts_are_read_back_from_their_text(facts: Facts) -> None:
+    assert read_facts(str(facts)) == facts
+
+
+def test_a_reflection_reads_as_english() -> None:
+    assert str(Facts((SLOWER, STAY))) == (
+        "A standing vehicle is in my lane some 25 metres ahead. "
+        "Going on like this would bring me too close, so I should slow down sooner. "
+        "My lane is clear. Going on like this would be unnecessary, so I should stay in my lane."
+    )
+    assert read_facts(NOTHING) == Facts()
+
+
+@given(facts(), st.data())
+def test_no_other_text_is_a_reflection(facts: Facts, data: st.DataObject) -> None:
+    text = str(facts)
+    place, cut = data.draw(st.integers(0, len(text))), data.draw(st.integers(0, 9))
+    changed = (
+        text[:place] + data.draw(st.sampled_from(["", " ", "a", ".", "5", "left"])) + text[place + cut :]
+    )
+    found = facts_of(changed)
+    assert found is None or str(found) == changed
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", " ", "I should slow down.", f"{SLOWER}  {STAY}", f"{SLOWER} ", f"{STAY} {SLOWER}", f"{STAY} {STAY}"],
+)
+def test_free_text_is_refused(text: str) -> None:
+    with pytest.raises(PhraseError):
+        read_facts(text)
+
+
+@pytest.mark.parametrize(
+    ("cue", "consequence", "correction"),
+    [
+        (Room("left"), "stuck", "lane_right"),
+        (Clear(), "too close", "slower"),
+        (Bend("left"), "too fast", "stop"),
+        (Thing("vehicle", "my lane", 12), "too close", "slower"),
+        (Thing("vehicle", "my lane", 105), "too close", "slower"),
+        (Thing("pedestrian", "oncoming", 5), "too close", "slower"),
+        (Thing("cone", "my lane", 5, "braking"), "too close", "slower"),
+        (Bend("left", 0), "too fast", "slower"),
+    ],
+)
+def test_facts_that_do_not_go_together_are_refused(cue: object, consequence: str, correction: str) -> None:
+    with pytest.raises(PhraseError):
+        Statement(cue, consequence, correction)  # type: ignore[arg-type]  # what the test is about
+
+
+def test_a_track_is_named_once_and_in_order() -> None:
+    for statements in ((STAY, SLOWER), (SLOWER, SLOWER)):
+        with pytest.raises(PhraseError, match="one change of each track"):
+            Facts(statements)
+
+
+@given(plans(), plans(), facts())
+def test_the_corrected_plan_changes_as_stated_and_not_otherwise(
+    before: Plan, better: Plan, facts: Facts
+) -> None:
+    after = corrected(before, better, facts)
+    stated = {group_of(change): change for change in facts.changes}
+    for group in GROUPS:
+        assert after.track(group) == (better if group in stated else before).track(group)
+    holds = all(change in track_changes(before, better, group) for group, change in stated.items())
+    assert agrees(facts, before, after) == holds
+
+
+def test_a_change_that_is_not_stated_disagrees() -> None:
+    before, slower = plan(), plan("Decelerate")
+    assert agrees(Facts((SLOWER,)), before, slower)
+    assert not agrees(Facts(), before, slower)
+    assert agrees(Facts(), before, before)
+    assert not agrees(Facts((SLOWER,)), before, before)
+    assert not agrees(Facts((SLOWER,)), before, plan("Decelerate", lane="Left Lane Change"))
+    assert not agrees(Facts((SLOWER,)), before, plan("Accelerate"))
+
+
+@given(plans(), plans())
+def test_what_is_needed_for_a_change_is_what_wanted_changes_finds(before: Plan, after: Plan) -> None:
+    found = frozenset().union(*wanted_changes(before, after))
+    assert found == {change for change in CHANGES if done(after, change) >= needed(before, change)}
