@@ -6,7 +6,8 @@ import re
 from typing import Final, Literal, NamedTuple
 
 from clients.labelling.leaks import find_leaks
-from model.driving.direction import CORRECTION, agrees
+from model.driving.direction import CORRECTION, agrees, group_of, track_changes, wanted_changes
+from model.driving.phrases import Facts, facts_of
 from model.driving.plan import Plan
 
 MOST_WORDS: Final = 80
@@ -43,10 +44,13 @@ def check_reflection(text: str, predicted: Plan, expert: Plan) -> list[FailedChe
     """What is wrong with a reflection on ``predicted`` that leads to ``expert``; empty where nothing is.
 
     Args:
-        text: of a teacher.
+        text: of a teacher. One in phrases is checked by its facts: its form, its length and that every
+            change has a cue are given, and it may leave out changes of whole tracks.
         predicted: the model's own plan, which the text looks at.
         expert: the plan that comes behind the text.
     """
+    if (facts := facts_of(text)) is not None:
+        return _check_facts(facts, predicted, expert)
     failed: list[FailedCheck] = []
     if not text.strip():
         return [FailedCheck("form", "write one short paragraph")]
@@ -65,6 +69,17 @@ def check_reflection(text: str, predicted: Plan, expert: Plan) -> list[FailedChe
     if not agrees(text, predicted, expert):
         failed.append(FailedCheck("direction", "the text asks for another change than the plan needs"))
     return failed
+
+
+def _check_facts(facts: Facts, predicted: Plan, expert: Plan) -> list[FailedCheck]:
+    if not facts.statements and wanted_changes(predicted, expert):
+        return [FailedCheck("direction", "the plan needs a change, and none is stated")]
+    return [
+        FailedCheck("direction", f"the plan needs another change than {change!r} in track {group}")
+        for change in facts.changes
+        for group in [group_of(change)]
+        if change not in track_changes(predicted, expert, group)
+    ]
 
 
 def _is_anchored(text: str) -> bool:

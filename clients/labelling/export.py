@@ -12,6 +12,7 @@ from clients.labelling.ledger import Entry, Ledger, LedgerError, Run
 from clients.labelling.outcomes import followed_plans, plans_that_hold
 from clients.labelling.teachers.prompt import camera_line
 from model.driving.images import media_type
+from model.driving.phrases import corrected, facts_of
 from model.driving.plan import parse_plan
 from model.driving.reflection_store import LabelledReflection
 from model.driving.scene import Scene
@@ -25,14 +26,20 @@ DATASET: Final = "looktwice"
 
 
 def reflections(ledger: Ledger, label: Run) -> Iterator[LabelledReflection]:
-    """What a teacher wrote, with its provenance, scene by scene."""
+    """What a teacher wrote, with its provenance, scene by scene.
+
+    A reflection in phrases leads to the expert's plan in the tracks that it speaks of; the others stay as the
+    model planned them.
+    """
     rollout = _rollout_of(ledger, label)
     for entry in ledger.entries(label):
+        predicted, expert = (parse_plan(entry.record[f"{name}_plan"]) for name in ("predicted", "expert"))
+        facts = facts_of(entry.record["reflection"])
         yield LabelledReflection(
             scene_id=entry.scene_id,
-            predicted_plan=parse_plan(entry.record["predicted_plan"]),
+            predicted_plan=predicted,
             reflection=entry.record["reflection"],
-            expert_plan=parse_plan(entry.record["expert_plan"]),
+            expert_plan=expert if facts is None else corrected(predicted, expert, facts),
             key=entry.key,
             model=rollout.config["model"],
             model_revision=rollout.config["revision"],

@@ -31,7 +31,7 @@ from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
 from model.driving.view import Surroundings
 
-CHECKS_VERSION: Final = 2
+CHECKS_VERSION: Final = 3
 """Of `clients.labelling.checks` and what they are made of; raised when they ask for something else."""
 
 

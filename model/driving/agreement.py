@@ -11,7 +11,10 @@ from typing import Final, Literal, get_args
 from model.driving.claims import claims, unfounded
 from model.driving.direction import agrees, asked_changes
 from model.driving.labeller import label_plan
+from model.driving.phrases import agrees as changes_as_stated
+from model.driving.phrases import facts_of
 from model.driving.plan import Plan, plan_iou
+from model.driving.seen import all_shown
 from model.driving.trajectory import FloatArray
 from model.driving.view import View
 
@@ -97,8 +100,12 @@ def trajectory_iou(plan: Plan | None, trajectory: FloatArray, history: FloatArra
 def reason_and_change(thinking: str, plan: Plan, revised: Plan) -> bool | None:
     """Whether the revised plan changes as the reasoning asks for.
 
-    None where the plan stays as it is and the reasoning asks for nothing. See `direction.agrees`.
+    A reasoning in phrases is compared by its facts: the plan changes in the stated directions and in no
+    other. Free text is read as English, see `direction.agrees`; None where the plan stays as it is and the
+    text asks for nothing.
     """
+    if (facts := facts_of(thinking)) is not None:
+        return changes_as_stated(facts, plan, revised)
     if plan == revised:
         return False if asked_changes(thinking) else None
     return agrees(thinking, plan, revised)
@@ -106,4 +113,6 @@ def reason_and_change(thinking: str, plan: Plan, revised: Plan) -> bool | None:
 
 def reason_and_view(thinking: str, view: View) -> bool | None:
     """Whether everything that a reasoning says is to be seen is in view; None where it says nothing of it."""
+    if (facts := facts_of(thinking)) is not None:
+        return all_shown(facts, view)
     return not unfounded(thinking, view) if claims(thinking) else None

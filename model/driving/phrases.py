@@ -199,7 +199,7 @@ class Statement:
     correction: Correction
 
     def __post_init__(self) -> None:
-        if self.correction not in consequences(_head(self.cue)).get(self.consequence, ()):
+        if self.correction not in consequences(head_of(self.cue)).get(self.consequence, ()):
             raise PhraseError(f"{self.cue} is no reason for {self.correction!r} ({self.consequence})")
         self.texts()
 
@@ -301,7 +301,8 @@ def corrected(before: Plan, better: Plan, facts: Facts) -> Plan:
     return Plan(**{group: (better if group in stated else before).track(group) for group in GROUPS})
 
 
-def _head(cue: Cue) -> Head:
+def head_of(cue: Cue) -> Head:
+    """What a statement with a cue begins with."""
     match cue:
         case Thing(kind, _, _, state):
             return (kind, state)
@@ -312,7 +313,7 @@ def _head(cue: Cue) -> Head:
 
 
 def _texts_of(cue: Cue) -> tuple[str, ...]:
-    head = _head(cue)
+    head = head_of(cue)
     texts = [_text(HEADS, head)]
     if isinstance(cue, Thing):
         texts += [_text(_SPOTS, cue.place), _text(_AHEAD, cue.ahead_m)]

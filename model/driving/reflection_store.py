@@ -34,7 +34,8 @@ class LabelledReflection:
         scene_id: of a scene in the scene store.
         predicted_plan: what the model planned.
         reflection: a teacher's paragraph; empty where the plan is right and is to be acted on.
-        expert_plan: what it leads to.
+        expert_plan: what it leads to: the expert's plan, of which a reflection in phrases takes over the
+            tracks that it speaks of.
         key: of the label in the ledger it comes from.
         model, model_revision: who planned.
         teacher, teacher_revision: who wrote; empty where nobody did.

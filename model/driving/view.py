@@ -46,12 +46,14 @@ class Sight:
         ahead_m: from bumper to bumper along x.
         place: where, seen from the ego's lane.
         speed_ms: along x over the last second, over ground; NaN where it came into view since.
+        brakes: whether its brake lights are on.
     """
 
     kind: AgentKind
     ahead_m: float
     place: Place
     speed_ms: float
+    brakes: bool = False
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,8 @@ def _sight(agent: Agent, lane: Array) -> Sight:
     # All poses are in the ego frame of now: differences are speeds over ground.
     speed_ms = float(x - before[0]) / (_PAST_STEPS * STEP_S)
     length = agent.length_m if agent.kind == "vehicle" else 0.0
-    return Sight(agent.kind, max(0.0, x - (EGO_LENGTH_M + length) / 2), place, speed_ms)
+    ahead_m = max(0.0, x - (EGO_LENGTH_M + length) / 2)
+    return Sight(agent.kind, ahead_m, place, speed_ms, "brake" in agent.lights)
 
 
 def _own_lane(lane_lines: tuple[FloatArray, ...]) -> Array:

@@ -14,9 +14,9 @@ from typing import Final
 from model.network.corpus import driving_sentences
 
 _TEACHERS: Final = """
-allow am back be calls carry come do drawing drive drives ease eat fits foot get go going have hold holding i
-lets like me metre metres mind mine miss moves much my needlessly nothing of off one out pick run runs see
-sooner stands steer stretch stuck take unnecessary up what
+allow am back be bends calls carry come do drawing drive drives ease eat fits foot get go going have hold
+holding i lets like me metre metres mind mine miss moves much my needlessly nothing of off one out pick run
+runs see sooner stands steer stretch stuck take unnecessary up what
 """
 """Words of the built-in teacher that the corpus lacks."""
 _FILLINGS: Final = 200

@@ -128,7 +128,8 @@ class ResponseDataset(Dataset[Sample]):
         for reflection in reflections:
             # Before hours of training: the format must be able to say it.
             no_codes = [0] * CODES
-            make_target(self._formats["cf_vla"], reflection.first_plan, no_codes, weights, reflection)
+            plan = reflection.revised_plan or reflection.first_plan
+            make_target(self._formats["cf_vla"], plan, no_codes, weights, reflection)
 
     def __len__(self) -> int:
         return len(self._examples)

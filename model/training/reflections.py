@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from model.driving.phrases import facts_of
 from model.driving.reflection_store import LabelledReflection
 from model.training.examples import Examples
 from model.training.targets import Reflection
@@ -45,5 +46,7 @@ def reflections_on(examples: Examples, found: Iterable[LabelledReflection]) -> O
         if each.scene_id not in place_of:
             raise ValueError(f"there is a reflection on scene {each.scene_id}, which is not among the scenes")
         places.append(place_of[each.scene_id])
-        reflections.append(Reflection(each.predicted_plan, each.reflection.translate(_PLAIN)))
+        thinking = each.reflection.translate(_PLAIN)
+        revised = None if facts_of(thinking) is None else each.expert_plan
+        reflections.append(Reflection(each.predicted_plan, thinking, revised))
     return OnExamples(np.array(places, np.int64), reflections)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Literal, get_args
 
+from model.driving.direction import wanted_changes
 from model.driving.plan import Plan
 from model.formats.cursor import CompiledFormat, Token
 from model.formats.pieces import ACTION, BRANCH, THINKING, Values
@@ -30,11 +31,13 @@ Task = Literal["traj_only", "cf_vla"]
 class Reflection:
     """A counterfactual example's own parts: a plan of the model's own, and why it is to be corrected.
 
-    ``thinking`` is empty where it is not: such a plan is acted on.
+    ``thinking`` is empty where it is not: such a plan is acted on. ``revised_plan`` is what the reasoning
+    leads to, where that is not the expert's plan in all tracks.
     """
 
     first_plan: Plan
     thinking: str
+    revised_plan: Plan | None = None
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ def target_values(
             "plan": reflection.first_plan,
             BRANCH: THINKING,
             "thinking": reflection.thinking,
-            "revised_plan": plan,
+            "revised_plan": reflection.revised_plan or plan,
             "trajectory": trajectory,
         }
     )
@@ -101,6 +104,9 @@ def make_target(
 ) -> Target:
     """Render and weigh the expert's response in ``compiled``'s format.
 
+    Where a reflection leads to a plan that the expert's trajectory does not carry out, the trajectory weighs
+    nothing: it would teach to do otherwise than planned.
+
     Raises:
         ValueError: nothing is known about what to say in this format; a `FormatError` where it cannot say it.
     """
@@ -108,4 +114,7 @@ def make_target(
     # Plans of scenes without lanes lack a group, which the model by itself always writes.
     plans = {section: value for section in values if isinstance(value := values[section], Plan)}
     tokens = compiled.render(values, given=plans)
+    revised = None if reflection is None else reflection.revised_plan
+    if revised is not None and wanted_changes(revised, plan):
+        weights = {**weights, "trajectory": 0.0}
     return weigh(tokens, weights, counterfactual=reflection is not None)

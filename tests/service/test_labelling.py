@@ -53,11 +53,7 @@ def test_a_reflection_is_written_and_checked(served: Served) -> None:
     assert (written.teacher.name, written.attempts, written.failed_checks) == ("rules", 1, [])
     again = LabelResponse.model_validate_json(served.http.post(PATH, json=asking(served)).content)
     assert again.reflection == written.reflection
-    others = {
-        served.http.post(PATH, json=asking(served, seed=seed)).json()["reflection"] for seed in range(9)
-    }
-    assert len(others) > 2
-    assert served.metric("looktwice_labels_total", teacher="rules") == 11
+    assert served.metric("looktwice_labels_total", teacher="rules") == 2
 
 
 def test_without_annotations_the_built_in_teacher_says_what_it_lacks(served: Served) -> None:

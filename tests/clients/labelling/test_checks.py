@@ -8,7 +8,7 @@ import pytest
 from clients.labelling import checks, leaks
 from clients.labelling.checks import MOST_WORDS, check_reflection
 from clients.labelling.label import CHECKS_VERSION
-from model.driving import direction
+from model.driving import direction, phrases
 from model.driving.direction import agrees, wanted_changes
 from model.driving.plan import Plan, track_from_words
 
@@ -56,6 +56,21 @@ def test_a_grounded_reflection_passes() -> None:
 )
 def test_what_is_wrong_is_named(text: str, check: str) -> None:
     assert check in {failed.check for failed in check_reflection(text, FAST, SLOW)}
+
+
+def test_a_reflection_in_phrases_is_checked_by_its_facts() -> None:
+    def failed(text: str, predicted: Plan, expert: Plan) -> list[str]:
+        return [each.check for each in check_reflection(text, predicted, expert)]
+
+    slow = str(phrases.Statement(phrases.Bend("left", 20), "too fast", "slower"))
+    stay = str(phrases.Statement(phrases.Clear(), "unnecessary", "keep_lane"))
+    assert failed(slow, FAST, SLOW) == []
+    # It may leave out a track.
+    assert failed(slow, FAST, plan("Keep Speed|Decelerate", lane="Left Lane Change")) == []
+    assert failed(slow, SLOW, FAST) == ["direction"]
+    assert failed(f"{slow} {stay}", FAST, SLOW) == ["direction"]
+    assert failed(phrases.NOTHING, FAST, FAST) == []
+    assert failed(phrases.NOTHING, FAST, SLOW) == ["direction"]
 
 
 def test_the_limit_is_eighty_words() -> None:
@@ -146,7 +161,7 @@ def test_short_differences_ask_for_nothing() -> None:
 
 def test_other_checks_have_another_version() -> None:
     """What was checked otherwise does not count as done: a label's key holds the version."""
-    sources = [Path(str(module.__file__)).read_bytes() for module in (checks, direction, leaks)]
+    sources = [Path(str(module.__file__)).read_bytes() for module in (checks, direction, leaks, phrases)]
     digest = hashlib.sha256(b"".join(sources)).hexdigest()[:12]
     told = "raise CHECKS_VERSION if these ask for something else now, and tell both here"
-    assert (CHECKS_VERSION, digest) == (2, "56f661abfbd0"), told
+    assert (CHECKS_VERSION, digest) == (3, "1dfe5c3f0353"), told

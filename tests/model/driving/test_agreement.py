@@ -16,6 +16,19 @@ from model.driving.agreement import (
     trajectory_iou,
 )
 from model.driving.labeller import expert_plan, label_plan
+from model.driving.phrases import (
+    NOTHING,
+    Bend,
+    Clear,
+    Cue,
+    Junction,
+    Room,
+    Statement,
+    Straight,
+    Thing,
+    consequences,
+    head_of,
+)
 from model.driving.plan import MetaAction, Plan
 from model.driving.view import Sight, View
 from tests.model.driving.drives import MIDDLES_S, labelled_scene
@@ -55,6 +68,60 @@ def test_a_reasoning_is_held_against_the_view() -> None:
     assert reason_and_view(BRAKE, ahead) is True
     assert reason_and_view(BRAKE, replace(ahead, sights=())) is False
     assert reason_and_view("I should slow down.", ahead) is None
+
+
+def test_a_reasoning_in_phrases_is_held_against_what_changes_by_its_facts() -> None:
+    slower = str(Statement(Thing("vehicle", "my lane", 20, "standing"), "too close", "slower"))
+    assert reason_and_change(slower, KEEP, SLOW) is True
+    assert reason_and_change(slower, KEEP, KEEP) is False
+    turned = replace(SLOW, lateral=(MetaAction(0, 64, "Left Turn"),))
+    assert reason_and_change(slower, KEEP, turned) is False  # no turn is stated
+    assert reason_and_change(NOTHING, KEEP, KEEP) is True
+    assert reason_and_change(NOTHING, KEEP, SLOW) is False
+
+
+VAN = Sight("vehicle", 22.0, "my lane", 0.0)
+COMES = Sight("vehicle", 40.0, "the left lane", -9.0)
+BUSY = View(10.0, (VAN, COMES), "left", 30.0, frozenset({"right"}), frozenset({"left", "right"}))
+
+
+@pytest.mark.parametrize(
+    ("cue", "shown"),
+    [
+        (Thing("vehicle", "my lane", 20), True),
+        (Thing("vehicle", "my lane", 20, "standing"), True),
+        (Thing("vehicle", "my lane", 20, "slower"), True),
+        (Thing("vehicle", "my lane", 20, "braking"), False),
+        (Thing("vehicle", "my lane", 40), False),
+        (Thing("vehicle", "the right lane", 20), False),
+        (Thing("barrier", "my lane", 20), False),
+        (Thing("vehicle", "oncoming", 40), True),
+        (Thing("vehicle", "oncoming", 20), False),
+        (Bend("left"), True),
+        (Bend("left", 30), True),
+        (Bend("left", 60), False),
+        (Bend("right"), False),
+        (Straight(), False),
+        (Junction("right"), True),
+        (Junction("left"), False),
+        (Clear(), False),
+        (Room("right"), True),
+        (Room("left"), False),
+    ],
+)
+def test_a_cue_is_in_view_or_not(cue: Cue, shown: bool) -> None:
+    consequence, (correction, *_) = next(iter(consequences(head_of(cue)).items()))
+    assert reason_and_view(str(Statement(cue, consequence, correction)), BUSY) is shown
+
+
+def test_every_cue_must_be_in_view() -> None:
+    seen, unseen = (
+        Statement(Thing("vehicle", "my lane", metres), "too close", "slower") for metres in (20, 60)
+    )
+    turn = Statement(Junction("right"), "wrong way", "right")
+    assert reason_and_view(f"{seen} {turn}", BUSY) is True
+    assert reason_and_view(f"{unseen} {turn}", BUSY) is False
+    assert reason_and_view(NOTHING, BUSY) is None
 
 
 def test_all_that_disagrees_is_told() -> None:

@@ -1,10 +1,10 @@
 from __future__ import annotations
 
-import ast
-from pathlib import Path
+from hypothesis import given
 
-import clients.labelling.teachers.rules as rules
+from model.driving.phrases import Facts
 from model.evaluation.words import unknown_words, words_of
+from tests.model.driving.strategies import facts
 
 
 def test_misspelt_words_are_none() -> None:
@@ -20,19 +20,6 @@ def test_numbers_and_times_are_no_words() -> None:
     ]
 
 
-def test_every_word_of_the_built_in_teacher_is_one() -> None:
-    """The sentences that it writes; what it tells programmers is not among them."""
-    tree = ast.parse(Path(rules.__file__).read_text())
-    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
-    sentences = [
-        node.value
-        for function in functions
-        for statement in function.body
-        if not (isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant))
-        for node in ast.walk(statement)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
-    ]
-    names = [name for of in rules._NAMES.values() for name in of]
-    assert len(sentences) > 80
-    # The "s" of seconds stands behind a number that is filled in.
-    assert {word for text in (*sentences, *names) for word in unknown_words(text)} <= {"s"}
+@given(facts())
+def test_every_word_of_a_reflection_in_phrases_is_one(facts: Facts) -> None:
+    assert unknown_words(str(facts)) == []

@@ -2,10 +2,11 @@ from __future__ import annotations
 
 import pytest
 
-from model.driving.plan import parse_plan
-from model.formats.cf_vla import CF_VLA, TRAJ_ONLY
+from model.driving.phrases import Statement, Thing
+from model.driving.plan import Plan, parse_plan
+from model.formats.cf_vla import CF_VLA, CF_VLA_PHRASES, TRAJ_ONLY
 from model.formats.cursor import CompiledFormat
-from model.formats.pieces import Format, Values
+from model.formats.pieces import Format, FormatError, Values
 from model.formats.text import parse
 from model.training.targets import PAPER_WEIGHTS, Reflection, make_target
 from tests.model.formats.vocabulary import ByteVocabulary
@@ -65,6 +66,40 @@ def test_a_right_plan_of_its_own_is_acted_on_and_not_taught() -> None:
     assert values == Values.of({"plan": WRONG, "branch": "Action:", "trajectory": CODES})
     taught = [id for id, weight in zip(target.ids, target.weights, strict=True) if weight > 0]
     assert VOCABULARY.decode(taught).startswith("Action:")
+
+
+def test_a_reflection_in_phrases_leads_to_its_own_plan() -> None:
+    compiled = CompiledFormat(CF_VLA_PHRASES, VOCABULARY)
+    first, slower = three_tracks("Keep Speed", "Keep Lane"), three_tracks("Wait", "Keep Lane")
+    text = str(Statement(Thing("barrier", "my lane", 20), "too close", "slower"))
+    expert = three_tracks("Wait", "Left Lane Change")
+    target = make_target(compiled, expert, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
+    values = parse(compiled, VOCABULARY.decode(target.ids))
+    assert (values["thinking"], values["revised_plan"]) == (text, slower)
+    # The expert goes to the left, of which nothing is stated: its trajectory is not what was planned.
+    tokens = compiled.render(values)
+    weights = {
+        token.section: weight for token, weight in zip(tokens, target.weights, strict=True) if weight != 10
+    }
+    assert weights == {"plan": 0.0, "trajectory": 0.0}
+    same = make_target(compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
+    assert same.ids == target.ids
+    assert set(same.weights) == {0.0, 1.0, 10.0}
+
+
+def test_a_plan_that_phrases_do_not_lead_to_is_refused() -> None:
+    compiled = CompiledFormat(CF_VLA_PHRASES, VOCABULARY)
+    first, slower = three_tracks("Keep Speed", "Keep Lane"), three_tracks("Wait", "Left Lane Change")
+    text = str(Statement(Thing("barrier", "my lane", 20), "too close", "slower"))
+    with pytest.raises(FormatError, match="changes otherwise"):
+        make_target(compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
+    with pytest.raises(FormatError, match="no reflection in phrases"):
+        make_target(compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, "I should slow down.", slower))
+
+
+def three_tracks(longitudinal: str, lane: str) -> Plan:
+    words = {"longitudinal": longitudinal, "lateral": "Straight", "lane": lane}
+    return parse_plan("".join(f"- {group}\n  - 0.0s-6.4s: {word}\n" for group, word in words.items()))
 
 
 def test_every_section_needs_a_weight() -> None:

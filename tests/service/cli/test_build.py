@@ -8,19 +8,23 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from clients.labelling.ledger import Run
 from clients.labelling.teachers.patience import TryLater, patiently
 from model.bundled import CHECKPOINT, SCENES
-from model.driving.reflection_store import read_reflections
+from model.driving.phrases import agrees, read_facts
+from model.driving.reflection_store import read_reflections, write_reflections
 from model.driving.scene_store import read_scenes, write_scenes
 from model.engines.torch.engine import TorchEngine, TorchSettings
+from model.network.checkpoint import read_config
+from model.network.settings import VlaSettings
 from service.cli.build import _progress
 from service.cli.commands import app
 from service.settings import Settings
@@ -90,6 +94,42 @@ def test_labelled_and_exported_in_every_form(rolled: Path, tmp_path: Path) -> No
     ran("export", rolled, "--form", "messages", "--scenes", SCENES, "--to", tmp_path / "m", "--run", run)
     assert len((tmp_path / "m" / "messages.jsonl").read_text().splitlines()) == written
     assert "--scenes" in ran("export", rolled, "--form", "messages", "--to", tmp_path / "n", code=2)
+
+
+def test_a_model_of_phrases_learns_from_its_own_plans(resampling_checkpoint: Path, tmp_path: Path) -> None:
+    build, file = tmp_path / "build", tmp_path / "reflections.parquet"
+    with serve(TorchEngine(resampling_checkpoint, TorchSettings(rows=12)), Settings()) as served:
+        told("rollout", build, SCENES, "--service", served.url, "--n", 2, "--json")
+    told("filter", build, "--everything", "--json")
+    assert told("label", build, SCENES, "--json")["done"] > 0
+    ran("export", build, "--to", file)
+    written = list(read_reflections(file))
+    for each in written:
+        assert agrees(read_facts(each.reflection), each.predicted_plan, each.expert_plan)
+    assert trained(resampling_checkpoint, file, tmp_path / "learned").exit_code == 0
+    assert VlaSettings.of_config(read_config(tmp_path / "learned")).reflection == "phrases"
+
+    free = [replace(each, reflection="A car brakes ahead, so I should slow down.") for each in written]
+    write_reflections(file, free)
+    refused = trained(resampling_checkpoint, file, tmp_path / "no")
+    assert refused.exit_code == 2
+    assert "'A car brakes ahead, so I should slow down.' is no reflection in phrases" in refused.output
+    assert not (tmp_path / "no").exists()
+
+
+def trained(source: Path, reflections: Path, target: Path) -> Result:
+    """A few steps of counterfactual training."""
+    options = {
+        "--scenes": SCENES,
+        "--from": source,
+        "--to": target,
+        "--reflections": reflections,
+        "--cache": target.parent / "cache",
+        "--steps": 2,
+        "--batch-size": 2,
+    }
+    arguments = [str(each) for option in options.items() for each in option]
+    return CliRunner().invoke(app, ["train", "counterfactual", *arguments])
 
 
 def test_a_full_disk_is_a_message_and_loses_nothing(rolled: Path, tmp_path: Path) -> None:
