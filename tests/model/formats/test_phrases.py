@@ -154,6 +154,16 @@ def test_a_first_plan_may_lack_a_track() -> None:
         assert agrees(read_facts(str(values["thinking"])), lacks, revised)
 
 
+def test_what_stays_as_it_is_is_jumped_over() -> None:
+    """Behind a good plan nothing but the codes is left to decide; behind a stated change one track is."""
+    _, cursor = COMPILED.start({"plan": WAITS}).forced()
+    for token in VOCABULARY.encode(f"Thinking:\n{NOTHING}"):
+        cursor = cursor.advance(token)
+    forced, cursor = cursor.forced()
+    assert VOCABULARY.decode(ids_of(forced)) == (f"\nMeta Actions:\n{WAITS}Action:\n<|traj_future_start|>")
+    assert len(cursor.allowed().ids) == len(VOCABULARY.code_ids(0))
+
+
 def test_free_text_is_no_reflection() -> None:
     values = {**response(WAITS, Facts(), WAITS).by_section, "thinking": ("I should slow down.",)}
     with pytest.raises(FormatError, match="no reflection in phrases"):
