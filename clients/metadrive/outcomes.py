@@ -17,7 +17,7 @@ import numpy as np
 from clients.metadrive.episode import World
 from clients.metadrive.fork import Forked, fork_along, fork_expert
 from clients.metadrive.tracking import WHEELBASE_M
-from model.driving.outcome import FailureName, Outcome
+from model.driving.outcome import FailureName, Outcome, metres_behind
 from model.driving.pdm import world as pdm
 from model.driving.pdm.comfort import comfort
 from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
@@ -79,8 +79,7 @@ def judged(followed: Forked, expert_m: float, *, needs_comfort: bool = False) ->
             itself: a person who runs into the road leaves no comfortable way.
     """
     uncomfortable_s, uncomfortable = _discomfort(followed)
-    due_m = max(expert_m, 0.0)  # see `Outcome.behind_m`
-    behind_m = due_m - followed.driven_m
+    behind_m = metres_behind(followed.driven_m, expert_m)
     collided = followed.collided_s is not None
     found: dict[FailureName, bool] = {
         "collision": collided,
@@ -88,8 +87,8 @@ def judged(followed: Forked, expert_m: float, *, needs_comfort: bool = False) ->
         "off_route": followed.off_route_s is not None,
         "comfort": needs_comfort and uncomfortable is not None,
         # A drive that a collision ended is shorter for that reason alone.
-        "behind": not collided and behind_m > LEAST_GAP_M and followed.driven_m < BEHIND_RATIO * due_m,
-        "ahead": not collided and -behind_m > LEAST_GAP_M and followed.driven_m > AHEAD_RATIO * due_m,
+        "behind": not collided and behind_m > LEAST_GAP_M and followed.driven_m < BEHIND_RATIO * expert_m,
+        "ahead": not collided and -behind_m > LEAST_GAP_M and followed.driven_m > AHEAD_RATIO * expert_m,
     }
     return Outcome(
         tuple(name for name, failed in found.items() if failed),

@@ -49,11 +49,8 @@ class Outcome:
 
     @property
     def behind_m(self) -> float:
-        """How many metres less than the expert it drove along the route; below 0 where it drove more.
-
-        An expert that backs out from behind an obstacle asks nobody to drive backwards.
-        """
-        return max(self.expert_m, 0.0) - self.driven_m
+        """See `metres_behind`."""
+        return metres_behind(self.driven_m, self.expert_m)
 
     @property
     def progress(self) -> float:
@@ -68,6 +65,17 @@ class Outcome:
     def from_json(cls, told: Mapping[str, Any]) -> Outcome:
         """Read what `to_json` told."""
         return cls(**{**told, "fails": cast("tuple[FailureName, ...]", tuple(told["fails"]))})
+
+
+def metres_behind(driven_m: float, expert_m: float) -> float:
+    """How many metres less than the expert somebody drove along the route; below 0 where it was more.
+
+    Where the expert backs out from an obstacle, whoever stands still or backs out no farther is neither
+    behind nor ahead.
+    """
+    if driven_m < expert_m:
+        return expert_m - driven_m
+    return min(max(expert_m, 0.0) - driven_m, 0.0)
 
 
 def in_words(outcome: Outcome) -> str:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from model.driving.reflection_store import LabelledReflection
 
 app = typer.Typer(
-    help="Build a counterfactual data set: rollout, filter, label, export.", no_args_is_help=True
+    help="Build a counterfactual data set: rollout, outcomes, filter, label, export.", no_args_is_help=True
 )
 
 Folder = Annotated[Path, typer.Argument(help="The build: its ledger and what is made of it.")]
