@@ -1,0 +1,45 @@
+"""What `make test-readme` takes for commands; that run itself is a maintainer's."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.docs.clean_clone import ACTIVATE, SERVE, blocks, lines, listed
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_lines_are_joined_and_comments_left_out() -> None:
+    assert lines("make plan    # installs\n\nlooktwice plan \\\n    --n 3\n") == [
+        "make plan",
+        "looktwice plan --n 3",
+    ]
+
+
+def test_alternatives_are_told_one_by_one_with_their_options() -> None:
+    page = "`looktwice scenes show\\|pick` and `looktwice evaluate --scenes data`, `looktwice plan [SCENE…]`"
+    assert listed(page) == [
+        ("scenes show", []),
+        ("scenes pick", []),
+        ("evaluate", ["--scenes"]),
+        ("plan", []),
+    ]
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/own-cameras.md"])
+def test_no_command_hides_in_a_block_that_is_not_run(name: str) -> None:
+    unread = [
+        block for language, block in blocks((ROOT / name).read_text()) if language not in ("bash", "python")
+    ]
+    assert not [block for block in unread if re.search(r"^(looktwice|make|pip|python|curl) ", block, re.M)]
+
+
+def test_the_readme_activates_before_it_serves() -> None:
+    commands = [line for _, block in blocks((ROOT / "README.md").read_text()) for line in lines(block)]
+    assert commands.index("make plan") < commands.index(ACTIVATE) < commands.index(SERVE)
+    assert next(place for place, line in enumerate(commands) if line.startswith("curl ")) > commands.index(
+        SERVE
+    )
