@@ -157,13 +157,16 @@ class Decoding:
         from vllm.sampling_params import RequestOutputKind, StructuredOutputsParams
 
         controls, first = self._request.controls, draws[0]
+        # vLLM tells of at most 128 tokens by name, or of the whole vocabulary; a stage has more codes.
+        weighs_codes = self._stage(first) is not None
         return SamplingParams(
             n=len(draws),
             temperature=controls.temperature,
             top_p=controls.top_p,
             seed=seed_of(controls.seed, first.index, len(first.tokens)),
-            max_tokens=1 if self._stage(first) is not None else first.cursor.compiled.longest(),
-            logprob_token_ids=self._weighed_ids(first),
+            max_tokens=1 if weighs_codes else first.cursor.compiled.longest(),
+            logprobs=-1 if weighs_codes else None,
+            logprob_token_ids=None if weighs_codes else self._branch_ids(first),
             structured_outputs=StructuredOutputsParams(grammar=self._grammar(first.cursor)),
             detokenize=False,
             output_kind=RequestOutputKind.DELTA,
@@ -173,11 +176,8 @@ class Decoding:
         """Whose codes are to be weighed next; None where vLLM's own choice stands."""
         return None if self._least_error is None else self._least_error.stage(draw.cursor.allowed().ids)
 
-    def _weighed_ids(self, draw: _Walk) -> list[int] | None:
-        """The tokens whose probabilities decide: codes that come next, or a branch that is to come."""
-        if self._stage(draw) is not None:
-            ids: list[int] = draw.cursor.allowed().ids.tolist()
-            return ids
+    def _branch_ids(self, draw: _Walk) -> list[int] | None:
+        """The tokens whose probabilities decide the branch, where it is still to come."""
         compiled = draw.cursor.compiled
         if draw.think_probability is not None or BRANCH not in compiled.format.sections():
             return None

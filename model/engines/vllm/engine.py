@@ -199,6 +199,8 @@ class VllmEngine:
             "limit_mm_per_prompt": limits,
             "structured_outputs_config": {"backend": "guidance"},
             "disable_log_stats": True,
+            # Codes of least expected error need the probabilities of a whole stage.
+            "max_logprobs": -1,
         }
         if current_platform.is_cpu():
             # Blocks of 128 tokens would leave most of a prompt out of the prefix cache; where prompts come in
