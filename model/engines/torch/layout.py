@@ -25,7 +25,7 @@ _BUCKET_SPAN: Final = 128
 _ORDERED_SPAN: Final = 128
 """The same where the sums of a token may depend on nothing but its own text."""
 MIN_QUERIES: Final = 4
-"""Of a call: for fewer, libraries have kernels that add up in another order."""
+"""Rows of a call, or of a product: for fewer, libraries have kernels that add up in another order."""
 _PADDING: Final = 6_000
 """Padding, in slots attended to over all tokens, that takes as long as a call of its own."""
 
@@ -38,6 +38,14 @@ def bucket(count: int) -> int:
     """
     step = 1 << max(0, (count - 1).bit_length() - 3) if count else 1
     return -(-count // step) * step
+
+
+def repeatable_bucket(count: int) -> int:
+    """The bucket of a pass whose tokens must not depend on how many there are.
+
+    Products in float32 add up in another order for fewer rows than four (MKL on AVX2).
+    """
+    return max(bucket(count), MIN_QUERIES)
 
 
 class Shape(NamedTuple):

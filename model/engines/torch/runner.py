@@ -36,6 +36,7 @@ from model.engines.torch.layout import (
     ordered_layout,
     padded,
     reached,
+    repeatable_bucket,
 )
 from model.engines.torch.memory import IntArray, Memory, SlotMapping
 from model.engines.torch.packed import Attention, PackedDecoder, Rotation
@@ -143,6 +144,7 @@ class Runner:
         self._decoder = PackedDecoder(model.model.language_model, products)
         self._head = AllowedHead(model.lm_head.weight)
         self._reproducible = reproducible
+        self._pass_size = repeatable_bucket if reproducible else bucket
         self._reuse, clip_bytes = reuse, clip_bytes if reuse else 0
         self._pictures = ClipCache(clip_bytes)
         self._vision = VisionEncoder(
@@ -217,7 +219,7 @@ class Runner:
         embeddings = torch.cat([prompt.embeddings[span] for prompt, span in spans])
         rotations = zip(*([part[span] for part in prompt.rotation] for prompt, span in spans), strict=True)
         cosines, sines = (torch.cat(part) for part in rotations)
-        padding = bucket(len(embeddings)) - len(embeddings)
+        padding = self._pass_size(len(embeddings)) - len(embeddings)
         embeddings = functional.pad(embeddings, (0, 0, 0, padding))
         rotation = Rotation(*(functional.pad(part, (0, 0, 0, 0, 0, padding)) for part in (cosines, sines)))
         self._decoder(embeddings, rotation, attention, None)
@@ -251,11 +253,11 @@ class Runner:
             for number, feed in enumerate(feeds)
             for place, ids in feed.wanted
         ]
-        size, wanted = bucket(len(ids)), np.array([place for _, place, _ in asked], np.int64)
+        size, wanted = self._pass_size(len(ids)), np.array([place for _, place, _ in asked], np.int64)
         numbers = [
             padded(ids, size, "edge"),
             padded(positions, size, "edge"),
-            padded(wanted, bucket(len(asked)) if asked else 0, "edge"),
+            padded(wanted, self._pass_size(len(asked)) if asked else 0, "edge"),
         ]
         if self._reproducible:
             hidden = self._in_order(batch, numbers)

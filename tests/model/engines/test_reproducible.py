@@ -8,12 +8,15 @@ from dataclasses import replace
 from itertools import count
 
 import pytest
+import torch
 
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.scene_store import read_scenes
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
 from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.network.precision import bfloat16_is_fast
+from model.engines.torch.layout import repeatable_bucket
+from model.engines.torch.packed import _Product
+from model.network.precision import bfloat16_is_fast, fast_dtype
 
 _SCENES = [labelled.scene for labelled in read_scenes(SCENES)][:6]
 _IDS = count()
@@ -66,6 +69,16 @@ def test_a_draw_is_the_same_fresh_repeated_alone_and_in_a_crowd(settings: TorchS
         await other.stop()
 
     asyncio.run(asyncio.wait_for(test(), 300))
+
+
+@pytest.mark.parametrize("products", sorted({torch.float32, fast_dtype()}, key=str), ids=str)
+def test_a_token_gets_the_same_in_a_pass_of_any_size(products: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(1)
+    product = _Product(torch.randn(768, 384, generator=generator).to(products))
+    states = torch.randn(512, 384, generator=generator).to(products)
+    alone = product(states[: repeatable_bucket(1)])[0]
+    for size in sorted({repeatable_bucket(tokens) for tokens in range(1, 513)}):
+        assert torch.equal(product(states[:size])[0], alone), size
 
 
 def test_only_on_a_cpu_is_that_so_by_default() -> None:
