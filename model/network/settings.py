@@ -113,10 +113,11 @@ class VlaSettings:
         return CLIP_PERIOD_S * self.temporal_patch_size
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-like form for ``config.json``."""
-        return {
-            key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()
-        }
+        """JSON-like form for ``config.json``; free text, which older checkpoints write, is not mentioned."""
+        values = asdict(self)
+        if self.reflection == "free_text":
+            del values["reflection"]
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     @classmethod
     def of_config(cls, config: Any) -> VlaSettings:

@@ -33,8 +33,9 @@ def phrased(resampling_checkpoint: Path) -> Loaded:
 @pytest.mark.parametrize("prefill", [None, WAITS, Plan(longitudinal=WAITS.longitudinal)])
 def test_every_second_look_agrees_with_its_change_of_plan(phrased: Loaded, prefill: Plan | None) -> None:
     """At a temperature at which nearly anything is written."""
-    controls = {"thinking": "always", "temperature": 2.0, "top_p": 1.0, "prefill": prefill}
-    requests = [request(f"{k}", k, n=8, seed=k, **controls) for k in range(4)]
+    requests = [
+        request(f"{k}", k, n=8, seed=k, thinking="always", temperature=2.0, prefill=prefill) for k in range(4)
+    ]
     draws = decode(Decoder(Runner(phrased, 16)), *requests)
     assert len(draws) == 32
     stated = 0

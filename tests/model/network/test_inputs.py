@@ -8,7 +8,7 @@ import pytest
 from model.driving.scene import FRONT_TELE, FRONT_WIDE, Scene, SceneError
 from model.network.inputs import InputBuilder, rotary_positions
 from model.network.prompts import PromptError
-from model.network.settings import SettingsError, VlaSettings
+from model.network.settings import NANO_SETTINGS, SettingsError, VlaSettings
 from model.network.vocabulary import HISTORY, ROUTE, VIDEO_PAD, Vocabulary
 from tests.model.network.conftest import made_up_scene
 
@@ -77,6 +77,11 @@ def test_rotary_positions_of_a_small_clip() -> None:
 
 def test_settings_that_do_not_fit() -> None:
     assert VlaSettings.from_dict(SETTINGS.to_dict()) == SETTINGS
+    assert VlaSettings.from_dict(NANO_SETTINGS.to_dict()) == NANO_SETTINGS
+    # Checkpoints that were written before reflections had languages stay what they are.
+    assert "reflection" not in SETTINGS.to_dict()
+    with pytest.raises(SettingsError, match="unknown language of reflections 'Latin'"):
+        VlaSettings.from_dict({"reflection": "Latin"})
     with pytest.raises(SettingsError, match="multiple of 28"):
         VlaSettings(image_width=200)
     with pytest.raises(SettingsError, match="unknown camera"):
