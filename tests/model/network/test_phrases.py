@@ -5,7 +5,7 @@ from pathlib import Path
 from model.driving.phrases import CONSEQUENCES, CORRECTIONS, GOING_ON, HEADS, details
 from model.network.checkpoint import read_parts
 
-LANGUAGE = Path(__file__).parents[3] / "docs" / "data" / "nano-language"
+LANGUAGE = Path(__file__).parents[3] / "docs" / "data" / "nano-meta-act"
 SPELT_OUT = {"The road runs straight on"}
 """Phrases that are younger than this tokenizer. Only their first token is a decision."""
 
