@@ -57,7 +57,7 @@ def openai_router(parts: Parts) -> APIRouter:
     """The endpoint for clients of OpenAI's API."""
     router = APIRouter(route_class=payload_route(lambda _: parts.planning.check_open()), tags=["planning"])
 
-    @router.post("/v1/chat/completions", responses=problems(*REFUSALS) | _ANSWERS)
+    @router.post("/v1/chat/completions", responses=problems(*REFUSALS, UNKNOWN_MODEL) | _ANSWERS)
     async def chat_completions(request: Request, chat: ChatRequest) -> Any:
         """Planning in OpenAI's dialect: pictures as image parts, a message per draw; see docs/http.md."""
         arrival = arrival_of(request)

@@ -130,18 +130,24 @@ class ResponseLearner(nn.Module):
         filling = -len(places) % _PLACES_STEP
         logits = vla.lm_head(hidden.flatten(0, 1)[F.pad(lie.before[places], (0, filling))])
         labels, weights = F.pad(labels[places], (0, filling)), F.pad(weights[places], (0, filling))
+        # The start of each response's trajectory, and which of them are to be learned.
+        row, place = ((input_ids == self._future_start_id) & (parts > 0)).nonzero(as_tuple=True)
+        learned = loss_weights[row, place + 1] > 0
         losses = response_loss(
             logits,
             labels,
             weights,
             self._first_code_id,
-            code_shares,
-            code_errors_m,
+            code_shares[learned],
+            code_errors_m[learned],
+            len(row),
             self._error_weight,
         )._asdict()
         if self.head is not None:
+            losses["head_ade_m"] = losses["loss"].new_zeros(())
+        if self.head is not None and learned.any():
             # Where the first code is written, a trajectory is drawn at once: metres teach faster than codes.
-            row, place = ((input_ids == self._future_start_id) & (parts > 0)).nonzero(as_tuple=True)
+            row, place = row[learned], place[learned]
             guesses = self.head(hidden[row, place].float())
             speeds = present_speeds(history)
             drawn = self.head.loss(guesses, speeds[row], futures[row])

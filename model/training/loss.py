@@ -38,6 +38,7 @@ def response_loss(
     first_code_id: int,
     code_shares: Tensor,
     code_errors_m: Tensor,
+    responses: int,
     error_weight: float = 0.0,
 ) -> ResponseLoss:
     """Cross-entropy, each token with its weight, summed over a response and averaged over responses.
@@ -56,8 +57,10 @@ def response_loss(
         labels: int64 [tokens].
         weights: float [tokens]; 0 leaves a token out.
         first_code_id: the id of stage 0's code 0; codes of all stages lie behind it, stage by stage.
-        code_shares: float [responses >= 1, stages, size], each response's distributions, in order.
+        code_shares: float [learned, stages, size], the distributions of each response whose codes are among
+            ``labels``, in order; there may be none.
         code_errors_m: float, of the same shape, see `SoftTarget`.
+        responses: how many the loss is averaged over.
         error_weight: nats that an expected metre counts.
 
     Raises:
@@ -75,11 +78,12 @@ def response_loss(
     expected_m = (of_codes.exp() * code_errors_m.flatten(0, 1)).sum(dim=1)
     parts = losses.masked_scatter(is_code, soft).detach()
     losses = losses.masked_scatter(is_code, soft + error_weight * expected_m)
-    first_error_m = expected_m.detach()[stage == 0].mean()
+    first_errors_m = expected_m.detach()[stage == 0]
+    first_error_m = first_errors_m.sum() / max(1, len(first_errors_m))
     is_word = ~is_code & (weights > 0)
     code_loss, word_loss = (parts[which].sum() / which.sum().clamp_min(1) for which in (is_code, is_word))
     by_stage = torch.tensor(STAGE_WEIGHTS, device=labels.device)[stage]
     weights = weights.float().masked_scatter(is_code, weights[is_code].float() * by_stage)
     return ResponseLoss(
-        (losses * weights).sum() / (LOSS_UNIT * len(code_shares)), code_loss, first_error_m, word_loss
+        (losses * weights).sum() / (LOSS_UNIT * responses), code_loss, first_error_m, word_loss
     )

@@ -52,7 +52,7 @@ def test_loss_equals_the_obvious_sum(error_weight: float) -> None:
     shares = torch.softmax(torch.randn(2, 6, SIZE), dim=-1)
     errors_m = torch.rand(2, 6, SIZE)
     told = response_loss(
-        logits, torch.tensor(labels), torch.tensor(weights), FIRST_CODE, shares, errors_m, error_weight
+        logits, torch.tensor(labels), torch.tensor(weights), FIRST_CODE, shares, errors_m, 2, error_weight
     )
     obvious = slow_loss(logits, labels, weights, shares.tolist(), errors_m.tolist(), error_weight)
     assert float(told.loss) == pytest.approx(obvious, rel=1e-5)
@@ -64,7 +64,7 @@ def test_loss_equals_the_obvious_sum(error_weight: float) -> None:
 def test_tokens_of_weight_zero_teach_nothing() -> None:
     logits = torch.randn(2, VOCABULARY, requires_grad=True)
     labels, weights = torch.tensor([1, 2]), torch.tensor([0.0, 1.0])
-    loss = response_loss(logits, labels, weights, FIRST_CODE, NO_CODES, NO_CODES).loss
+    loss = response_loss(logits, labels, weights, FIRST_CODE, NO_CODES, NO_CODES, 1).loss
     (gradient,) = torch.autograd.grad(loss, logits)
     assert gradient[0].abs().max() == 0
     assert gradient[1].abs().max() > 0
@@ -72,7 +72,9 @@ def test_tokens_of_weight_zero_teach_nothing() -> None:
 
 def test_no_weight_at_all_is_a_loss_of_zero() -> None:
     logits = torch.randn(1, VOCABULARY)
-    loss = response_loss(logits, torch.tensor([1]), torch.tensor([0.0]), FIRST_CODE, NO_CODES, NO_CODES).loss
+    loss = response_loss(
+        logits, torch.tensor([1]), torch.tensor([0.0]), FIRST_CODE, NO_CODES, NO_CODES, 1
+    ).loss
     assert float(loss) == 0.0
 
 
@@ -87,7 +89,7 @@ def test_forced_text_before_a_code_does_not_dilute_it() -> None:
         logits = torch.cat([before, code_logits]).requires_grad_()
         labels = torch.tensor([1] * len(before) + [FIRST_CODE])
         loss = response_loss(
-            logits, labels, torch.full((len(labels),), 10.0), FIRST_CODE, shares[:, :1], shares[:, :1]
+            logits, labels, torch.full((len(labels),), 10.0), FIRST_CODE, shares[:, :1], shares[:, :1], 1
         ).loss
         gradients.append(torch.autograd.grad(loss, logits)[0][-1])
     torch.testing.assert_close(gradients[0], gradients[1])

@@ -106,7 +106,8 @@ def test_a_model_of_phrases_learns_from_its_own_plans(resampling_checkpoint: Pat
     written = list(read_reflections(file))
     for each in written:
         assert agrees(read_facts(each.reflection), each.predicted_plan, each.expert_plan)
-    assert trained(resampling_checkpoint, file, tmp_path / "learned").exit_code == 0
+    learned = trained(resampling_checkpoint, file, tmp_path / "learned")
+    assert learned.exit_code == 0, learned.output
     assert VlaSettings.of_config(read_config(tmp_path / "learned")).reflection == "phrases"
 
     free = [replace(each, reflection="A car brakes ahead, so I should slow down.") for each in written]
