@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from clients.labelling.ledger import Entry, Ledger, Run
-from clients.labelling.pipeline import ERRORS_COUNT_FROM, Limits, StageStopped, Tally
+from clients.labelling.pipeline import Limits, StageStopped, Tally
 from clients.labelling.rollout import key_of, unpacked
 from clients.metadrive.outcomes import MomentOutcomes
 from clients.metadrive.replay import EpisodeSetting, Moment, setting_of
@@ -72,7 +72,7 @@ def follow_all(
             faults += _enter(ledger, run, works.pop(scene_id), found, tally)
             on_progress(tally)
             count = tally.done + tally.dead
-            if count >= ERRORS_COUNT_FROM and faults > limits.max_error_rate * count:
+            if limits.too_many(faults, count):
                 raise StageStopped(f"{faults} of {count} scenes could not be followed; see dead letters")
     except WorkerDied as error:
         raise StageStopped(f"{error}; the same command goes on") from error

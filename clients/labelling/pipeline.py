@@ -51,6 +51,10 @@ class Limits:
     max_error_rate: float = 0.1
     at_most: int | None = None
 
+    def too_many(self, faults: int, ended: int) -> bool:
+        """Whether so many faults among what ended stop a stage."""
+        return ended >= ERRORS_COUNT_FROM and faults > self.max_error_rate * ended
+
 
 @dataclass(frozen=True)
 class Job(Generic[_Subject]):
@@ -123,7 +127,7 @@ async def work_through(
             tally.done += 1
         on_progress(tally)
         ended = tally.done + tally.dead
-        if ended >= ERRORS_COUNT_FROM and faults > limits.max_error_rate * ended:
+        if limits.too_many(faults, ended):
             raise StageStopped(
                 f"{faults} of {ended} could not be done, the last one ({job.scene_id}) because: "
                 f"{_last_reason(ledger, run)}"

@@ -158,7 +158,7 @@ class Decoding:
 
         controls, first = self._request.controls, draws[0]
         # vLLM tells of at most 128 tokens by name, or of the whole vocabulary; a stage has more codes.
-        weighs_codes = self._stage(first) is not None
+        weighs_codes = self._stage(first.cursor.allowed().ids) is not None
         return SamplingParams(
             n=len(draws),
             temperature=controls.temperature,
@@ -172,9 +172,9 @@ class Decoding:
             output_kind=RequestOutputKind.DELTA,
         )
 
-    def _stage(self, draw: _Walk) -> int | None:
-        """Whose codes are to be weighed next; None where vLLM's own choice stands."""
-        return None if self._least_error is None else self._least_error.stage(draw.cursor.allowed().ids)
+    def _stage(self, ids: IntArray) -> int | None:
+        """Whose codes the allowed ``ids`` are, to be weighed; None where vLLM's own choice stands."""
+        return None if self._least_error is None else self._least_error.stage(ids)
 
     def _branch_ids(self, draw: _Walk) -> list[int] | None:
         """The tokens whose probabilities decide the branch, where it is still to come."""
@@ -186,7 +186,8 @@ class Decoding:
     def _walk(self, draw: _Walk, tokens: Sequence[int], logprobs: Sequence[Mapping[int, Any]] | None) -> bool:
         """Write what vLLM wrote; False when the draw is done, or goes on elsewhere."""
         for place, token in enumerate(tokens):
-            allowed, wanted, stage = draw.cursor.allowed(), token, self._stage(draw)
+            allowed, wanted = draw.cursor.allowed(), token
+            stage = self._stage(allowed.ids)
             weighed = None if logprobs is None else logprobs[place]
             if stage is not None and not _weighs(weighed, allowed.ids):
                 break

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
@@ -29,6 +28,7 @@ from service.cli.build import _progress
 from service.cli.commands import app
 from service.settings import Settings
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer
+from tests.service.cli.builds import ran, told
 from tests.service.serving import serve
 from tests.sockets import listening
 
@@ -49,21 +49,6 @@ def rolled(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert (done["done"], done["dead"]) == (COUNT, 0)
     assert told("filter", folder, "--everything", "--json")["kept"] == COUNT
     return folder
-
-
-def ran(*arguments: object, code: int = 0) -> str:
-    """What a command prints."""
-    result = CliRunner().invoke(app, ["build", *map(str, arguments)])
-    assert result.exit_code == code, result.output
-    return result.output
-
-
-def told(*arguments: object) -> dict[str, Any]:
-    # The service runs in this process too, and its log goes where the command prints.
-    lines = [json.loads(line) for line in ran(*arguments).splitlines() if line.startswith("{")]
-    (found,) = [line for line in lines if "event" not in line]
-    assert isinstance(found, dict)
-    return found
 
 
 def test_rolled_out_once_and_for_all(rolled: Path, url: str) -> None:

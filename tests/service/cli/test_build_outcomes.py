@@ -10,10 +10,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from clients.labelling.ledger import FILE, Ledger
 from clients.labelling.outcomes import Followed
@@ -21,8 +19,8 @@ from clients.metadrive.generate import MANIFEST
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.reflection_store import read_reflections
 from model.engines.torch.engine import TorchEngine, TorchSettings
-from service.cli.commands import app
 from service.settings import Settings
+from tests.service.cli.builds import ran, told
 from tests.service.serving import serve
 
 DRAWS = 2
@@ -38,20 +36,6 @@ def rolled(generated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert (done["dead"], bundled["dead"]) == (0, 0)
     assert done["done"] >= 6
     return folder
-
-
-def ran(*arguments: object, code: int = 0) -> str:
-    """What a command prints."""
-    result = CliRunner().invoke(app, ["build", *map(str, arguments)])
-    assert result.exit_code == code, result.output
-    return result.output
-
-
-def told(*arguments: object) -> dict[str, Any]:
-    lines = [json.loads(line) for line in ran(*arguments).splitlines() if line.startswith("{")]
-    (found,) = [line for line in lines if "event" not in line]
-    assert isinstance(found, dict)
-    return found
 
 
 def scenes_of(manifest_of: Path) -> int:
