@@ -21,7 +21,7 @@ Camera = Literal[
     "back_right",
 ]
 Thinking = Literal["adaptive", "always", "never"]
-Codes = Literal["least_error", "drawn"]
+Decision = Literal["least_error", "drawn"]
 Branch = Literal["Action:", "Thinking:"]
 Cut = Literal["skipped", "shortened", "replaced"]
 AgentKind = Literal["vehicle", "pedestrian", "cone", "barrier"]
@@ -191,10 +191,13 @@ class ReflectControls(Asked):
         le=600_000,
         description="Milliseconds from the request's arrival until the answer must be there; null for none.",
     )
-    codes: Codes = Field(
+    numbers: Decision = Field(
         default="least_error",
-        description="How trajectory codes are chosen: least_error takes the one of least expected error, "
-        "drawn draws them as words are.",
+        description="How numbers in the text, such as a plan's times, are chosen: least_error takes the one "
+        "of least expected error, drawn draws them as words are.",
+    )
+    codes: Decision = Field(
+        default="least_error", description="How trajectory codes are chosen, in the same two ways."
     )
     bind: bool = Field(
         default=False,

@@ -145,6 +145,7 @@ def _controls(asked: wire.ReflectControls, prefill: Plan | None) -> Controls:
             top_p=asked.top_p,
             seed=asked.seed,
             deadline_ms=asked.deadline_ms,
+            numbers=asked.numbers,
             codes=asked.codes,
             bind=asked.bind,
         )

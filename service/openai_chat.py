@@ -100,7 +100,8 @@ class Extras(wire.Asked):
     think_threshold: wire.Probability | None = None
     prefill: wire.PlanGiven | None = None
     deadline_ms: int | None = Field(default=None, ge=1, le=600_000)
-    codes: wire.Codes = "least_error"
+    numbers: wire.Decision = "least_error"
+    codes: wire.Decision = "least_error"
     bind: bool = False
     format: str = Field(default="cf_vla", max_length=40)
 
@@ -147,7 +148,7 @@ def plan_document(chat: ChatRequest, card: ModelCard) -> dict[str, Any]:
         for number, camera in enumerate(card.cameras)
     ]
     controls = extras.model_dump(
-        include={"thinking", "think_threshold", "prefill", "deadline_ms", "codes", "bind"}
+        include={"thinking", "think_threshold", "prefill", "deadline_ms", "numbers", "codes", "bind"}
     )
     controls |= chat.model_dump(include={"n", "temperature", "top_p", "seed"})
     scene = {"clips": clips, "history": extras.history or _STANDING, "route": extras.route}

@@ -33,6 +33,7 @@ class Workload:
             n=self.n,
             temperature=self.temperature,
             deadline_ms=self.deadline_ms,
+            numbers="drawn",
             codes="drawn",
         )
         return [

@@ -15,7 +15,7 @@ from model.driving.trajectory import FloatArray
 from model.formats.pieces import ACTION, THINKING
 
 Thinking = Literal["adaptive", "always", "never"]
-Codes = Literal["least_error", "drawn"]
+Decision = Literal["least_error", "drawn"]
 Branch = Literal["Action:", "Thinking:"]
 Cut = Literal["skipped", "shortened", "replaced"]
 """What a deadline did to a second look: not begun, ended early, given up for the draft."""
@@ -55,8 +55,10 @@ class Controls:
         deadline_ms: milliseconds from submission by which the answer must be there; None for no deadline.
             Thinking that would not fit is not begun, or cut; while it lasts, a direct trajectory is made
             ready beside it and is the answer if the reflection does not end in time.
-        codes: how trajectory codes are chosen: ``least_error`` takes the one that is expected to be off the
-            least (`model.engines.codes`), ``drawn`` draws them as words are.
+        numbers: how numbers in the text are chosen, such as the times of a plan: ``least_error`` takes the
+            one that is expected to be off the least (`model.engines.least_error`), ``drawn`` draws them as
+            words are.
+        codes: how trajectory codes are chosen, likewise.
         bind: only trajectories may be begun that do what the plan says (`model.engines.binding`).
     """
 
@@ -68,14 +70,16 @@ class Controls:
     top_p: float = 1.0
     seed: int = 0
     deadline_ms: int | None = None
-    codes: Codes = "least_error"
+    numbers: Decision = "least_error"
+    codes: Decision = "least_error"
     bind: bool = False
 
     def __post_init__(self) -> None:
         if self.thinking not in ("adaptive", "always", "never"):
             raise RequestError(f"thinking must be adaptive, always or never, got {self.thinking!r}")
-        if self.codes not in ("least_error", "drawn"):
-            raise RequestError(f"codes must be least_error or drawn, got {self.codes!r}")
+        for name, decision in (("numbers", self.numbers), ("codes", self.codes)):
+            if decision not in ("least_error", "drawn"):
+                raise RequestError(f"{name} must be least_error or drawn, got {decision!r}")
         if not isinstance(self.n, int) or not 1 <= self.n <= MAX_DRAWS:
             raise RequestError(f"n must be a whole number in 1..{MAX_DRAWS}, got {self.n}")
         if not 0.0 <= self.temperature <= 2.0:

@@ -59,8 +59,8 @@ class Number(Compound):
     def expand(self) -> Piece:
         """A choice of all numbers, or one code."""
         if self.spelling == DIGITS:
-            return Choice(tuple(map(Option, self.texts)))
-        return Codes(self.spelling, 1, len(self.texts))
+            return Choice(tuple(map(Option, self.texts)), ordered=True)
+        return Codes(self.spelling, 1, len(self.texts), ordered=True)
 
     def join(self, parts: tuple[Value, ...]) -> float:
         """The number of a text or of a code."""

@@ -112,11 +112,14 @@ class Allowed:
         ids: int64 [k], k >= 2, ascending.
         section: the section the token will belong to.
         choice: the name of the choice that is being decided here, where it has one.
+        ranks: int64 [k], where a number is decided: which of them each id stands for, counted from the least.
+            Where a number takes several tokens, ids count by the least number that begins with them.
     """
 
     ids: npt.NDArray[np.int64]
     section: str
     choice: str | None = None
+    ranks: npt.NDArray[np.int64] | None = None
 
 
 class CompiledFormat:
@@ -322,20 +325,23 @@ class Cursor:
     def allowed(self) -> Allowed:
         """What may come next; a single id means the token is forced. Not to be called when done."""
         name: str | None = None
+        ranks: npt.NDArray[np.int64] | None = None
         match self.active:
             case Run(ids, position):
                 allowed = np.array([ids[position]], np.int64)
             case AtChoice(choice, node):
                 allowed, name = node.ids, choice.name
+                ranks = node.ranks if choice.ordered else None
             case InText(piece, state):
                 allowed = self.compiled.text(piece).allowed(state)
             case AtCode(piece, place):
                 allowed = self.compiled.codes(piece, place)
+                ranks = np.arange(len(allowed)) if piece.ordered else None
             case Ways():
                 allowed = np.sort(np.concatenate([way.allowed().ids for way in self._ways()]))
             case None:
                 raise FormatError("the response is complete")
-        return Allowed(allowed, self.section, name)
+        return Allowed(allowed, self.section, name, ranks)
 
     def forced(self) -> tuple[list[Token], Cursor]:
         """The run of forced tokens from here, and the cursor behind it."""

@@ -125,11 +125,17 @@ class Choice:
     """One of several words; its value is the option's text.
 
     An option may be the beginning of another, or empty, if what follows it tells them apart at the first
-    character. ``name`` lets controls and records refer to the choice.
+    character.
+
+    Attributes:
+        options: what can be chosen.
+        name: lets controls and records refer to the choice.
+        ordered: whether the options are evenly spaced numbers, the least one first.
     """
 
     options: tuple[Option, ...]
     name: str | None = None
+    ordered: bool = False
 
     def __post_init__(self) -> None:
         texts = [option.text for option in self.options]
@@ -202,12 +208,14 @@ class Codes:
 
     Attributes:
         size: codes that each codebook must have; None for any number.
+        ordered: whether the codes are evenly spaced numbers, the least one first.
     """
 
     alphabet: str
     count: int
     size: int | None = None
     name: str | None = None
+    ordered: bool = False
 
     def __post_init__(self) -> None:
         if self.count < 1:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import ClassVar, Final
 
@@ -169,7 +169,7 @@ class Track(Shorthand):
         first = TICKS if self.segments_left == 1 else self.start + 1
         words = (self._word(end) for end in range(first, TICKS + 1))
         ends = tuple(Option(format_tick(word.end), word) for word in words if word.words())
-        return Sequence((Literal(f"  - {format_tick(self.start)}s-"), Choice(ends)))
+        return Sequence((Literal(f"  - {format_tick(self.start)}s-"), Choice(ends, ordered=True)))
 
     def _word(self, end: int) -> TrackWord:
         # Without an aim a word does not depend on how long it is said.
@@ -315,11 +315,10 @@ def _with_given(piece: Piece, given: Mapping[str, Plan], section: str, left: set
             return Section(name, _with_given(body, given, name, left))
         case Sequence(parts):
             return Sequence(tuple(_with_given(part, given, section, left) for part in parts))
-        case Choice(options, name):
+        case Choice(options):
             then = [_with_given(option.then, given, section, left) for option in options]
-            return Choice(
-                tuple(Option(option.text, each) for option, each in zip(options, then, strict=True)), name
-            )
+            new = tuple(Option(option.text, each) for option, each in zip(options, then, strict=True))
+            return replace(piece, options=new)
         case Maybe(inner, name):
             return Maybe(_with_given(inner, given, section, left), name)
         case PlanTracks() | RevisedPlan() if section in given:

@@ -9,14 +9,22 @@ import numpy.typing as npt
 
 
 class Node:
-    """A node of a trie over tokenised options; ``option`` is the position of the one that may end here."""
+    """A node of a trie over tokenised options.
 
-    __slots__ = ("children", "ids", "option")
+    Attributes:
+        children: by token.
+        option: the position of the one that may end here.
+        ids: int64 [k], the tokens, ascending.
+        ranks: int64 [k], the place of each token among them by the first option that it leads to.
+    """
+
+    __slots__ = ("children", "ids", "option", "ranks")
 
     def __init__(self) -> None:
         self.children: dict[int, Node] = {}
         self.option: int | None = None
         self.ids: npt.NDArray[np.int64] = np.empty(0, np.int64)
+        self.ranks: npt.NDArray[np.int64] = np.empty(0, np.int64)
 
     def options(self) -> Iterator[int]:
         """Positions of the options reachable from here."""
@@ -38,5 +46,7 @@ def build_trie(texts: Sequence[str], encode: Callable[[str], Sequence[int]]) -> 
     while stack:
         node = stack.pop()
         node.ids = np.array(sorted(node.children), np.int64)
+        # Options came in order, so a token's place among the children is that of the first one it leads to.
+        node.ranks = np.argsort(np.fromiter(node.children, np.int64))
         stack += node.children.values()
     return root

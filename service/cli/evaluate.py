@@ -40,6 +40,10 @@ def evaluate(
         float | None,
         typer.Option(help="Think when the think probability exceeds it, instead of by chance.", min=0, max=1),
     ] = None,
+    numbers: Annotated[
+        Literal["least_error", "drawn"],
+        typer.Option(help="Times of plans: of least expected error, or drawn as words are."),
+    ] = "least_error",
     codes: Annotated[
         Literal["least_error", "drawn"],
         typer.Option(help="Trajectory codes: of least expected error, or drawn as words are."),
@@ -102,7 +106,12 @@ def evaluate(
         from model.evaluation.kept import KeptDraws
 
         controls = Controls(
-            n=n, temperature=temperature, think_threshold=think_threshold, codes=codes, bind=bind
+            n=n,
+            temperature=temperature,
+            think_threshold=think_threshold,
+            numbers=numbers,
+            codes=codes,
+            bind=bind,
         )
         labelled = list(_evenly(read_scenes(scenes, dense=False), count_scenes(scenes), limit))
         if perception:

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from model.engines.binding import Binding, binding_of
-from model.engines.codes import LeastError
 from model.engines.engine import (
     DraftFinished,
     Draw,
@@ -23,6 +22,7 @@ from model.engines.engine import (
     RequestError,
     Started,
 )
+from model.engines.least_error import LeastError
 from model.engines.requests import begin, read
 from model.engines.torch.batch import Batch, Feed
 from model.engines.torch.deadlines import LatencyModel, drafts_of
@@ -133,10 +133,9 @@ class Decoder:
             raise RequestError(f"request id {plan_request.request_id} is in use")
         loaded = self._runner.loaded
         origin = begin(plan_request, loaded.card, self._runner.formats)
-        request = Request(plan_request, origin, self._clock() if submitted_s is None else submitted_s)
+        arrived_s = self._clock() if submitted_s is None else submitted_s
+        request = Request(plan_request, origin, arrived_s, self._least_error)
         request.binding = binding or binding_of(plan_request, loaded.codec, loaded.vocabulary)
-        if plan_request.controls.codes == "least_error":
-            request.least_error = self._least_error
         request.draws_a_tree = self._scheduler.draws_a_tree(request)
         request.plant(share=self._shortcuts.shared_rows)
         if not self._scheduler.fits(request):

@@ -15,8 +15,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from model.engines.binding import Binding
-from model.engines.codes import LeastError
 from model.engines.engine import Controls, Draw, PlanRequest
+from model.engines.least_error import LeastError
 from model.engines.torch.memory import Memory
 from model.engines.torch.rows import Row
 from model.formats.cursor import Cursor
@@ -101,26 +101,26 @@ class Request:
         plan_request: what is asked.
         origin: the cursor at which responses begin.
         submitted_s: what its deadline counts from.
+        least_error: tells how far apart numbers and codes lie.
         draws_a_tree: how many draws share a copy of the prompt, at most.
         arrival: ascending.
         phase: where it stands.
         trees: of rows that have not ended.
         drafts: by draw, until the draw is answered.
         started: whether it has left the queue once.
-        least_error: chooses the trajectory codes, unless the control ``codes`` has them drawn.
         binding: where the caller's control ``bind`` asks for it.
     """
 
     plan_request: PlanRequest
     origin: Cursor
     submitted_s: float
+    least_error: LeastError
     draws_a_tree: int = 1
     arrival: int = field(default_factory=lambda: next(_arrivals))
     phase: Phase = Phase.WAITING
     trees: list[Tree] = field(default_factory=list)
     drafts: dict[int, Draw] = field(default_factory=dict)
     started: bool = False
-    least_error: LeastError | None = None
     binding: Binding | None = None
 
     @property

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from model.engines.engine import Event, SectionFinished, TextWritten
+from model.engines.least_error import least_error
 from model.engines.requests import branch_of
 from model.engines.response import Response, SectionText
 from model.engines.sampling import choose, probabilities, uniforms
@@ -88,10 +89,11 @@ class Row(Response):
         """
         allowed = self.cursor.allowed()
         left = self._controlled(allowed, logits, time_for)
-        least = self.request.least_error
-        if least is not None and (stage := least.stage(allowed.ids)) is not None:
-            return [(int(allowed.ids[least.choose(stage, logits, left)]), self.draws)]
-        ids, controls = allowed.ids[left], self.request.controls
+        controls = self.request.controls
+        expected = self.request.least_error.expected(allowed, controls)
+        if expected is not None:
+            return [(int(allowed.ids[least_error(logits, expected, left)]), self.draws)]
+        ids = allowed.ids[left]
         numbers = uniforms(controls.seed, self.draws, len(self.tokens))
         places = choose(logits[left], controls.temperature, controls.top_p, numbers)
         chosen: dict[int, list[int]] = {}

@@ -12,7 +12,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.codes import LeastError
 from model.engines.engine import (
     MAX_DRAWS,
     DrawFinished,
@@ -23,9 +22,10 @@ from model.engines.engine import (
     Started,
     TextWritten,
 )
+from model.engines.least_error import Expected, LeastError, least_error
 from model.engines.requests import branch_of, read
 from model.engines.response import Response, SectionText
-from model.formats.cursor import Cursor
+from model.formats.cursor import Allowed, Cursor
 from model.formats.pieces import ACTION, BRANCH, THINKING
 from model.network.checkpoint import Parts
 
@@ -74,7 +74,7 @@ class Decoding:
         grammar: what may follow a cursor, for vLLM.
         request: what is asked.
         start: where its response begins.
-        least_error: chooses trajectory codes, unless the request has them drawn.
+        least_error: tells how far apart numbers and codes lie.
     """
 
     def __init__(
@@ -87,8 +87,7 @@ class Decoding:
         least_error: LeastError,
     ) -> None:
         self._llm, self._parts, self._grammar = llm, parts, grammar
-        self._least_error = least_error if request.controls.codes == "least_error" else None
-        self._request, self._start = request, start
+        self._request, self._start, self._least_error = request, start, least_error
         self._happened: asyncio.Queue[Event | Exception] = asyncio.Queue()
         self._tasks: set[asyncio.Task[None]] = set()
         self._requests = 0
@@ -158,23 +157,23 @@ class Decoding:
 
         controls, first = self._request.controls, draws[0]
         # vLLM tells of at most 128 tokens by name, or of the whole vocabulary; a stage has more codes.
-        weighs_codes = self._stage(first.cursor.allowed().ids) is not None
+        weighs = self._expected(first.cursor.allowed()) is not None
         return SamplingParams(
             n=len(draws),
             temperature=controls.temperature,
             top_p=controls.top_p,
             seed=seed_of(controls.seed, first.index, len(first.tokens)),
-            max_tokens=1 if weighs_codes else first.cursor.compiled.longest(),
-            logprobs=-1 if weighs_codes else None,
-            logprob_token_ids=None if weighs_codes else self._branch_ids(first),
+            max_tokens=1 if weighs else first.cursor.compiled.longest(),
+            logprobs=-1 if weighs else None,
+            logprob_token_ids=None if weighs else self._branch_ids(first),
             structured_outputs=StructuredOutputsParams(grammar=self._grammar(first.cursor)),
             detokenize=False,
             output_kind=RequestOutputKind.DELTA,
         )
 
-    def _stage(self, ids: IntArray) -> int | None:
-        """Whose codes the allowed ``ids`` are, to be weighed; None where vLLM's own choice stands."""
-        return None if self._least_error is None else self._least_error.stage(ids)
+    def _expected(self, allowed: Allowed) -> Expected | None:
+        """The expected error of each allowed id, to be weighed by it; None where vLLM's own choice stands."""
+        return self._least_error.expected(allowed, self._request.controls)
 
     def _branch_ids(self, draw: _Walk) -> list[int] | None:
         """The tokens whose probabilities decide the branch, where it is still to come."""
@@ -187,22 +186,24 @@ class Decoding:
         """Write what vLLM wrote; False when the draw is done, or goes on elsewhere."""
         for place, token in enumerate(tokens):
             allowed, wanted = draw.cursor.allowed(), token
-            stage = self._stage(allowed.ids)
+            expected = self._expected(allowed)
             weighed = None if logprobs is None else logprobs[place]
-            if stage is not None and not _weighs(weighed, allowed.ids):
+            if expected is not None and not _weighs(weighed, allowed.ids):
                 break
             draw.passes += 1
             if allowed.choice == BRANCH and len(allowed.ids) > 1:
                 assert weighed is not None
                 wanted = self._decide(draw, token, weighed)
-            if stage is not None:
-                wanted = self._code(stage, allowed.ids, weighed)
+            if expected is not None:
+                assert weighed is not None
+                logits = np.array([weighed[int(id)].logprob for id in allowed.ids])
+                wanted = int(allowed.ids[least_error(logits, expected)])
             fits = wanted in allowed.ids
             if fits:
                 self._tell(draw, draw.append(wanted, self._parts.vocabulary))
                 if self._request.live and (new := draw.new_text(self._parts.vocabulary)):
                     self._happened.put_nowait(TextWritten(draw.index, *new))
-            if stage is None and fits and wanted == token and not draw.cursor.ending:
+            if expected is None and fits and wanted == token and not draw.cursor.ending:
                 continue
             self._tell(draw, draw.append_forced(self._parts.vocabulary))
             if draw.cursor.done:
@@ -221,13 +222,6 @@ class Decoding:
         draw.think_probability = 1 / (1 + math.exp(min(action - thinking, _FAR)))
         branch = self._request.controls.branch(draw.think_probability)
         return token if branch is None else options[branch]
-
-    def _code(self, stage: int, ids: IntArray, weighed: Mapping[int, Any] | None) -> int:
-        """The code of least expected error among ``ids``, whose log-probabilities vLLM told."""
-        assert self._least_error is not None
-        assert weighed is not None
-        logits = np.array([weighed[int(id)].logprob for id in ids])
-        return int(ids[self._least_error.choose(stage, logits)])
 
     def _finish(self, draw: _Walk) -> None:
         for finished in read(

@@ -16,8 +16,8 @@ import numpy as np
 
 from model.driving.images import ImageError
 from model.driving.scene import Scene
-from model.engines.codes import LeastError
 from model.engines.engine import EngineError, Event, Load, ModelCard, PlanRequest, RequestError
+from model.engines.least_error import LeastError
 from model.engines.pictures import PictureThreads
 from model.engines.requests import begin
 from model.engines.vllm.decoding import Decoding, VllmPrompt

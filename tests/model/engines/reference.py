@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from transformers import DynamicCache
 
 from model.engines.binding import binding_of
-from model.engines.codes import LeastError
 from model.engines.engine import Draw, PlanRequest
+from model.engines.least_error import LeastError, least_error
 from model.engines.sampling import choose, probabilities, uniform
 from model.formats.cf_vla import formats_of
 from model.formats.cursor import CompiledFormat, Token
@@ -108,13 +108,13 @@ def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> t
                 left = thinks == (think_probability > controls.think_threshold)
         if binding is not None and (bound := binding.leaves(allowed.ids, tokens)) is not None:
             left = bound
-        stage = least.stage(allowed.ids) if controls.codes == "least_error" else None
+        expected = least.expected(allowed, controls)
         number = np.array([uniform(controls.seed, index, len(tokens))])
-        if stage is None:
+        if expected is None:
             place = choose(scores[left], controls.temperature, controls.top_p, number)[0]
             token = int(allowed.ids[left][place])
         else:
-            token = int(allowed.ids[least.choose(stage, scores, left)])
+            token = int(allowed.ids[least_error(scores, expected, left)])
         place = len(inputs.prompt.ids) + len(tokens)
         tokens.append(Token(token, cursor.section))
         cursor = cursor.advance(token)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from model.engines.engine import Controls, PlanRequest
+from model.engines.least_error import LeastError
 from model.engines.requests import branch_of
 from model.engines.sampling import uniform
 from model.engines.torch.drafter import _CONTEXTS, Drafter, _Ngrams, _Responses
@@ -29,7 +30,11 @@ def beginning(loaded: Loaded, **controls: Any) -> Row:
     start = CompiledFormat(CF_VLA, loaded.vocabulary).start()
     asked = PlanRequest("a", noisy_scene(), "cf_vla", Controls(n=1, **controls))
     prompt: Any = SimpleNamespace(shown=b"pictures", last_token=0)
-    row = Row(start, Tree(Request(asked, start, 0.0), prompt=prompt), (0,))
+    row = Row(
+        start,
+        Tree(Request(asked, start, 0.0, LeastError(loaded.codec, loaded.vocabulary)), prompt=prompt),
+        (0,),
+    )
     row.start(0)
     row.write((), loaded.vocabulary)
     return row

@@ -107,6 +107,7 @@ def arrivals(draw: st.DrawFn) -> list[Arrival]:
             temperature=draw(st.sampled_from([0.0, 0.2, 0.7, 1.0, 1.5])),
             top_p=draw(st.sampled_from([1.0, 0.9, 0.5])),
             seed=draw(st.integers(0, 1000)),
+            numbers=draw(st.sampled_from(["least_error", "drawn"])),
             codes=draw(st.sampled_from(["least_error", "drawn"])),
             # The clock stands still: deadlines only decide who gives way to whom, and make drafts.
             deadline_ms=draw(st.sampled_from([None, None, 2_000, 3_000])),

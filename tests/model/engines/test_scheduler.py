@@ -20,8 +20,8 @@ class Queue:
 
     def add(self, name: str, n: int = 2, deadline_ms: int | None = None) -> Request:
         asked = PlanRequest(name, SCENE, "cf_vla", Controls(n=n, deadline_ms=deadline_ms, thinking="never"))
-        origin: Any = None  # where responses begin is of no account here
-        request = Request(asked, origin, 0.0, draws_a_tree=2)
+        unused: Any = None  # where responses begin and how numbers are chosen is of no account here
+        request = Request(asked, unused, 0.0, unused, draws_a_tree=2)
         request.__dict__["makes_drafts"] = False
         request.plant(share=True)
         self.scheduler.add(request)

@@ -100,7 +100,7 @@ def test_shortcuts_save_what_they_are_for(exact: Loaded) -> None:
 
 def test_cached_steps_equal_a_full_pass(exact: Loaded) -> None:
     """The decoder's greedy choice at every decision is that of one pass over the whole sequence."""
-    one = request("a", 1, n=1, temperature=0.0, thinking="never", codes="drawn")
+    one = request("a", 1, n=1, temperature=0.0, thinking="never", numbers="drawn", codes="drawn")
     draw = decode(Decoder(Runner(exact, 1)), one)["a", 0]
     inputs = exact.inputs.build(one.scene, "cf_vla")
     compiled = CompiledFormat(CF_VLA, exact.vocabulary)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -150,6 +151,24 @@ def test_a_number_may_be_one_token() -> None:
     [token, _] = compiled.render(Values.of({"tenth": -0.7}))
     assert VOCABULARY.texts[token.id] == "<tenth 3>"
     assert parse(compiled, "<tenth 3><|im_end|>")["tenth"] == -0.7
+
+
+@pytest.mark.parametrize(
+    "number", [Number(0, 9, 1), Number(-0.9, 12.5, 0.1), Number(-1.0, 1.0, 0.1, "tenth")]
+)
+def test_tokens_of_a_number_are_ranked_by_the_least_number_behind_them(number: Number) -> None:
+    compiled = compile_(Section("number", number))
+    least: dict[int, int] = {}
+    for place, text in enumerate(number.texts):
+        value = float(text)
+        least.setdefault(compiled.render(Values.of({"number": value}))[0].id, place)
+    allowed = compiled.start().allowed()
+    assert allowed.ranks is not None
+    assert list(allowed.ids[np.argsort(allowed.ranks)]) == sorted(least, key=least.__getitem__)
+
+
+def test_words_have_no_ranks() -> None:
+    assert compile_(Section("sign", Choice((Option("a"), Option("b"))))).start().allowed().ranks is None
 
 
 def test_numbers_spell_what_their_grid_needs() -> None:

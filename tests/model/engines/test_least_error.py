@@ -7,10 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.engines.codes import LeastError
+from model.engines.engine import Controls
+from model.engines.least_error import Expected, LeastError, least_error
 from model.engines.sampling import probabilities
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.runner import Runner
+from model.formats.cursor import Allowed
 from model.network.checkpoint import Loaded, load
 from tests.checkpoints import noisy_scene
 from tests.model.engines.decoding import decode, request
@@ -47,19 +49,42 @@ def test_no_other_code_is_expected_to_be_off_less(
     left = random.random(len(logits)) < 0.5
     left[0] = True
     distances = loaded.codec.code_distances_m()[stage]
-    place = least.choose(stage, logits, left)
+    place = least_error(logits, codes_expected(loaded, least, stage), left)
     assert left[place]
     believed = probabilities(logits[left])
     expected = distances[left][:, left] @ believed
     assert believed @ distances[left, place] == pytest.approx(expected.min(), abs=1e-6)
 
 
-def test_codes_are_told_from_words(loaded: Loaded, least: LeastError) -> None:
-    for stage in range(6):
-        ids = loaded.vocabulary.code_ids(stage)
-        assert least.stage(np.array(ids)) == stage
-        assert least.stage(np.array(ids[:2])) is None
-    assert least.stage(np.arange(loaded.codec.size)) is None
+def codes_expected(loaded: Loaded, least: LeastError, stage: int) -> Expected:
+    allowed = Allowed(np.array(loaded.vocabulary.code_ids(stage)), "trajectory")
+    assert least.expected(allowed, Controls(codes="drawn")) is None
+    expected = least.expected(allowed, Controls(numbers="drawn"))
+    assert expected is not None
+    return expected
+
+
+def test_words_are_drawn(loaded: Loaded, least: LeastError) -> None:
+    for ids in (np.array(loaded.vocabulary.code_ids(0)[:2]), np.arange(loaded.codec.size)):
+        assert least.expected(Allowed(ids, "plan"), Controls()) is None
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 12))
+def test_no_other_number_is_expected_to_be_off_less(least: LeastError, seed: int, count: int) -> None:
+    random = np.random.default_rng(seed)
+    logits, ranks = 3 * random.normal(size=count), random.permutation(count)
+    left = random.random(count) < 0.5
+    left[0] = True
+    allowed = Allowed(np.arange(count), "plan", ranks=ranks)
+    assert least.expected(allowed, Controls(numbers="drawn")) is None
+    expected = least.expected(allowed, Controls(codes="drawn"))
+    assert expected is not None
+    place = least_error(logits, expected, left)
+    assert left[place]
+    believed = probabilities(np.where(left, logits, -np.inf))
+    errors = np.abs(ranks[:, None] - ranks) @ believed
+    assert expected(believed) == pytest.approx(errors)
+    assert errors[place] == pytest.approx(errors[left].min())
 
 
 @pytest.mark.usefixtures("inference")
