@@ -12,6 +12,7 @@ from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
 from clients.labelling.teachers.rules import RuleTeacher
 from clients.labelling.teachers.teacher import Teacher
 from model.bundled import SCENES
+from model.driving.phrases import ReflectionLanguage
 from service.keys import Keys
 
 LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
@@ -94,7 +95,7 @@ class TeacherSettings(BaseSettings):
     Attributes:
         kind: ``rules`` is built in; ``openai`` is any endpoint that speaks OpenAI's chat completions.
         base_url, model, api_key, temperature, max_tokens, timeout_s, input_price_usd, output_price_usd,
-            extra_body: of the endpoint, see `OpenAiSettings`.
+            extra_body, reflection: of the endpoint, see `OpenAiSettings`.
     """
 
     model_config = SettingsConfigDict(env_prefix="LOOKTWICE_TEACHER_", frozen=True, extra="ignore")
@@ -109,6 +110,7 @@ class TeacherSettings(BaseSettings):
     input_price_usd: float = Field(default=0.0, ge=0)
     output_price_usd: float = Field(default=0.0, ge=0)
     extra_body: dict[str, Any] = {}
+    reflection: ReflectionLanguage = "free_text"
 
     def teacher(self) -> Teacher:
         """The teacher that is set; raises `ValueError` where something is missing."""

@@ -18,6 +18,8 @@ from model.driving.direction import Change, group_of, track_changes
 from model.driving.plan import GROUPS, Plan
 
 Side = Literal["left", "right"]
+ReflectionLanguage = Literal["free_text", "phrases"]
+"""What reflections are written in."""
 State = Literal["", "standing", "slower", "braking"]
 Spot = Literal["my lane", "the left lane", "the right lane", "the left side", "the right side", "oncoming"]
 Consequence = Literal[

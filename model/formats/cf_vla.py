@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Final
-from typing import Literal as Literal_
 
+from model.driving.phrases import ReflectionLanguage
 from model.formats.phrases import Reflection
 from model.formats.pieces import (
     ACTION,
@@ -25,8 +25,6 @@ from model.formats.pieces import (
 )
 from model.formats.plan_tracks import FIRST_PLAN, REFLECTION, PlanTracks, RevisedPlan
 
-ReflectionLanguage = Literal_["free_text", "phrases"]
-"""What reflections are written in."""
 MAX_THINKING_TOKENS: Final = 160
 """Teachers write at most 80 words (CF-VLA section 8); two tokens a word leave room to spare."""
 

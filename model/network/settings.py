@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final, get_args
 
 from model.driving.facts import FACT_GROUPS
+from model.driving.phrases import ReflectionLanguage
 from model.driving.scene import CAMERAS, CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE
-from model.formats.cf_vla import ReflectionLanguage
 from model.network.intent import INTENT_TOKENS
 
 CONFIG_KEY: Final = "looktwice"

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clients.answers import retry_after_s
 from clients.labelling.checks import FailedCheck
+from clients.labelling.teachers.facts import RESPONSE_FORMAT, phrases_of
 from clients.labelling.teachers.prompt import PROMPT_VERSION, SYSTEM, Part, Text, user_message
 from clients.labelling.teachers.teacher import (
     Answer,
@@ -22,6 +23,7 @@ from clients.labelling.teachers.teacher import (
     TeacherError,
 )
 from model.driving.images import media_type
+from model.driving.phrases import PhraseError, ReflectionLanguage
 
 _BUSY: Final = (408, 409, 425, 429, 500, 502, 503, 504, 529)
 _CLOSED: Final = (401, 402, 403, 404, 405)
@@ -44,6 +46,7 @@ class OpenAiSettings:
         input_price_usd, output_price_usd: for a million tokens, to count costs by.
         extra_body: more fields of the request, such as an endpoint's own sampling options; null takes a
             field out.
+        reflection: what it is to write: a paragraph, or facts (JSON) that are brought into phrases.
     """
 
     base_url: str
@@ -55,6 +58,7 @@ class OpenAiSettings:
     input_price_usd: float = 0.0
     output_price_usd: float = 0.0
     extra_body: Mapping[str, Any] = field(default_factory=dict)
+    reflection: ReflectionLanguage = "free_text"
 
 
 class _Message(BaseModel):
@@ -101,7 +105,7 @@ class OpenAiTeacher:
         settings = self._settings
         told = f"prompt {PROMPT_VERSION}, temperature {settings.temperature:g}, {settings.max_tokens} tokens"
         extra = "".join(f", {name}={value}" for name, value in sorted(settings.extra_body.items()))
-        return told + extra
+        return told + extra + ", in phrases" * (settings.reflection == "phrases")
 
     async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
         """See `Teacher.reflect`."""
@@ -150,13 +154,17 @@ def completion_request(
     body = {
         "model": settings.model,
         "messages": [
-            {"role": "system", "content": SYSTEM},
-            {"role": "user", "content": [_part(part) for part in user_message(question, complaints)]},
+            {"role": "system", "content": SYSTEM[settings.reflection]},
+            {
+                "role": "user",
+                "content": [_part(part) for part in user_message(question, complaints, settings.reflection)],
+            },
         ],
         "temperature": settings.temperature,
         "max_tokens": settings.max_tokens,
         # Another try gets other random numbers.
         "seed": question.seed + len(complaints),
+        "response_format": RESPONSE_FORMAT if settings.reflection == "phrases" else None,
         **settings.extra_body,
     }
     return {name: value for name, value in body.items() if value is not None}
@@ -174,11 +182,17 @@ def completion_answer(settings: OpenAiSettings, content: bytes | str) -> Answer:
     ) / 1e6
     answer = Answer("", used.prompt_tokens, used.completion_tokens, cost_usd)
     if not completion.choices or not completion.choices[0].message.content:
-        return answer._replace(unusable="write one short paragraph")
+        return answer._replace(unusable="the last answer was empty")
     choice = completion.choices[0]
     if choice.finish_reason == "length":
         return answer._replace(unusable="write less: the answer was cut off")
-    return answer._replace(text=(choice.message.content or "").strip())
+    text = (choice.message.content or "").strip()
+    if settings.reflection == "free_text":
+        return answer._replace(text=text)
+    try:
+        return answer._replace(text=phrases_of(text))
+    except PhraseError as error:
+        return answer._replace(unusable=str(error))
 
 
 def _part(part: Part) -> dict[str, Any]:

@@ -164,4 +164,4 @@ def test_other_checks_have_another_version() -> None:
     sources = [Path(str(module.__file__)).read_bytes() for module in (checks, direction, leaks, phrases)]
     digest = hashlib.sha256(b"".join(sources)).hexdigest()[:12]
     told = "raise CHECKS_VERSION if these ask for something else now, and tell both here"
-    assert (CHECKS_VERSION, digest) == (3, "1dfe5c3f0353"), told
+    assert (CHECKS_VERSION, digest) == (3, "5404fce8457b"), told

@@ -9,9 +9,11 @@ from collections.abc import AsyncIterator
 
 import pytest
 from fastapi import FastAPI
+from hypothesis import given
 from starlette.responses import StreamingResponse
 
 from clients.labelling.checks import FailedCheck, check_reflection
+from clients.labelling.teachers.facts import phrases_of
 from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
 from clients.labelling.teachers.patience import patiently
 from clients.labelling.teachers.teacher import (
@@ -22,7 +24,9 @@ from clients.labelling.teachers.teacher import (
     TeacherError,
     ask,
 )
+from model.driving.phrases import HEADS, Facts, head_of
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer, completion
+from tests.model.driving.strategies import facts
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN
 from tests.sockets import listening
@@ -211,3 +215,64 @@ def test_who_asks_to_be_asked_again_at_once_is_not() -> None:
     with listening(server.app()) as (url, _), pytest.raises(TeacherBusy):
         asyncio.run(asking(url))
     assert 2 <= len(server.asked) <= 12
+
+
+SEEN: dict[str, object] = {
+    "seen": "A standing vehicle",
+    "place": "my lane",
+    "ahead_m": 18,
+    "consequence": "too close",
+    "correction": "slower",
+}
+
+
+def told(**changes: object) -> str:
+    return json.dumps({"statements": [SEEN | changes]})
+
+
+def test_a_teacher_may_fill_in_facts_that_become_phrases() -> None:
+    server = ChatServer([told()])
+    text = answer(server, reflection="phrases").text
+    assert text == (
+        "A standing vehicle is in my lane some 20 metres ahead."
+        " Going on like this would bring me too close, so I should slow down sooner."
+    )
+    assert check_reflection(text, KEEP_ON, SLOW_DOWN) == []
+    (body,) = server.asked
+    fields = body["response_format"]["json_schema"]["schema"]["$defs"]["ToldStatement"]["properties"]
+    assert "A standing vehicle" in fields["seen"]["enum"]
+    assert "JSON" in body["messages"][0]["content"]
+    assert "paragraph" not in body["messages"][1]["content"][-1]["text"]
+
+
+@pytest.mark.parametrize(
+    ("written", "complaint"),
+    [
+        ("I should slow down.", "answer with the JSON"),
+        (told(seen="A unicorn"), "'A unicorn' is none of"),
+        (told(place=None), "needs a place"),
+        (told(ahead_m=400), "from 0 to 100"),
+        (told(consequence="wrong way"), "is no reason for"),
+        (json.dumps({"statements": [SEEN, SEEN]}), "one change of each track"),
+        (told(colour="red"), "answer with the JSON"),
+    ],
+)
+def test_facts_that_do_not_go_together_are_asked_for_again(written: str, complaint: str) -> None:
+    found = answer(ChatServer([written]), reflection="phrases")
+    assert found.text == ""
+    assert complaint in found.unusable
+
+
+@given(facts())
+def test_every_reflection_in_phrases_can_be_told_in_fields(facts: Facts) -> None:
+    statements = [
+        {
+            "seen": next(text for text, head in HEADS.items() if head == head_of(each.cue)),
+            "place": getattr(each.cue, "place", None),
+            "ahead_m": getattr(each.cue, "ahead_m", None),
+            "consequence": each.consequence,
+            "correction": each.correction,
+        }
+        for each in facts.statements
+    ]
+    assert phrases_of(json.dumps({"statements": statements})) == str(facts)
