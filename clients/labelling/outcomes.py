@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from clients.labelling.ledger import Entry, Ledger, LedgerError, Record, Run
+from model.driving.direction import wanted_changes
 from model.driving.outcome import OUTCOMES_VERSION, Outcome
+from model.driving.plan import parse_plan
 
 
 @dataclass(frozen=True)
@@ -65,15 +67,15 @@ def plans_that_fail(entry: Entry, followed: Followed) -> tuple[int, ...]:
     """The free draws whose plans fail and have a better one: for each such plan its first draw.
 
     A plan of several draws fails where all of them do: if it holds in some, the plan is not the reason. Where
-    the expert's own way fails as well, or its plan is the same, there is nothing better to say.
+    the expert's own way fails as well, or its plan asks for no change, there is nothing better to say.
     """
     if not followed.expert.holds:
         return ()
-    better = entry.record["expert_plan"]
+    better = parse_plan(entry.record["expert_plan"])
     return tuple(
         draws[0]
         for plan, draws in _draws_of(entry).items()
-        if plan != better and not any(followed.plans[draw].holds for draw in draws)
+        if not any(followed.plans[draw].holds for draw in draws) and wanted_changes(parse_plan(plan), better)
     )
 
 

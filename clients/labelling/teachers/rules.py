@@ -30,7 +30,7 @@ from model.driving.phrases import (
     Thing,
 )
 from model.driving.plan import TICKS, Plan
-from model.driving.seen import LANES, SLOWER_BY_MS, is_clear, spot_of, state_of
+from model.driving.seen import LANES, SLOWER_BY_MS, STANDING_MS, is_clear, spot_of, state_of
 from model.driving.view import Place, Sight, View, view_of
 
 _CLOSE_M: Final = CLEAR_WITHIN_M
@@ -46,7 +46,7 @@ class RuleTeacher:
     """`clients.labelling.teachers.teacher.Teacher` by rule; nothing is asked of anybody."""
 
     name: Final = "rules"
-    revision: Final = "4"
+    revision: Final = "5"
 
     async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
         """Facts in phrases; the same for the same question.
@@ -120,7 +120,7 @@ def _faster(view: View) -> Statement | None:
     if is_clear(view, "my lane"):
         return Statement(Clear(), "too cautious", "faster")
     ahead = view.first("vehicle", "cone", "barrier", "pedestrian", places=("my lane",))
-    if ahead is None or ahead.speed_ms < view.speed_ms - SLOWER_BY_MS:
+    if ahead is None or not _leaves_room(ahead, view):
         return None
     return Statement(_thing(ahead, view), "too cautious", "faster")
 
@@ -150,6 +150,14 @@ def _other_lane(side: Side, view: View) -> Statement | None:
 def _ahead(view: View) -> Sight | None:
     """The nearest thing that blocks the own lane."""
     return view.first("vehicle", "cone", "barrier", places=("my lane",))
+
+
+def _leaves_room(sight: Sight, view: View) -> bool:
+    """Whether one may pick up speed behind it: it drives, does not brake, and is far or drives off."""
+    if sight.kind != "vehicle" or sight.speed_ms < STANDING_MS or sight.brakes:
+        return False
+    faster_ms = sight.speed_ms - view.speed_ms
+    return faster_ms > SLOWER_BY_MS or (faster_ms > -SLOWER_BY_MS and sight.ahead_m > _NO_TIME_M[sight.kind])
 
 
 def _holds_up(sight: Sight, view: View) -> bool:
