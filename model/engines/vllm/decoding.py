@@ -32,6 +32,8 @@ from model.network.checkpoint import Parts
 IntArray = npt.NDArray[np.int64]
 
 _SEEDS: Final = 2**63
+_MOST_NAMED: Final = 128
+"""Tokens that vLLM tells the log-probabilities of by name; of more it tells the whole vocabulary's."""
 _FAR: Final = 700.0
 """A difference of log-probabilities beyond which the exponential overflows."""
 
@@ -136,16 +138,22 @@ class Decoding:
             stream = self._llm.generate(
                 self._prompt.then(written), self._parameters(draws), f"{self._request.request_id}/{number}"
             )
+            # What is weighed is the same for all draws, so vLLM is asked for one.
+            weighs, alone = self._weighs(draws[0].cursor), self._alone(draws[0].cursor)
             following = {draw.index for draw in draws}
             async with aclosing(stream):
                 async for output in stream:
                     for part in output.outputs:
-                        draw = draws[part.index]
-                        if draw.index in following and not self._walk(draw, part.token_ids, part.logprobs):
-                            following.discard(draw.index)
+                        for draw in draws if weighs else draws[part.index : part.index + 1]:
+                            tokens = part.token_ids[:1] if alone else part.token_ids
+                            if draw.index in following and not self._walk(draw, tokens, part.logprobs, alone):
+                                following.discard(draw.index)
                     if not following:
-                        return
-            raise EngineError("vLLM ended a response before its format does")
+                        break
+            if following:
+                raise EngineError("vLLM ended a response before its format does")
+            for group in _alike(draw for draw in draws if not draw.cursor.done):
+                self._go_on(group)
         except EngineError as error:
             self.fail(error)
         except Exception as error:  # vLLM's own, of whatever type
@@ -156,20 +164,34 @@ class Decoding:
         from vllm.sampling_params import RequestOutputKind, StructuredOutputsParams
 
         controls, first = self._request.controls, draws[0]
-        # vLLM tells of at most 128 tokens by name, or of the whole vocabulary; a stage has more codes.
-        weighs = self._expected(first.cursor.allowed()) is not None
+        ids = first.cursor.allowed().ids
+        weighs, alone = self._weighs(first.cursor), self._alone(first.cursor)
+        named = self._branch_ids(first)
+        if weighs:
+            named = ids.tolist() if len(ids) <= _MOST_NAMED else None
+        grammar = None if alone else StructuredOutputsParams(grammar=self._grammar(first.cursor))
         return SamplingParams(
-            n=len(draws),
+            n=1 if weighs else len(draws),
             temperature=controls.temperature,
             top_p=controls.top_p,
             seed=seed_of(controls.seed, first.index, len(first.tokens)),
-            max_tokens=1 if weighs else first.cursor.compiled.longest(),
-            logprobs=-1 if weighs else None,
-            logprob_token_ids=None if weighs else self._branch_ids(first),
-            structured_outputs=StructuredOutputsParams(grammar=self._grammar(first.cursor)),
+            max_tokens=1 if alone else first.cursor.compiled.longest(),
+            logprobs=-1 if weighs and named is None else None,
+            logprob_token_ids=named,
+            allowed_token_ids=ids.tolist() if alone else None,
+            structured_outputs=grammar,
             detokenize=False,
             output_kind=RequestOutputKind.DELTA,
         )
+
+    def _weighs(self, cursor: Cursor) -> bool:
+        """Whether we choose the next token by its expected error, the same for all draws."""
+        return self._expected(cursor.allowed()) is not None
+
+    def _alone(self, cursor: Cursor) -> bool:
+        """Whether vLLM is asked for the next token alone: between numbers no grammar is needed."""
+        few = len(cursor.allowed().ids) <= _MOST_NAMED
+        return self._weighs(cursor) or (few and self._request.controls.numbers == "least_error")
 
     def _expected(self, allowed: Allowed) -> Expected | None:
         """The expected error of each allowed id, to be weighed by it; None where vLLM's own choice stands."""
@@ -182,13 +204,19 @@ class Decoding:
             return None
         return [compiled.literal(word)[0] for word in (ACTION, THINKING)]
 
-    def _walk(self, draw: _Walk, tokens: Sequence[int], logprobs: Sequence[Mapping[int, Any]] | None) -> bool:
-        """Write what vLLM wrote; False when the draw is done, or goes on elsewhere."""
+    def _walk(
+        self,
+        draw: _Walk,
+        tokens: Sequence[int],
+        logprobs: Sequence[Mapping[int, Any]] | None,
+        alone: bool,
+    ) -> bool:
+        """Write what vLLM wrote; False when the draw is done, or goes on with another request."""
         for place, token in enumerate(tokens):
             allowed, wanted = draw.cursor.allowed(), token
             expected = self._expected(allowed)
             weighed = None if logprobs is None else logprobs[place]
-            if expected is not None and not _weighs(weighed, allowed.ids):
+            if expected is not None and not _told(weighed, allowed.ids):
                 break
             draw.passes += 1
             if allowed.choice == BRANCH and len(allowed.ids) > 1:
@@ -203,7 +231,7 @@ class Decoding:
                 self._tell(draw, draw.append(wanted, self._parts.vocabulary))
                 if self._request.live and (new := draw.new_text(self._parts.vocabulary)):
                     self._happened.put_nowait(TextWritten(draw.index, *new))
-            if expected is None and fits and wanted == token and not draw.cursor.ending:
+            if not alone and fits and wanted == token and not draw.cursor.ending:
                 continue
             self._tell(draw, draw.append_forced(self._parts.vocabulary))
             if draw.cursor.done:
@@ -212,7 +240,6 @@ class Decoding:
             break
         else:
             return True
-        self._go_on([draw])
         return False
 
     def _decide(self, draw: _Walk, token: int, logprobs: Mapping[int, Any]) -> int:
@@ -239,6 +266,14 @@ class Decoding:
             self._happened.put_nowait(SectionFinished(draw.index, *section))
 
 
-def _weighs(weighed: Mapping[int, Any] | None, ids: IntArray) -> bool:
+def _alike(draws: Iterable[_Walk]) -> Iterable[list[_Walk]]:
+    """Draws by what they have written: vLLM writes on for those that have written the same together."""
+    groups: dict[tuple[int, ...], list[_Walk]] = {}
+    for draw in draws:
+        groups.setdefault(tuple(token.id for token in draw.tokens), []).append(draw)
+    return groups.values()
+
+
+def _told(weighed: Mapping[int, Any] | None, ids: IntArray) -> bool:
     """Whether vLLM was asked for the probabilities of all ``ids``."""
     return weighed is not None and all(int(id) in weighed for id in ids)
