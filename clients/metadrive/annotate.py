@@ -119,9 +119,24 @@ class Tagger:
 
 
 def route_ahead(log: EpisodeLog, step: int) -> npt.NDArray[np.float32]:
-    """The way to go [20, 2] in the ego frame: the present lane's centre, the turn's lane before a turn.
+    """The way to go [20, 2] in the ego frame: `route_line` at the spacing of a route."""
+    points = route_line(log, step, 0.0, 100.0)
+    apart = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    wanted = ROUTE_SPACING_M * np.arange(1, ROUTE_POINTS + 1)
+    even = np.stack([np.interp(wanted, apart, points[:, 0]), np.interp(wanted, apart, points[:, 1])], axis=1)
+    return to_ego(even, log.ego[step]).astype(np.float32)
+
+
+def route_line(log: EpisodeLog, step: int, behind_m: float, ahead_m: float) -> Array:
+    """The way to go [k, 2] in the world: the present lane's centre, the turn's lane before a turn.
 
     It follows the map and the navigation only: nothing the expert does about others shows in it.
+
+    Args:
+        log: the episode.
+        step: when in it.
+        behind_m: whole metres of progress before the ego's place that the line begins.
+        ahead_m: metres of progress beyond it that the line ends.
     """
     road_map = log.road_map
     lane = int(log.lanes[step])
@@ -129,7 +144,7 @@ def route_ahead(log: EpisodeLog, step: int) -> npt.NDArray[np.float32]:
     if rail is None:
         rail = int(log.rails[step])
     start = float(log.progress[step])
-    progress = np.arange(start, start + 100.0, 1.0)
+    progress = np.arange(start - behind_m, start + ahead_m, 1.0)
     points = _along(road_map.rails[rail], progress)
     target = _turn_rail(log, rail, start)
     if target is not None:
@@ -138,10 +153,7 @@ def route_ahead(log: EpisodeLog, step: int) -> npt.NDArray[np.float32]:
         u = np.clip(u, 0, np.clip((progress - start) / 30.0, 0, 1))
         w = (u**3 * (10 - 15 * u + 6 * u * u))[:, None]
         points = (1 - w) * points + w * _along(road_map.rails[other], progress)
-    apart = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    wanted = ROUTE_SPACING_M * np.arange(1, ROUTE_POINTS + 1)
-    even = np.stack([np.interp(wanted, apart, points[:, 0]), np.interp(wanted, apart, points[:, 1])], axis=1)
-    return to_ego(even, log.ego[step]).astype(np.float32)
+    return points
 
 
 def _along(rail: Rail, progress: Array) -> Array:

@@ -11,6 +11,7 @@ import shapely.affinity
 
 from clients.metadrive.annotate import Tagger, dense_target, route_ahead, to_ego
 from clients.metadrive.episode_log import EpisodeLog, lights_on
+from clients.metadrive.lane_maps import LaneMaps
 from clients.metadrive.rig import Picture, Rig
 from clients.metadrive.roads import Array
 from clients.metadrive.stage import Stage
@@ -54,6 +55,7 @@ def labelled_scenes(
         return
     stage = Stage(log, rig)
     tagger = Tagger(log)
+    lane_maps = LaneMaps(log)
     shots: dict[int, list[Picture]] = {}
     try:
         for step, moment in usable:
@@ -84,6 +86,7 @@ def labelled_scenes(
                 moment.lane_trace(),
                 tagger.tags(step),
                 dense,
+                lane_maps.at(step),
             )
     finally:
         stage.close()

@@ -17,6 +17,7 @@ from model.driving.agents import (
     Light,
     SceneError,
 )
+from model.driving.lane_map import LaneMap
 from model.driving.tracks import Track, check_tracks, tracks_of
 from model.driving.trajectory import (
     FloatArray,
@@ -171,6 +172,7 @@ class LabelledScene:
         lane_trace: the ego's lanes over time, or None where unknown.
         tags: what makes the scene difficult.
         dense: per-pixel targets of the latest pictures; may be empty.
+        lane_map: what NAVSIM's scores ask of the map; None where nobody knows.
     """
 
     scene: Scene
@@ -183,6 +185,7 @@ class LabelledScene:
     lane_trace: LaneTrace | None = None
     tags: frozenset[Tag] = frozenset()
     dense: tuple[DenseTarget, ...] = ()
+    lane_map: LaneMap | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "future", check_trajectory(self.future))

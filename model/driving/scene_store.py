@@ -1,7 +1,8 @@
 """Labelled scenes in Parquet files: one row a scene, everything a scene knows in it.
 
-A file carries ``looktwice.scene_version`` in its metadata; readers refuse other versions. Files are written
-to a temporary name beside their place and renamed, so a reader never meets half a file.
+A file carries ``looktwice.scene_version`` in its metadata; readers refuse other versions. Files of this
+version may lack ``lane_map``, which came later: then it is not known. Files are written to a temporary name
+beside their place and renamed, so a reader never meets half a file.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from model.driving.images import decode_image, encode_png
+from model.driving.lane_map import LANE_MAP_CM, LaneArea, LaneMap
 from model.driving.parquet_rows import write_rows
 from model.driving.scene import (
     Agent,
@@ -27,7 +29,7 @@ from model.driving.scene import (
     SceneError,
     Tag,
 )
-from model.driving.trajectory import GeometryError
+from model.driving.trajectory import FloatArray, GeometryError
 
 SCENE_VERSION: Final = "2"
 _VERSION_KEY: Final = b"looktwice.scene_version"
@@ -38,6 +40,8 @@ _RANGE_FAR_M: Final = 400.0
 
 _FLOATS = pa.list_(pa.float32())
 _RINGS = pa.list_(_FLOATS)
+_STEPS = pa.list_(pa.int32())
+"""Points of a lane map in centimetres, each as the step from the one before: half the bytes of floats."""
 _SCHEMA: Final = pa.schema(
     [
         ("scene_id", pa.string()),
@@ -74,6 +78,22 @@ _SCHEMA: Final = pa.schema(
             "dense",
             pa.list_(
                 pa.struct([("camera", pa.string()), ("classes", pa.binary()), ("range_log", pa.binary())])
+            ),
+        ),
+        (
+            "lane_map",
+            pa.struct(
+                [
+                    (
+                        "lanes",
+                        pa.list_(
+                            pa.struct([("lane_id", pa.int32()), ("ring", _STEPS), ("on_route", pa.bool_())])
+                        ),
+                    ),
+                    ("intersections", pa.list_(_STEPS)),
+                    ("centreline", _STEPS),
+                    ("has_lights", pa.bool_()),
+                ]
             ),
         ),
     ]
@@ -217,7 +237,41 @@ def _to_row(labelled: LabelledScene) -> dict[str, Any]:
             }
             for target in labelled.dense
         ],
+        "lane_map": None if labelled.lane_map is None else _lane_map_to_row(labelled.lane_map),
     }
+
+
+def _lane_map_to_row(lane_map: LaneMap) -> dict[str, Any]:
+    return {
+        "lanes": [
+            {"lane_id": lane.lane_id, "ring": _to_steps(lane.ring), "on_route": lane.on_route}
+            for lane in lane_map.lanes
+        ],
+        "intersections": [_to_steps(ring) for ring in lane_map.intersections],
+        "centreline": _to_steps(lane_map.centreline),
+        "has_lights": lane_map.has_lights,
+    }
+
+
+def _lane_map(row: dict[str, Any]) -> LaneMap:
+    return LaneMap(
+        tuple(
+            LaneArea(lane["lane_id"], _from_steps(lane["ring"]), lane["on_route"]) for lane in row["lanes"]
+        ),
+        tuple(_from_steps(ring) for ring in row["intersections"]),
+        _from_steps(row["centreline"]),
+        row["has_lights"],
+    )
+
+
+def _to_steps(points: FloatArray) -> list[int]:
+    centimetres = np.round(points.astype(np.float64) * LANE_MAP_CM).astype(np.int64)
+    steps: list[int] = np.diff(centimetres, axis=0, prepend=np.zeros((1, 2), np.int64)).ravel().tolist()
+    return steps
+
+
+def _from_steps(steps: list[int]) -> Any:
+    return np.cumsum(np.asarray(steps, np.int64).reshape(-1, 2), axis=0) / LANE_MAP_CM
 
 
 def _array(values: list[float], columns: int) -> Any:
@@ -255,6 +309,7 @@ def _from_row(row: dict[str, Any]) -> LabelledScene:
             )
             for target in row.get("dense") or ()
         ),
+        lane_map=_lane_map(told) if (told := row.get("lane_map")) is not None else None,
     )
 
 

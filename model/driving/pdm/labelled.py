@@ -7,6 +7,8 @@ from typing import Final
 import numpy as np
 
 from model.driving.agents import Agent
+from model.driving.lane_map import LaneArea
+from model.driving.pdm.simulator import reference_poses, simulate
 from model.driving.pdm.world import (
     ACCELERATION,
     HEADING,
@@ -18,6 +20,7 @@ from model.driving.pdm.world import (
     YAW_RATE,
     Area,
     Array,
+    Lane,
     TrackedBox,
     Vehicle,
     World,
@@ -25,35 +28,73 @@ from model.driving.pdm.world import (
     Y,
 )
 from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, LabelledScene
-from model.driving.trajectory import HISTORY_STEPS, FloatArray
+from model.driving.trajectory import HISTORY_STEPS, FloatArray, to_ego_frame
 
-_AXLE_M: Final = 1.4166
-"""From the box's centre back to the rear axle, in MetaDrive's car; 1.0523 m forward to the front one."""
-EGO: Final = Vehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2 + _AXLE_M, EGO_LENGTH_M / 2 - _AXLE_M, _AXLE_M + 1.0523)
-"""The ego of our scenes."""
+_WHEELBASE_M: Final = 1.4166 + 1.0523
+"""Of MetaDrive's car, behind and before its middle."""
+EGO: Final = Vehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2, EGO_LENGTH_M / 2, _WHEELBASE_M)
+"""The ego of our scenes, measured from its middle: that is the point that never slips.
+
+Experts on their rails, and cars that follow plans (`clients.metadrive.tracking`), head where their middle
+goes. NAVSIM calls the point of which this is true the rear axle. Were it put where MetaDrive's axle is, an
+expert in a tight turn would slip by 8 degrees there, and NAVSIM's tracker, which cannot slip, be a metre off.
+"""
 _MOVING_MPS: Final = 0.5
 
 
 def world_of(labelled: LabelledScene) -> World:
     """The world around a labelled scene's ego, whose poses are those of the box's centre.
 
-    Our scenes know no lanes as areas, no intersections and no lights: those layers are None. The centre line
-    is the route, where there is one.
+    A scene without a lane map knows no lanes as areas, no intersections and no lights: those layers are None,
+    and the centre line is the route, where there is one.
     """
     past = _states(labelled.scene.history)
-    route = labelled.scene.route
-    line = None if route is None else np.concatenate([np.zeros((1, 2)), route.astype(np.float64)])
-    drivable = (
-        Area(tuple(ring.astype(np.float64) for ring in labelled.drivable)) if labelled.drivable else None
-    )
+    known = labelled.lane_map
     return World(
         ego=past[-1],
         vehicle=EGO,
         tracks=tuple(_track(agent) for agent in labelled.agents if np.isfinite(_ahead(agent)).any()),
-        drivable=None if drivable is None else (drivable,),
-        centreline=line,
+        lanes=None if known is None else tuple(map(_lane, known.lanes)),
+        intersections=None if known is None else _areas(known.intersections),
+        drivable=_areas(labelled.drivable) or None,
+        # A world without lights has none that is red, and that is known. Of a world with lights it is not.
+        lights=None if known is None or known.has_lights else (),
+        centreline=_route_line(labelled) if known is None else known.centreline.astype(np.float64),
         past=past[:-1],
     )
+
+
+def _lane(lane: LaneArea) -> Lane:
+    return Lane(str(lane.lane_id), Area((lane.ring.astype(np.float64),)), lane.on_route)
+
+
+def _areas(rings: tuple[FloatArray, ...]) -> tuple[Area, ...]:
+    """One area of all rings, as points are in it by the even-odd rule; none of none."""
+    return (Area(tuple(ring.astype(np.float64) for ring in rings)),) if rings else ()
+
+
+def _route_line(labelled: LabelledScene) -> Array | None:
+    route = labelled.scene.route
+    return None if route is None else np.concatenate([np.zeros((1, 2)), route.astype(np.float64)])
+
+
+def states_of(history: FloatArray, plan: Array) -> Array:
+    """Simulated states [41, 11] of a plan [64, 3] of the centre that begins where a history [h, 4] ends."""
+    state = _states(history)[-1]
+    states: Array = simulate(reference_poses(plan[None], EGO, state, centre=True), EGO, state)[0]
+    return states
+
+
+def moment_before(labelled: LabelledScene, seconds: float) -> tuple[FloatArray, FloatArray]:
+    """The scene's ego a little earlier: its history [h, 4] up to then, and the expert's way on [64, 4].
+
+    The history is as much shorter as the moment lies back; at least four of its 16 poses must be left.
+    """
+    back = round(seconds / STEP_S)
+    track = np.concatenate([labelled.scene.history, labelled.future]).astype(np.float64)
+    present = HISTORY_STEPS - 1 - back
+    seen = to_ego_frame(track, track[present]).astype(np.float32)
+    return seen[: present + 1], seen[present + 1 : present + 1 + len(labelled.future)]
 
 
 def plans_of(trajectories: FloatArray) -> Array:
@@ -62,13 +103,17 @@ def plans_of(trajectories: FloatArray) -> Array:
 
 
 def _states(history: FloatArray) -> Array:
-    """States [16, 11] of the rear axle, of poses [16, 4] of the centre at 10 Hz."""
-    states = np.zeros((HISTORY_STEPS, STATE_SIZE))
+    """States [h, 11] of the rear axle, of poses [h, 4] of the centre at 10 Hz.
+
+    At both ends, speeds and turns are those of the parabola through the three nearest poses. A plain
+    difference would be half a step late, and the acceleration now, taken of it, half of what it is.
+    """
+    states = np.zeros((len(history), STATE_SIZE))
     heading = np.unwrap(history[:, 3].astype(np.float64))
     axle = history[:, :2] - EGO.centre_m * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    steps = np.gradient(axle, STEP_S, axis=0)
+    steps = np.gradient(axle, STEP_S, axis=0, edge_order=2)
     speed = steps[:, 0] * np.cos(heading) + steps[:, 1] * np.sin(heading)
-    turning = np.gradient(heading, STEP_S)
+    turning = np.gradient(heading, STEP_S, edge_order=2)
     moving = np.where(np.abs(speed) > _MOVING_MPS, speed, np.inf)
     states[:, X], states[:, Y], states[:, HEADING] = axle[:, 0], axle[:, 1], heading
     states[:, SPEED], states[:, YAW_RATE] = speed, turning

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from model.driving.lane_map import LaneArea, LaneMap
 from model.driving.scene import FRONT_WIDE, DenseTarget, LabelledScene
 from model.driving.scene_store import (
     ROW_GROUP,
@@ -55,6 +56,15 @@ def rich_scene() -> LabelledScene:
         drivable=(rectangle(-50, -6, 90, 6), rectangle(3, 3, 4, 4)),
         tags=frozenset({"pedestrian", "turn"}),
         dense=(DenseTarget(FRONT_WIDE, classes, np.zeros((6, 8), np.float32)),),
+        lane_map=LaneMap(
+            (
+                LaneArea(3, rectangle(-50.004, -1.75, 90.123, 1.75), True),
+                LaneArea(4, rectangle(-50, 1.75, 90, 5.25), False),
+            ),
+            (rectangle(20, -6, 40, 6), rectangle(28, -1, 30, 1)),
+            np.array([[-20.0, 0.01], [160.0, -0.02]]),
+            has_lights=False,
+        ),
     )
 
 
@@ -70,6 +80,28 @@ def test_everything_a_scene_knows_comes_back(tmp_path: Path) -> None:
     assert write_scenes(path, written) == 2
     for one, other in zip(written, read_scenes(path), strict=True):
         assert_same(one, other)
+
+
+def test_files_from_before_lane_maps_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "old.parquet"
+    write_scenes(path, [rich_scene()])
+    old = pq.read_table(path)
+    pq.write_table(old.drop_columns(["lane_map"]), path)
+    for dense in (True, False):
+        (read,) = read_scenes(path, dense=dense)
+        assert_same(read, replace(rich_scene(), lane_map=None, dense=rich_scene().dense if dense else ()))
+    assert old.num_rows == count_scenes(path)
+
+
+def test_a_broken_lane_map_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "s.parquet"
+    write_scenes(path, [rich_scene()])
+    table = pq.read_table(path)
+    row = table.to_pylist()[0]
+    row["lane_map"]["lanes"][0]["ring"] = [0, 0, 100, 0]
+    pq.write_table(pa.Table.from_pylist([row], schema=table.schema), path)
+    with pytest.raises(SceneFileError, match=r"no scene: lane 3 needs at least 3 points"):
+        list(read_scenes(path))
 
 
 def test_ranges_of_dense_targets_are_off_by_little(tmp_path: Path) -> None:
