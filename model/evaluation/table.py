@@ -118,8 +118,8 @@ def format_table(rows: Sequence[Row], comparisons: Sequence[Comparison] = ()) ->
     """The table as plain text; the ADE that is driven by carries its 95 % interval, comparisons follow."""
     header = ["", "scenes", "n", *(title for _, title, _ in _COLUMNS)]
     header.insert(4, "95 %")
-    lines = _aligned([header, *(_cells(row) for row in rows)])
-    lines += _aligned([_comparison_cells(comparison) for comparison in comparisons])
+    lines = aligned([header, *(_cells(row) for row in rows)])
+    lines += aligned([_comparison_cells(comparison) for comparison in comparisons])
     return "\n".join(lines) + "\n"
 
 
@@ -156,7 +156,7 @@ def _shown_interval(interval: Interval | None) -> str:
     return "" if interval is None else f"{interval[0]:.2f}..{interval[1]:.2f}"
 
 
-def _aligned(lines: Sequence[Sequence[str]]) -> list[str]:
+def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
     """Columns padded to their widest cell: the first one to the left, numbers to the right."""
     if not lines:
         return []

@@ -113,7 +113,7 @@ def evaluate(
             codes=codes,
             bind=bind,
         )
-        labelled = list(_evenly(read_scenes(scenes, dense=False), count_scenes(scenes), limit))
+        labelled = list(evenly(read_scenes(scenes, dense=False), count_scenes(scenes), limit))
         if perception:
             from service.cli.perception import tell_perception
 
@@ -154,7 +154,7 @@ def evaluate(
             variants = standard_variants(made.card.formats, controls, made.card.inputs)
             planners = dict(map(_small_planner, small or ()))
             evaluate = partial(evaluate_checkpoint, planners=planners)
-            run = _run(evaluate, labelled, made, variants, n, rows, quiet=as_json)
+            run = run_started(evaluate, labelled, made, variants, n, rows, quiet=as_json)
             report = asyncio.run(run)
         typer.echo(json.dumps(report.to_json()) if as_json else str(report))
 
@@ -189,7 +189,7 @@ def _outcomes(
         draws[variant.name][labelled.scene.scene_id] = of
 
     evaluate = partial(evaluate_variants, on_draws=keep_draws)
-    asyncio.run(_run(evaluate, scenes, engine, variants, controls.n, rows, quiet=quiet))
+    asyncio.run(run_started(evaluate, scenes, engine, variants, controls.n, rows, quiet=quiet))
     file = None if keep is None else keep.with_name(f"{keep.name}.outcomes")
     tables = follow_pairs(pairs, scenes, draws, setting, workers, file, quiet=quiet)
     told_as = {"second_looks": [{"given": given} | table.to_json() for given, table in tables.items()]}
@@ -204,7 +204,7 @@ def _small_planner(folder: Path) -> tuple[str, Callable[[LabelledScene], FloatAr
     return planner.kind, lambda labelled: planner.plan([labelled.given(route=True, tracks=True)])[0]
 
 
-def _evenly(scenes: Iterable[LabelledScene], count: int, limit: int | None) -> Iterator[LabelledScene]:
+def evenly(scenes: Iterable[LabelledScene], count: int, limit: int | None) -> Iterator[LabelledScene]:
     """So many of the ``count`` scenes, or all, evenly chosen."""
     every = max(1, count // limit) if limit else 1
     return islice(scenes, 0, limit and every * limit, every)
@@ -254,14 +254,18 @@ def _ladder(
         derived = [each for each in variants if each.controls.think_threshold is not None]
         planned = [each for each in variants if each not in derived]
         evaluate = partial(evaluate_variants, on_draws=keep)
-        found = asyncio.run(_run(evaluate, scenes, engine_of(path), planned, controls.n, rows, quiet=quiet))
+        found = asyncio.run(
+            run_started(evaluate, scenes, engine_of(path), planned, controls.n, rows, quiet=quiet)
+        )
         found |= threshold_results(rung, derived, scenes, draws)
         results |= {variant: found[variant] for variant in variants}
         if rung == shown:
             results |= threshold_results(rung, threshold_variants(rung, controls), scenes, draws)
-            swept = list(_evenly(scenes, len(scenes), sweep))
+            swept = list(evenly(scenes, len(scenes), sweep))
             variants = temperature_variants(rung, controls)
-            run = _run(evaluate_variants, swept, engine_of(path), variants, controls.n, rows, quiet=quiet)
+            run = run_started(
+                evaluate_variants, swept, engine_of(path), variants, controls.n, rows, quiet=quiet
+            )
             results |= asyncio.run(run)
     report = ladder_report(results)
     if per_scene is not None:
@@ -283,7 +287,7 @@ def _ladder(
     return report
 
 
-async def _run(
+async def run_started(
     evaluate: Callable[..., Awaitable[_Found]],
     scenes: Sequence[LabelledScene],
     engine: Engine,

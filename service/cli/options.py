@@ -41,6 +41,14 @@ Checkpoint = Annotated[
         callback=_found,
     ),
 ]
+OptionalCheckpoint = Annotated[
+    Path | None,
+    typer.Option(
+        "--checkpoint",
+        help="Checkpoint folder, or OWNER/NAME[@REVISION] on the Hugging Face hub.",
+        callback=lambda checkpoint: checkpoint and _found(checkpoint),
+    ),
+]
 ScenePath = Annotated[
     Path, typer.Option("--scenes", help="Scene file or folder of scene files.", show_default="bundled")
 ]

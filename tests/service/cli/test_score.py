@@ -7,6 +7,7 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
+from model.bundled import SCENES
 from service.cli.commands import app
 from service.examples import example_score
 
@@ -34,3 +35,26 @@ def test_a_wrong_request_is_one_line(tmp_path: Path) -> None:
         "looktwice: A trajectory cannot be scored: "
         "/trajectories/0: has 9 poses; 8 at 0.5 s or 64 at 0.1 s are scored\n"
     )
+
+
+def test_a_scene_file_is_scored_planner_by_planner(tmp_path: Path, untrained_checkpoint: Path) -> None:
+    asked = ["score", str(SCENES), "--limit", "2", "--checkpoint", str(untrained_checkpoint), "--n", "2"]
+    result = RUNNER.invoke(app, [*asked, "--json"])
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout.splitlines()[-1])
+    expert, constant, *_, checkpoint = told["pdms"]
+    assert (expert["name"], constant["name"]) == ("expert", "constant velocity")
+    assert len({row["name"] for row in told["pdms"]}) == 4
+    assert expert["score"] > 0.9
+    assert expert["scenes"] == checkpoint["scenes"] == 2
+    # Scenes from before lane maps: what they lack is named.
+    assert told["epdms"][0]["score"] is None
+    assert set(told["epdms"][0]["missing"]) == {
+        *("driving_direction_compliance", "traffic_light_compliance", "lane_keeping"),
+    }
+
+
+def test_a_folder_without_scenes_is_one_line(tmp_path: Path) -> None:
+    result = RUNNER.invoke(app, ["score", str(tmp_path)])
+    assert result.exit_code == 2
+    assert result.stderr == f"looktwice: {tmp_path} holds no .parquet scene files\n"

@@ -1,0 +1,312 @@
+"""NAVSIM's scores of planners over labelled scenes: a row a planner, with intervals over episodes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from model.driving.intervals import Interval, ratio_interval
+from model.driving.pdm.comfort import Version
+from model.driving.pdm.labelled import moment_before, plans_of, states_of, world_of
+from model.driving.pdm.scoring import (
+    COLLISIONS,
+    COMFORT,
+    DIRECTION,
+    DRIVABLE,
+    EXTENDED_COMFORT,
+    FACTORS,
+    LANE_KEEPING,
+    LIGHTS,
+    PROGRESS,
+    TIME_TO_COLLISION,
+    WEIGHTS,
+    Others,
+    score,
+)
+from model.driving.pdm.world import Array
+from model.driving.scene import LabelledScene
+from model.driving.trajectory import FloatArray
+from model.evaluation.open_loop import BASELINES, EXPERT
+from model.evaluation.table import aligned
+
+VERSIONS: Final[Mapping[Version, str]] = {"v1.1": "PDMS", "v2.2": "EPDMS"}
+BEFORE_S: Final = 0.5
+"""Extended comfort compares a plan with the one made so much earlier."""
+_TITLES: Final = {
+    COLLISIONS: "collisions",
+    DRIVABLE: "drivable",
+    DIRECTION: "direction",
+    LIGHTS: "lights",
+    PROGRESS: "progress",
+    TIME_TO_COLLISION: "TTC",
+    LANE_KEEPING: "lane",
+    COMFORT: "comfort",
+    EXTENDED_COMFORT: "extended",
+}
+_STEP: Final = re.compile(r"-(\d{4})$")
+
+
+@dataclass(frozen=True)
+class SceneScore:
+    """What one trajectory is worth in one scene, by the rules of one version.
+
+    Attributes:
+        episode_id: of the scene.
+        sub_scores: by name; None where what it needs is not known.
+        score: None where a sub-score is.
+        partial_score: of the sub-scores that are there; None where none is.
+    """
+
+    episode_id: str
+    sub_scores: Mapping[str, float | None]
+    score: float | None
+    partial_score: float | None
+
+
+@dataclass(frozen=True)
+class ScoreRow:
+    """Means of one planner over scenes by one version's rules, with 95 % intervals over episodes.
+
+    Attributes:
+        name: the planner's.
+        version: whose rules.
+        scenes, episodes: how many.
+        score: None where a sub-score is missing in some scene.
+        partial_score: of the sub-scores that are there, in every scene.
+        sub_scores: over the scenes that have them; None where none has.
+        missing: in how many scenes a sub-score is missing, of those that are.
+        intervals: of ``score``, ``partial_score`` and the sub-scores, where they are there.
+    """
+
+    name: str
+    version: Version
+    scenes: int
+    episodes: int
+    score: float | None
+    partial_score: float | None
+    sub_scores: Mapping[str, float | None]
+    missing: Mapping[str, int]
+    intervals: Mapping[str, Interval]
+
+    @classmethod
+    def of(cls, name: str, version: Version, scores: Sequence[SceneScore]) -> ScoreRow:
+        """The row of a planner's scores; raises ValueError without any."""
+        if not scores:
+            raise ValueError(f"{name}: there are no scenes to score")
+        names = (*FACTORS[version], *WEIGHTS[version])
+        measured: dict[str, list[float | None]] = {
+            "score": [each.score for each in scores],
+            "partial_score": [each.partial_score for each in scores],
+            **{each: [scene.sub_scores[each] for scene in scores] for each in names},
+        }
+        if None in measured["score"]:
+            # The mean of those scenes alone that happen to be complete would be one of other scenes.
+            measured["score"] = [None] * len(scores)
+        episodes = [each.episode_id for each in scores]
+        found = {each: _mean(episodes, values) for each, values in measured.items()}
+        return cls(
+            name,
+            version,
+            len(scores),
+            len(set(episodes)),
+            _value(found["score"]),
+            _value(found["partial_score"]),
+            {each: _value(found[each]) for each in names},
+            {each: lacking for each in names if (lacking := measured[each].count(None))},
+            {each: of[1] for each, of in found.items() if of is not None},
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """The row as JSON's values."""
+        return {
+            "name": self.name,
+            "scenes": self.scenes,
+            "episodes": self.episodes,
+            "score": self.score,
+            "partial_score": self.partial_score,
+            "sub_scores": dict(self.sub_scores),
+            "missing": dict(self.missing),
+            "intervals": {name: list(interval) for name, interval in self.intervals.items()},
+        }
+
+
+@dataclass(frozen=True)
+class ScoreTable:
+    """Rows of all planners, by version.
+
+    Attributes:
+        rows: of each version.
+        forgiven: whether what the expert fails at too is forgiven.
+        without_lights: scenes of worlds that have no traffic lights, where none can be red.
+    """
+
+    rows: Mapping[Version, tuple[ScoreRow, ...]]
+    forgiven: bool
+    without_lights: int
+
+    def to_json(self) -> dict[str, Any]:
+        """``pdms`` and ``epdms`` hold the rows; progress is ``against`` the expert."""
+        first = next(iter(self.rows.values()))[0]
+        return {
+            "scenes": first.scenes,
+            "episodes": first.episodes,
+            "against": EXPERT,
+            "forgiven": self.forgiven,
+            "scenes_without_lights": self.without_lights,
+            **{VERSIONS[of].lower(): [row.to_json() for row in rows] for of, rows in self.rows.items()},
+        }
+
+    def __str__(self) -> str:
+        lines = []
+        for version, rows in self.rows.items():
+            names = (*FACTORS[version], *WEIGHTS[version])
+            title = f"{VERSIONS[version]} ({version})"
+            header = [title, "scenes", "score", "95 %", *(_TITLES[name] for name in names)]
+            lines += [*aligned([header, *(_cells(row, names) for row in rows)])]
+            lines += [f"* {row.name} is partial: {_lacks(row)}" for row in rows if row.missing]
+            lines.append("")
+        lines.append(f"Progress is measured against the {EXPERT}'s.")
+        if self.without_lights:
+            lines.append(f"{self.without_lights} scenes are of a world without traffic lights: lights is 1.")
+        if self.forgiven:
+            lines.append(f"What the {EXPERT} fails at too is forgiven ({VERSIONS['v2.2']}).")
+        return "\n".join(lines)
+
+
+Planner = Callable[[LabelledScene], tuple[FloatArray, Array | None]]
+"""A trajectory [64, 4], and the simulated states [41, 11] of the one made `BEFORE_S` earlier, where known."""
+
+
+def expert_way(labelled: LabelledScene) -> tuple[FloatArray, Array | None]:
+    """The expert as a planner: half a second ago it was to drive as it did."""
+    history, future = moment_before(labelled, BEFORE_S)
+    return labelled.future, states_of(history, plans_of(future))
+
+
+def by_rule(baseline: Callable[[FloatArray], FloatArray]) -> Planner:
+    """A kinematic baseline as a planner."""
+
+    def plan(labelled: LabelledScene) -> tuple[FloatArray, Array | None]:
+        history, _ = moment_before(labelled, BEFORE_S)
+        return baseline(labelled.scene.history), states_of(history, plans_of(baseline(history)))
+
+    return plan
+
+
+def by_scene(scenes: Sequence[LabelledScene], trajectories: Mapping[str, FloatArray]) -> Planner:
+    """A planner whose trajectories [64, 4] are known by scene id.
+
+    What it planned before is its trajectory of the scene that lies `BEFORE_S` back in the same episode, told
+    by the step in generated scenes' names.
+    """
+    named = {each.scene.scene_id: each for each in scenes}
+
+    def plan(labelled: LabelledScene) -> tuple[FloatArray, Array | None]:
+        before = named.get(_name_before(labelled.scene.scene_id))
+        if before is None or before.episode_id != labelled.episode_id:
+            return trajectories[labelled.scene.scene_id], None
+        planned = trajectories[before.scene.scene_id]
+        return trajectories[labelled.scene.scene_id], states_of(before.scene.history, plans_of(planned))
+
+    return plan
+
+
+def score_table(
+    scenes: Sequence[LabelledScene], planners: Mapping[str, Planner], *, forgive: bool = False
+) -> ScoreTable:
+    """Score the expert, the kinematic baselines and more planners in every scene, by both versions' rules.
+
+    Args:
+        scenes: at least one.
+        planners: by the names of their rows.
+        forgive: as NAVSIM's EPDMS does, forgive what the expert fails at too.
+
+    Raises:
+        ValueError: no scenes.
+        ScoreError, SolveError: see `model.driving.pdm.scoring.score`.
+    """
+    baselines = {name: by_rule(baseline) for name, baseline in BASELINES.items()}
+    every: dict[str, Planner] = {EXPERT: expert_way, **baselines, **planners}
+    found: dict[Version, dict[str, list[SceneScore]]] = {
+        version: {name: [] for name in every} for version in VERSIONS
+    }
+    for labelled in scenes:
+        for name, planner in every.items():
+            for version, result in _scored(labelled, planner, forgive=forgive):
+                found[version][name].append(result)
+    rows = {
+        version: tuple(ScoreRow.of(name, version, scores) for name, scores in of.items())
+        for version, of in found.items()
+    }
+    known = [each.lane_map for each in scenes if each.lane_map is not None]
+    return ScoreTable(rows, forgive, sum(not lane_map.has_lights for lane_map in known))
+
+
+def _scored(
+    labelled: LabelledScene, planner: Planner, *, forgive: bool
+) -> Iterator[tuple[Version, SceneScore]]:
+    world, expert = world_of(labelled), plans_of(labelled.future)
+    trajectory, before = planner(labelled)
+    plan = plans_of(trajectory)[None]
+    for version in VERSIONS:
+        others = Others(expert, EXPERT, before, BEFORE_S, expert if forgive else None)
+        scores = score(world, plan, version, others, centre=True)
+        subs = {
+            name: None if values is None else _known(values[0]) for name, values in scores.sub_scores.items()
+        }
+        yield (
+            version,
+            SceneScore(labelled.episode_id, subs, _known(scores.score[0]), _known(scores.partial_score[0])),
+        )
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
+
+
+def _name_before(scene_id: str) -> str:
+    """The generator's name of the scene `BEFORE_S` earlier; "" where the name tells no step."""
+    told = _STEP.search(scene_id)
+    if told is None:
+        return ""
+    return f"{scene_id[: told.start()]}-{int(told[1]) - round(BEFORE_S * 10):04d}"
+
+
+def _mean(episodes: Sequence[str], values: Sequence[float | None]) -> tuple[float, Interval] | None:
+    """Mean and interval of what is there."""
+    sums: dict[str, list[float]] = {}
+    for episode, value in zip(episodes, values, strict=True):
+        if value is not None:
+            sums.setdefault(episode, []).append(value)
+    if not sums:
+        return None
+    amounts = np.array([sum(of) for of in sums.values()])
+    counts = np.array([float(len(of)) for of in sums.values()])
+    return float(amounts.sum() / counts.sum()), ratio_interval(amounts, counts)
+
+
+def _value(found: tuple[float, Interval] | None) -> float | None:
+    return None if found is None else found[0]
+
+
+def _cells(row: ScoreRow, names: Sequence[str]) -> list[str]:
+    shown = "partial_score" if row.score is None else "score"
+    value = row.partial_score if row.score is None else row.score
+    low, high = row.intervals.get(shown, (np.nan, np.nan))
+    marked = "-" if value is None else f"{value:.3f}{'*' if row.score is None else ''}"
+    subs = (row.sub_scores[name] for name in names)
+    return [
+        row.name,
+        str(row.scenes),
+        marked,
+        "" if value is None else f"{low:.3f}..{high:.3f}",
+        *("-" if each is None else f"{each:.3f}" for each in subs),
+    ]
+
+
+def _lacks(row: ScoreRow) -> str:
+    return ", ".join(f"{name} is missing in {count} scenes" for name, count in row.missing.items())
