@@ -50,6 +50,7 @@ from clients.answers import (
 )
 from clients.requests import label_request, plan_request, reflect_request
 from clients.wire_values import with_pictures
+from model.driving.outcome import Outcome
 from model.driving.plan import Plan
 from model.driving.scene import Scene
 from model.driving.view import Surroundings
@@ -210,6 +211,7 @@ class PlannerClient:
         *,
         surroundings: Surroundings | None = None,
         seed: int = 0,
+        outcome: Outcome | None = None,
     ) -> wire.LabelResponse:
         """Have the service's teacher say why ``predicted`` is less good than ``expert``.
 
@@ -219,11 +221,12 @@ class PlannerClient:
             expert: the better one, which the answer leads to without naming it.
             surroundings: the scene's annotations; the built-in teacher needs them.
             seed: another one, other words.
+            outcome: what ``predicted`` failed at when it was followed, where that is known.
 
         Raises:
             PlannerError: see its subclasses.
         """
-        asked = label_request(scene, predicted, expert, surroundings, seed)
+        asked = label_request(scene, predicted, expert, surroundings, seed, outcome)
         return read(self._ask("/v1/label", asked), wire.LabelResponse)
 
     def score(self, request: wire_scores.ScoreRequest) -> wire_scores.ScoreResponse:
@@ -341,9 +344,10 @@ class AsyncPlannerClient:
         *,
         surroundings: Surroundings | None = None,
         seed: int = 0,
+        outcome: Outcome | None = None,
     ) -> wire.LabelResponse:
         """Have the service's teacher look at a plan; see `PlannerClient.label`."""
-        asked = label_request(scene, predicted, expert, surroundings, seed)
+        asked = label_request(scene, predicted, expert, surroundings, seed, outcome)
         return read(await self._ask("/v1/label", asked), wire.LabelResponse)
 
     async def score(self, request: wire_scores.ScoreRequest) -> wire_scores.ScoreResponse:

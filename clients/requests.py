@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from clients import wire
 from clients.wire_values import rows, wire_agents, wire_scene
+from model.driving.outcome import Outcome
 from model.driving.plan import Plan
 from model.driving.scene import Scene
 from model.driving.view import Surroundings
@@ -34,9 +35,14 @@ def reflect_request(
 
 
 def label_request(
-    scene: Scene, predicted: Plan, expert: Plan, surroundings: Surroundings | None = None, seed: int = 0
+    scene: Scene,
+    predicted: Plan,
+    expert: Plan,
+    surroundings: Surroundings | None = None,
+    seed: int = 0,
+    outcome: Outcome | None = None,
 ) -> wire.LabelRequest:
-    """The body of POST /v1/label for two plans in ``scene``."""
+    """The body of POST /v1/label for two plans in ``scene``; an ``outcome`` is that of a plan that failed."""
     return wire.LabelRequest(
         scene=wire_scene(scene),
         predicted_plan=str(predicted),
@@ -47,5 +53,6 @@ def label_request(
             agents=wire_agents(surroundings.agents),
             lane_lines=[rows(line) for line in surroundings.lane_lines],
         ),
+        outcome=None if outcome is None else wire.PlanOutcome.model_validate(outcome.to_json()),
         seed=seed,
     )

@@ -400,6 +400,29 @@ class Annotations(Asked):
     )
 
 
+Seconds = Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)]
+
+
+class PlanOutcome(Asked):
+    """What a plan came to when it was followed; each failure needs the fields that tell of it."""
+
+    fails: list[Literal["collision", "off_road", "off_route", "comfort", "behind", "ahead"]] = Field(
+        min_length=1, max_length=6, description="What it failed at."
+    )
+    collided_s: Seconds | None = Field(default=None, description="For collision.")
+    hit: (
+        Literal["standing vehicle", "moving vehicle", "oncoming vehicle", "pedestrian", "obstacle"] | None
+    ) = Field(default=None, description="With what it collided.")
+    off_road_s: Seconds | None = Field(default=None, description="For off_road.")
+    off_route_s: Seconds | None = Field(default=None, description="For off_route.")
+    uncomfortable_s: Seconds | None = Field(default=None, description="For comfort.")
+    uncomfortable: Annotated[str, Field(pattern="^[a-z_]{1,40}$")] | None = Field(
+        default=None, description="For comfort: which bound, such as longitudinal_jerk."
+    )
+    driven_m: Nearby = Field(default=0.0, description="For behind and ahead: along the route.")
+    expert_m: Nearby = Field(default=0.0, description="For behind and ahead: by the better plan.")
+
+
 class LabelRequest(Asked):
     """Body of POST /v1/label."""
 
@@ -410,6 +433,11 @@ class LabelRequest(Asked):
     )
     annotations: Annotations | None = Field(
         default=None, description="The built-in teacher needs them; others look at the pictures."
+    )
+    outcome: PlanOutcome | None = Field(
+        default=None,
+        description="What the predicted plan failed at when it was followed: a hint at what to look for, "
+        "which the answer does not tell.",
     )
     seed: int = Field(default=0, ge=0, le=MAX_SEED, description="Another one, other words.")
 

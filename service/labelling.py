@@ -22,6 +22,7 @@ from clients.labelling.teachers.teacher import (
     TeacherError,
     ask,
 )
+from model.driving.outcome import Outcome
 from model.driving.scene import AGENT_KINDS, Agent
 from model.driving.view import Surroundings
 from service.intake import plan_of, scene_of
@@ -41,6 +42,14 @@ log = structlog.stdlib.get_logger()
 
 PATIENCE_S: Final = 30.0
 """That a teacher may be busy or away before its caller is told."""
+
+_TOLD: Final = {
+    "collision": ("collided_s", "hit"),
+    "off_road": ("off_road_s",),
+    "off_route": ("off_route_s",),
+    "comfort": ("uncomfortable_s", "uncomfortable"),
+}
+"""What a failure must come with; the others are told by the metres."""
 
 _UNKNOWN_HEIGHT_M: Final = 1.5
 """The wire has no heights; teachers look at nothing that depends on them."""
@@ -103,7 +112,25 @@ def _question(asked: wire.LabelRequest) -> Question:
         plan_of(asked.expert_plan, "/expert_plan"),
         None if asked.annotations is None else _surroundings(asked.annotations),
         asked.seed,
+        None if asked.outcome is None else _outcome(asked.outcome),
     )
+
+
+def _outcome(asked: wire.PlanOutcome) -> Outcome:
+    """What a plan failed at; each failure must come with what is told of it."""
+    told = asked.model_dump()
+    for name in asked.fails:
+        for field in _TOLD.get(name, ()):
+            if told[field] is None:
+                raise at(INVALID_REQUEST, f"/outcome/{field}", f"is missing: the plan fails at {name}")
+    outcome = Outcome.from_json(told)
+    for name, is_so in (("behind", outcome.behind_m > 0), ("ahead", outcome.behind_m < 0)):
+        if name in asked.fails and not is_so:
+            problem = (
+                f"says otherwise: the plan fails at {name}, and driven_m and expert_m must tell by how much"
+            )
+            raise at(INVALID_REQUEST, "/outcome/driven_m", problem)
+    return outcome
 
 
 def _surroundings(asked: wire.Annotations) -> Surroundings:

@@ -8,6 +8,7 @@ import pytest
 from clients.labelling.checks import FailedCheck, check_reflection
 from clients.labelling.teachers.teacher import Answer, Question, TeacherClosed, TeacherError
 from clients.wire import LabelResponse
+from model.driving.outcome import in_words
 from model.driving.plan import parse_plan
 from service.settings import Settings
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN, ScriptedEngine
@@ -78,6 +79,59 @@ def test_annotations_are_checked(served: Served) -> None:
     document = asking(served)
     document["annotations"]["agents"][0]["poses"].pop()
     assert problem(served.http.post(PATH, json=document), "invalid-request")
+
+
+class Listening(Upstream):
+    """Notes what it is asked."""
+
+    def __init__(self) -> None:
+        super().__init__("The lead vehicle ahead is slow, so the car should slow down.")
+        self.asked: list[Question] = []
+
+    async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
+        self.asked.append(question)
+        return await super().reflect(question, complaints)
+
+
+OUTCOMES = (
+    {"fails": ["collision"], "collided_s": 2.1, "hit": "obstacle"},
+    {"fails": ["off_road", "behind"], "off_road_s": 1.4, "driven_m": 12.0, "expert_m": 30.0},
+    {"fails": ["comfort"], "uncomfortable_s": 0.3, "uncomfortable": "longitudinal_jerk"},
+)
+IN_WORDS = (
+    "collides with an obstacle after 2.1 s",
+    "leaves the road after 1.4 s, falls behind by 18 m",
+    "has too much longitudinal jerk after 0.3 s",
+)
+
+
+def test_what_the_plan_failed_at_reaches_the_teacher(settings: Settings) -> None:
+    teacher = Listening()
+    with serve(ScriptedEngine(), settings, teacher=teacher) as served:
+        served.http.post(PATH, json=asking(served))
+        assert teacher.asked[-1].outcome is None
+        for outcome, words in zip(OUTCOMES, IN_WORDS, strict=True):
+            served.http.post(PATH, json=asking(served, outcome=outcome))
+            given = teacher.asked[-1].outcome
+            assert given is not None
+            assert in_words(given) == words
+
+
+@pytest.mark.parametrize(
+    ("outcome", "pointer"),
+    [
+        ({"fails": []}, "/outcome/fails"),
+        ({"fails": ["boredom"]}, "/outcome/fails/0"),
+        ({"fails": ["collision"], "collided_s": 1.0}, "/outcome/hit"),
+        ({"fails": ["off_route"]}, "/outcome/off_route_s"),
+        ({"fails": ["behind"], "driven_m": 30.0, "expert_m": 12.0}, "/outcome/driven_m"),
+        ({"fails": ["off_road"], "off_road_s": -1}, "/outcome/off_road_s"),
+    ],
+)
+def test_an_outcome_is_checked(served: Served, outcome: dict[str, Any], pointer: str) -> None:
+    document = asking(served, outcome=outcome)
+    fault = problem(served.http.post(PATH, json=document), "invalid-request").errors[0]
+    assert fault.pointer == pointer
 
 
 def test_plans_that_agree_get_a_reflection_too(served: Served) -> None:

@@ -65,6 +65,7 @@ class ServiceTeacher:
                 question.expert,
                 surroundings=question.surroundings,
                 seed=seed,
+                outcome=question.outcome,
             )
         except (ServiceBusy, PlannerUnreachable) as error:
             raise TeacherBusy(str(error), getattr(error, "retry_after_s", None)) from error

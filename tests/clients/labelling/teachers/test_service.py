@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from clients.labelling.teachers.teacher import (
     TeacherClosed,
     TeacherError,
 )
+from model.driving.outcome import Outcome
 from model.driving.view import Surroundings
 from service.settings import Settings
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer
@@ -50,6 +52,16 @@ class Seeded(RuleTeacher):
         return (await super().reflect(question, complaints))._replace(input_tokens=question.seed)
 
 
+class Hinted(RuleTeacher):
+    """Tells a tenth of the second at which the plan that it is asked about collides."""
+
+    async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
+        collided_s = None if question.outcome is None else question.outcome.collided_s
+        return (await super().reflect(question, complaints))._replace(
+            input_tokens=round(10 * (collided_s or 0))
+        )
+
+
 def asked(
     tmp_path: Path, teacher: Teacher, question: Question = QUESTION, complaints: tuple[FailedCheck, ...] = ()
 ) -> tuple[str, str, Answer]:
@@ -70,6 +82,11 @@ def test_it_answers_as_the_teacher_behind_it(tmp_path: Path) -> None:
     assert answer == asyncio.run(RuleTeacher().reflect(QUESTION))
     again = asked(tmp_path, Seeded(), complaints=(FailedCheck("leak", "x"), FailedCheck("form", "y")))
     assert again[2].input_tokens == 2, "asked again, it is asked with another seed"
+
+
+def test_what_the_plan_failed_at_goes_with_the_question(tmp_path: Path) -> None:
+    outcome = Outcome(("collision",), 2.1, "moving vehicle", None, None, None, None, 12.0, 30.0)
+    assert asked(tmp_path, Hinted(), replace(QUESTION, outcome=outcome))[2].input_tokens == 21
 
 
 def test_a_vision_language_model_behind_the_service(tmp_path: Path) -> None:
