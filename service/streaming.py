@@ -19,7 +19,7 @@ from model.engines.engine import (
     SectionFinished,
     TextWritten,
 )
-from model.formats.pieces import BRANCH
+from model.families.cf_vla.format import BRANCH
 from service.answers import wire_plan, wire_trajectory
 from service.callers import CallerLeft, while_connected
 from service.errors import problem_document

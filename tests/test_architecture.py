@@ -17,6 +17,7 @@ ALLOWED = {
     "model": ("model",),
     "model.driving": ("model.driving",),
     "model.formats": ("model.formats", "model.driving"),
+    "model.families": ("model.families", "model.formats", "model.driving"),
     "clients": ("clients", "model.driving"),
     "clients.importers": ("clients.importers", "clients.navsim", "model.driving"),
     "loadtests": ("loadtests", "clients", "model.driving"),
@@ -27,7 +28,7 @@ ALLOWED = {
     "service.cli": EVERYTHING,
     "deploy": ("deploy", "service", "model.bundled"),
 }
-TORCH_FREE = ("model.driving", "model.formats", "clients", "loadtests")
+TORCH_FREE = ("model.driving", "model.formats", "model.families", "clients", "loadtests")
 LIGHT = ("clients.wire", "clients.wire_scores", "clients.planner")
 LIGHT_IMPORTS = ("numpy", "PIL", "httpx", "httpx_sse", "msgpack", "pydantic", "model", "clients")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from model.engines.engine import Draw, DrawFinished, Engine, PlanRequest
-from model.formats.cf_vla import formats_of
+from model.families.registry import families_of
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import FormatError
 from model.formats.text import parse
@@ -115,8 +115,10 @@ class PlainVllm(Contender):
         self._engine, self._max_tokens = engine, max_tokens
         parts = read_parts(checkpoint)
         self._vocabulary = parts.vocabulary
-        formats = formats_of(parts.settings.reflection)
-        self._formats = {name: CompiledFormat(each, self._vocabulary) for name, each in formats.items()}
+        families = families_of(parts.card.formats, parts.settings.reflection)
+        self._formats = {
+            name: CompiledFormat(each.format, self._vocabulary) for name, each in families.items()
+        }
 
     async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
         """Answer requests that arrive at once."""
@@ -156,9 +158,9 @@ class Transformers(Contender):
         from model.network.checkpoint import load
 
         self._loaded = load(checkpoint, dtype, device)
-        formats = formats_of(self._loaded.settings.reflection)
+        families = families_of(self._loaded.card.formats, self._loaded.settings.reflection)
         self._formats = {
-            name: CompiledFormat(each, self._loaded.vocabulary) for name, each in formats.items()
+            name: CompiledFormat(each.format, self._loaded.vocabulary) for name, each in families.items()
         }
         self._max_tokens, self._cache = max_tokens, cache
 

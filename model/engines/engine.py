@@ -12,7 +12,7 @@ from typing import Any, Literal, Protocol
 from model.driving.plan import Plan
 from model.driving.scene import Scene
 from model.driving.trajectory import FloatArray
-from model.formats.pieces import ACTION, THINKING
+from model.families.cf_vla.format import ACTION, THINKING
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]

@@ -9,8 +9,9 @@ from typing import cast
 from model.driving.plan import Plan
 from model.engines.engine import Branch, Draw, ModelCard, PlanRequest, RequestError
 from model.engines.response import Response
+from model.families.cf_vla.format import ACTION, BRANCH, THINKING
 from model.formats.cursor import CompiledFormat, Cursor
-from model.formats.pieces import ACTION, BRANCH, THINKING, FormatError
+from model.formats.pieces import FormatError
 from model.formats.text import parse
 from model.network.codec import TrajectoryCodec
 from model.network.vocabulary import Vocabulary

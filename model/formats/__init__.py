@@ -1,1 +1,1 @@
-"""The response language: one declaration per model family, used to decode, parse, train and export."""
+"""The response language: the pieces of a declaration, used to decode, parse, train and export."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 from model.driving.direction import CHANGES, Change, group_of, needed
 from model.driving.phrases import (
@@ -41,16 +41,25 @@ from model.formats.pieces import (
     Shorthand,
     Value,
 )
-from model.formats.plan_tracks import FIRST_PLAN, written_plan
+from model.formats.plan_tracks import written_plan
 
 _ALL: Final = frozenset(CHANGES)
 
 
 @dataclass(frozen=True)
 class Reflection(Narrowing):
-    """A reflection on the first plan: statements of changes that this plan leaves room for, or none."""
+    """A reflection on the first plan: statements of changes that this plan leaves room for, or none.
 
-    sections: ClassVar[tuple[str, ...]] = (FIRST_PLAN,)
+    Attributes:
+        first_plan: the section that it is in.
+    """
+
+    first_plan: str
+
+    @property
+    def sections(self) -> tuple[str, ...]:
+        """The first plan's."""
+        return (self.first_plan,)
 
     def expand(self) -> Piece:
         """Statements of any changes."""
@@ -58,7 +67,7 @@ class Reflection(Narrowing):
 
     def narrowed(self, written: Mapping[str, str]) -> Piece:
         """Statements of what can be changed in the first plan."""
-        plan = written_plan(written[FIRST_PLAN])
+        plan = written_plan(written[self.first_plan])
         return Phrases(frozenset(change for change in CHANGES if needed(plan, change) <= TICKS))
 
 

@@ -16,23 +16,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Final, TypeAlias
-from typing import Literal as Literal_
+from typing import TypeAlias
 
 from model.driving.plan import Plan
 
 Value: TypeAlias = "Plan | str | bool | float | tuple[Value, ...] | Mapping[str, Value]"
 """A plan, a word or free text, whether a `Maybe` is there, a number, codes or repeated values, a record."""
-
-BRANCH: Final = "branch"
-"""Name of the choice, and of its section, where a response decides to act or to think."""
-ACTION: Final[Literal_["Action:"]] = "Action:"
-THINKING: Final[Literal_["Thinking:"]] = "Thinking:"
-
-TRAJECTORY: Final = "trajectory"
-"""The alphabet of trajectory codes: one codebook for each of its `CODES` stages."""
-CODES: Final = 6
-"""Trajectory codes of a trajectory (CF-VLA section 8)."""
 
 
 class FormatError(ValueError):
@@ -254,8 +243,10 @@ class Narrowing(Shorthand):
     `expand` tells all that it may stand for, in whichever response.
     """
 
-    sections: ClassVar[tuple[str, ...]]
-    """The sections that narrow it, which must have ended before it."""
+    @property
+    @abstractmethod
+    def sections(self) -> tuple[str, ...]:
+        """The sections that narrow it, which must have ended before it."""
 
     @abstractmethod
     def narrowed(self, written: Mapping[str, str]) -> Piece:
@@ -336,6 +327,14 @@ def _children(piece: Piece) -> collections.abc.Sequence[Piece]:
         case _:
             # A compound holds no section.
             return ()
+
+
+def choices(piece: Piece) -> Iterator[Choice]:
+    """The choices within ``piece``, those that its shorthands stand for apart."""
+    if isinstance(piece, Choice):
+        yield piece
+    for child in _children(piece):
+        yield from choices(child)
 
 
 def _sections(piece: Piece) -> Iterator[str]:

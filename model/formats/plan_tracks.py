@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import ClassVar, Final
+from typing import Final
 
 from model.driving.direction import Change, done, gain, group_of, needed
 from model.driving.phrases import Facts, PhraseError, agrees, read_facts
@@ -38,9 +38,6 @@ from model.formats.pieces import (
     Value,
 )
 
-FIRST_PLAN: Final = "plan"
-REFLECTION: Final = "thinking"
-"""The sections that a revised plan is narrowed by."""
 MAX_SEGMENTS: Final = 12
 """Meta-actions in one track at most: the labeller's shortest is 0.5 s, and responses stay bounded."""
 
@@ -251,11 +248,18 @@ class RevisedPlan(Narrowing):
     Tracks that nothing is stated of are those of the first plan.
 
     Attributes:
+        first_plan, reflection: the sections that these are in.
         given: what the plan is, where the caller gives it.
     """
 
+    first_plan: str
+    reflection: str
     given: Plan | None = None
-    sections: ClassVar[tuple[str, ...]] = (FIRST_PLAN, REFLECTION)
+
+    @property
+    def sections(self) -> tuple[str, ...]:
+        """The first plan's and the reflection's."""
+        return self.first_plan, self.reflection
 
     def expand(self) -> Piece:
         """Any plan."""
@@ -263,7 +267,7 @@ class RevisedPlan(Narrowing):
 
     def narrowed(self, written: Mapping[str, str]) -> Piece:
         """The plans that a reflection leads to; raises `FormatError` where that is not the given one."""
-        first, facts = written_plan(written[FIRST_PLAN]), _facts(written[REFLECTION])
+        first, facts = written_plan(written[self.first_plan]), _facts(written[self.reflection])
         if self.given is not None:
             if not agrees(facts, first, self.given):
                 raise FormatError(f"the plan behind {str(facts)!r} changes otherwise: {self.given}")
@@ -330,7 +334,7 @@ def _with_given(piece: Piece, given: Mapping[str, Plan], section: str, left: set
                         f"section {section!r}: track {group} has more meta-actions than the format allows"
                     )
             if isinstance(piece, RevisedPlan):
-                return RevisedPlan(plan)
+                return replace(piece, given=plan)
             return GivenPlan(plan, piece.name)
         case _:
             return piece

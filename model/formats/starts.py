@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from model.formats.pieces import (
-    BRANCH,
     Choice,
     Codes,
     FormatError,
@@ -108,8 +107,6 @@ class _Checker:
             then = self.starts(option.then, section, follow)
             if text in longer:
                 what = f"option {option.text!r}, which is a beginning of another,"
-                if choice.name == BRANCH:
-                    raise FormatError(f"{what} stands at the branch, where controls must tell options apart")
                 self._apart(what, section, then, frozenset(longer[text]))
             found |= {Start(text[0], section)} if text else then
         return frozenset(found)

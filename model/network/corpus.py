@@ -12,7 +12,8 @@ from typing import Final
 
 from model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, track_from_words
 from model.driving.scene import CAMERAS
-from model.network.prompts import SYSTEM, TASKS, prompt_text
+from model.families.registry import family_named
+from model.network.prompts import SYSTEM, prompt_text
 from model.network.settings import LEAST_SCENE_TOKENS, VlaSettings
 
 _SLOTS: Final[dict[str, tuple[str, ...]]] = {
@@ -180,6 +181,7 @@ their he she we our you your in on at to from into onto of for with without by a
 across along around through within about per hour kilometers ahead, vehicle. lane. road.
 """
 
+_FORMATS: Final = ("cf_vla", "traj_only")
 _PLAN_START: Final = "Meta Actions:\n"
 _KINDS: Final = ("vehicle", "pedestrian", "traffic cone", "barrier")
 _PHRASES: Final = tuple(
@@ -280,7 +282,8 @@ def nano_phrases() -> tuple[str, ...]:
     distances = [f" some {metres} metres ahead" for metres in range(5, 105, 5)]
     words = [f" {word}" for words in WORDS.values() for word in words]
     groups = [f"- {group}\n" for group in GROUPS]
-    return (SYSTEM, *TASKS.values(), _PLAN_START, *groups, *words, *objects, *distances, *_PHRASES)
+    tasks = (family_named(name).task for name in _FORMATS)
+    return (SYSTEM, *tasks, _PLAN_START, *groups, *words, *objects, *distances, *_PHRASES)
 
 
 def nano_corpus() -> Iterator[str]:
@@ -291,7 +294,7 @@ def nano_corpus() -> Iterator[str]:
         yield from [f"{format_tick(tick)}  - {format_tick(tick)}s-"] * 50
     yield from driving_sentences()
     yield from response_texts()
-    for format in TASKS:
+    for format in _FORMATS:
         for route in (False, True):
             # Often enough that the prompt's own words become single tokens.
             for tokens in (0, LEAST_SCENE_TOKENS):

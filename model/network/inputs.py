@@ -81,7 +81,7 @@ class InputBuilder:
         Raises:
             SceneError: a camera is missing.
             ImageError: a picture cannot be decoded.
-            PromptError: an unknown format.
+            FamilyError: an unknown format.
         """
         route, tracks = self.way(scene), self.tracks(scene)
         return ModelInputs(
@@ -129,7 +129,7 @@ class InputBuilder:
         return patchify(np.stack(frames), self.settings)
 
     def prompt(self, format: str, *, route: bool, tracks: bool = False) -> Prompt:
-        """The prompt of a format; raises `PromptError` for an unknown one."""
+        """The prompt of a format; raises `FamilyError` for an unknown one."""
         key = (format, route, tracks)
         if key not in self._prompts:
             settings = self.settings

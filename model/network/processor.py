@@ -37,7 +37,7 @@ class LookTwiceProcessor(ProcessorMixin):
         ``route`` [1, 20, 2] and ``tracks`` [1, 16, features].
 
         Raises:
-            SceneError, ImageError, PromptError: as `InputBuilder.build`.
+            SceneError, ImageError, FamilyError: as `InputBuilder.build`.
         """
         built = self.inputs.build(scene, format)
         ids = torch.from_numpy(built.prompt.ids.copy())[None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from model.families.registry import family_named
 from model.network.intent import INTENT_TOKENS
 from model.network.settings import VlaSettings
 from model.network.vocabulary import (
@@ -23,19 +24,8 @@ from model.network.vocabulary import (
     VISION_START,
 )
 
-TASKS: Final = {
-    "cf_vla": "Propose meta-actions; only if they are wrong, reflect and correct them. Then give the "
-    "trajectory.",
-    "traj_only": "Give the trajectory.",
-}
-"""What is asked for, by response format."""
-
 SYSTEM: Final = "You plan how this car drives."
 """What the model is told it is."""
-
-
-class PromptError(ValueError):
-    """No prompt is known for a response format."""
 
 
 def prompt_text(format: str, settings: VlaSettings, *, route: bool, tracks: bool = False) -> str:
@@ -45,19 +35,17 @@ def prompt_text(format: str, settings: VlaSettings, *, route: bool, tracks: bool
     beginnings hold as long as possible.
 
     Args:
-        format: the response format's name; it decides the task.
+        format: the response format's name; its family decides the task.
         settings: cameras, in their order, and the number of placeholders.
         route: whether the scene has a route.
         tracks: whether it has tracks.
 
     Raises:
-        PromptError: ``format`` has no task.
+        FamilyError: there is no such format.
     """
-    if format not in TASKS:
-        raise PromptError(f"no prompt is known for format {format!r}; known are {', '.join(TASKS)}")
     return (
         f"{IM_START}system\n{SYSTEM}{IM_END}\n"
-        f"{IM_START}user\n{TASKS[format]}\n"
+        f"{IM_START}user\n{family_named(format).task}\n"
         f"{_seen(settings)}"
         f"{motion_text(route=route, tracks=tracks)}"
         f"{IM_END}\n{IM_START}assistant\n"

@@ -27,7 +27,7 @@ class VlaSettings:
     Attributes:
         name: the checkpoint's name, shown to users.
         formats: response formats it was trained on.
-        reflection: what its reflections are written in (`model.formats.cf_vla.formats_of`).
+        reflection: what its reflections are written in (`Family.in_dialect`).
         cameras: cameras it looks at, in the order of the prompt.
         image_width, image_height: pixels that pictures are resized to; multiples of a merged patch.
         codec_size: trajectory codes per stage.

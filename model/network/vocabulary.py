@@ -15,8 +15,7 @@ import numpy.typing as npt
 from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, trainers
 from transformers import PreTrainedTokenizerFast
 
-CODE_STAGES: Final = 6
-"""Codes a trajectory is written in (CF-VLA section 7)."""
+from model.families.trajectory_codes import CODES, TRAJECTORY
 
 END_OF_TEXT: Final = "<|endoftext|>"
 IM_START: Final = "<|im_start|>"
@@ -134,7 +133,7 @@ class Vocabulary:
     @cached_property
     def alphabets(self) -> Mapping[str, tuple[range, ...]]:
         """Named alphabets of codes: for each codebook the ids of its tokens."""
-        return {"trajectory": tuple(map(self.code_ids, range(CODE_STAGES)))}
+        return {TRAJECTORY: tuple(map(self.code_ids, range(CODES)))}
 
     def free_text_ids(self, *, multiline: bool = False) -> npt.NDArray[np.bool_]:
         """Mask bool [len(self)] of tokens that free text may hold.
@@ -160,7 +159,7 @@ class Vocabulary:
             size += 1
         if not size:
             raise VocabularyError(f"the tokenizer lacks trajectory codes such as {code_token(0, 0)}")
-        for stage in range(CODE_STAGES):
+        for stage in range(CODES):
             first = self._ids.get(code_token(stage, 0), -1)
             if any(self._ids.get(code_token(stage, code)) != first + code for code in range(size)):
                 raise VocabularyError(f"the codes of stage {stage} must be {size} tokens side by side")
@@ -215,7 +214,7 @@ def expand_tokenizer(tokenizer: Any, codec_size: int) -> int:
     """Add our markers and codes to a Qwen2.5-VL tokenizer in place; returns how many tokens were new."""
     before = len(tokenizer)
     _add(tokenizer, OUR_TOKENS, special=True)
-    codes = [code_token(stage, code) for stage in range(CODE_STAGES) for code in range(codec_size)]
+    codes = [code_token(stage, code) for stage in range(CODES) for code in range(codec_size)]
     # Not special: grammars of other engines only see ordinary tokens.
     _add(tokenizer, codes, special=False)
     _add(tokenizer, TRACK_TOKENS, special=True)

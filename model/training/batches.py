@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
 from model.driving.trajectory import HISTORY_STEPS, STEP_S, present_speed
-from model.formats.cf_vla import formats_of
+from model.families.registry import families_of
+from model.families.trajectory_codes import CODES
 from model.formats.cursor import CompiledFormat
-from model.formats.pieces import CODES
 from model.network.codec import TrajectoryCodec
 from model.network.inputs import InputBuilder
 from model.network.patches import patchify
@@ -123,8 +123,8 @@ class ResponseDataset(Dataset[Sample]):
         self._soft = SoftCodes(codec, codec.vectors(examples.history, examples.future))
         self._random = np.random.default_rng(seed)
         self._weights, self._pictures, self._vocabulary = weights, pictures, vocabulary
-        formats = formats_of(inputs.settings.reflection)
-        self._formats = {name: CompiledFormat(format, vocabulary) for name, format in formats.items()}
+        families = families_of(inputs.settings.formats, inputs.settings.reflection)
+        self._formats = {name: CompiledFormat(each.format, vocabulary) for name, each in families.items()}
         for reflection in reflections:
             # Before hours of training: the format must be able to say it.
             no_codes = [0] * CODES

@@ -13,8 +13,9 @@ from typing import Final, Literal, get_args
 
 from model.driving.direction import wanted_changes
 from model.driving.plan import Plan
+from model.families.cf_vla.format import ACTION, BRANCH, THINKING
 from model.formats.cursor import CompiledFormat, Token
-from model.formats.pieces import ACTION, BRANCH, THINKING, Values
+from model.formats.pieces import Values
 
 SectionWeights = Mapping[str, float]
 

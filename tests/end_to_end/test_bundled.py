@@ -23,7 +23,7 @@ from model.driving.scene_store import read_scenes
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
 from model.engines.torch.engine import TorchEngine
 from model.evaluation.open_loop import BASELINES, evaluate_baselines, evaluate_trajectories
-from model.formats.cf_vla import CF_VLA
+from model.families.cf_vla import CF_VLA
 from model.formats.cursor import CompiledFormat
 from model.formats.text import parse
 from model.network.checkpoint import read_parts
@@ -112,7 +112,7 @@ def test_a_thousand_hot_draws_all_parse() -> None:
 
     draws = asyncio.run(write())
     assert len(draws) == 12 * 84
-    compiled = CompiledFormat(CF_VLA, read_parts(CHECKPOINT).vocabulary)
+    compiled = CompiledFormat(CF_VLA.format, read_parts(CHECKPOINT).vocabulary)
     for draw in draws:
         values = parse(compiled, draw.text)
         assert (values["plan"], values["branch"], values["trajectory"]) == (

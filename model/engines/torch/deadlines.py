@@ -11,8 +11,8 @@ from enum import Enum
 from typing import Final
 
 from model.engines.requests import branch_of
+from model.families.cf_vla.format import ACTION, BRANCH, THINKING
 from model.formats.cursor import Cursor
-from model.formats.pieces import ACTION, BRANCH, THINKING
 
 _WEIGHT: Final = 0.1
 """Weight of the latest observation in a running mean."""

@@ -19,8 +19,8 @@ from model.engines.engine import Controls, Draw, PlanRequest
 from model.engines.least_error import LeastError
 from model.engines.torch.memory import Memory
 from model.engines.torch.rows import Row
+from model.families.cf_vla.format import BRANCH
 from model.formats.cursor import Cursor
-from model.formats.pieces import BRANCH
 
 if TYPE_CHECKING:
     from model.engines.torch.runner import Prompt  # a runner needs torch, requests do not

@@ -15,8 +15,8 @@ from model.engines.requests import branch_of
 from model.engines.response import Response, SectionText
 from model.engines.sampling import choose, probabilities, uniforms
 from model.engines.torch.deadlines import TimeFor
+from model.families.cf_vla.format import ACTION, BRANCH, THINKING
 from model.formats.cursor import Allowed
-from model.formats.pieces import ACTION, BRANCH, THINKING
 from model.network.vocabulary import Vocabulary
 
 if TYPE_CHECKING:

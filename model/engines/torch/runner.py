@@ -41,9 +41,9 @@ from model.engines.torch.layout import (
 from model.engines.torch.memory import IntArray, Memory, SlotMapping
 from model.engines.torch.packed import Attention, PackedDecoder, Rotation
 from model.engines.torch.vision import Encoded, VisionEncoder
-from model.formats.cf_vla import formats_of
+from model.families.family import Family
+from model.families.registry import families_of
 from model.formats.cursor import CompiledFormat
-from model.formats.pieces import Format
 from model.network.checkpoint import Loaded
 
 ROWS_A_TREE: Final = 12
@@ -106,7 +106,7 @@ class Runner:
         reuse: whether anything is kept from scene to scene at all.
         capture: how passes of draws are captured, to be replayed for passes of the same sizes; None for not
             at all, which is best where an operation costs no more than what it does.
-        formats: of them those that the checkpoint writes are served; None for its own.
+        families: of the formats that the checkpoint writes; None for those that are registered.
         usual_tokens: of a response; what KV rows have room for, see `USUAL_TOKENS`.
 
     Attributes:
@@ -127,14 +127,14 @@ class Runner:
         reproducible: bool = False,
         reuse: bool = True,
         capture: Capture | None = None,
-        formats: Mapping[str, Format] | None = None,
+        families: Mapping[str, Family] | None = None,
         usual_tokens: int = USUAL_TOKENS,
     ) -> None:
         self.loaded = loaded
         self.rows, self.prompts = rows, prompts or rows
-        formats = formats or formats_of(loaded.settings.reflection)
+        self.families = families or families_of(loaded.card.formats, loaded.settings.reflection)
         self.formats = {
-            name: CompiledFormat(formats[name], loaded.vocabulary) for name in loaded.card.formats
+            name: CompiledFormat(family.format, loaded.vocabulary) for name, family in self.families.items()
         }
         # A row holds the prompt's last token too.
         self.row_tokens = 1 + max(format.longest() for format in self.formats.values())

@@ -25,8 +25,8 @@ from model.engines.engine import (
 from model.engines.least_error import Expected, LeastError, least_error
 from model.engines.requests import branch_of, read
 from model.engines.response import Response, SectionText
+from model.families.cf_vla.format import ACTION, BRANCH, THINKING
 from model.formats.cursor import Allowed, Cursor
-from model.formats.pieces import ACTION, BRANCH, THINKING
 from model.network.checkpoint import Parts
 
 IntArray = npt.NDArray[np.int64]

@@ -23,7 +23,7 @@ from model.engines.requests import begin
 from model.engines.vllm.decoding import Decoding, VllmPrompt
 from model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
 from model.engines.warm_up import warm_up
-from model.formats.cf_vla import formats_of
+from model.families.registry import families_of
 from model.formats.cursor import Active, CompiledFormat, Cursor, Rest
 from model.formats.grammar_export import to_lark
 from model.network.checkpoint import read_parts
@@ -67,9 +67,10 @@ class VllmEngine:
         self._checkpoint, self._settings = checkpoint, settings
         self._parts = read_parts(checkpoint)
         self._card = replace(self._parts.card, engine="vllm")
-        formats = formats_of(self._parts.settings.reflection)
+        self._families = families_of(self._card.formats, self._parts.settings.reflection)
         self._formats = {
-            name: CompiledFormat(formats[name], self._parts.vocabulary) for name in self._card.formats
+            name: CompiledFormat(family.format, self._parts.vocabulary)
+            for name, family in self._families.items()
         }
         self._least_error = LeastError(self._parts.codec, self._parts.vocabulary)
         self._llm: Any = None

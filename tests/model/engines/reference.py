@@ -16,9 +16,10 @@ from model.engines.binding import binding_of
 from model.engines.engine import Draw, PlanRequest
 from model.engines.least_error import LeastError, least_error
 from model.engines.sampling import choose, probabilities, uniform
-from model.formats.cf_vla import formats_of
+from model.families.cf_vla.format import BRANCH
+from model.families.family import Family
+from model.families.registry import families_of
 from model.formats.cursor import CompiledFormat, Token
-from model.formats.pieces import BRANCH, Format
 from model.formats.text import parse
 from model.network.checkpoint import Loaded
 
@@ -58,22 +59,22 @@ Shares = dict[int, npt.NDArray[np.float64]]
 
 
 def reference_draws(
-    loaded: Loaded, request: PlanRequest, formats: Mapping[str, Format] | None = None
+    loaded: Loaded, request: PlanRequest, families: Mapping[str, Family] | None = None
 ) -> list[Draw]:
     """All draws of a request, each from its own prompt."""
-    formats = formats or formats_of(loaded.settings.reflection)
-    return [draw for draw, _ in reference(loaded, request, formats)]
+    families = families or families_of(loaded.card.formats, loaded.settings.reflection)
+    return [draw for draw, _ in reference(loaded, request, families)]
 
 
 def reference(
-    loaded: Loaded, request: PlanRequest, formats: Mapping[str, Format]
+    loaded: Loaded, request: PlanRequest, families: Mapping[str, Family]
 ) -> list[tuple[Draw, Shares]]:
     """The same, with what each draw had to choose from."""
-    format = formats[request.format]
-    return [_draw(loaded, request, format, index) for index in range(request.controls.n)]
+    family = families[request.format]
+    return [_draw(loaded, request, family, index) for index in range(request.controls.n)]
 
 
-def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> tuple[Draw, Shares]:
+def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> tuple[Draw, Shares]:
     model: Any = loaded.model
     controls = request.controls
     inputs = loaded.inputs.build(request.scene, request.format)
@@ -86,7 +87,7 @@ def _draw(loaded: Loaded, request: PlanRequest, format: Format, index: int) -> t
         use_cache=True,
     ).logits[0, -1]
     given = {} if controls.prefill is None else {"plan": controls.prefill}
-    compiled = CompiledFormat(format, loaded.vocabulary)
+    compiled = CompiledFormat(family.format, loaded.vocabulary)
     cursor = compiled.start(given)
     tokens: list[Token] = []
     binding = binding_of(request, loaded.codec, loaded.vocabulary)

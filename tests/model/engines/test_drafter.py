@@ -13,9 +13,9 @@ from model.engines.sampling import uniform
 from model.engines.torch.drafter import _CONTEXTS, Drafter, _Ngrams, _Responses
 from model.engines.torch.request import Request, Tree
 from model.engines.torch.rows import Row
-from model.formats.cf_vla import CF_VLA
+from model.families.cf_vla import CF_VLA
+from model.families.cf_vla.format import BRANCH, THINKING
 from model.formats.cursor import CompiledFormat
-from model.formats.pieces import BRANCH, THINKING
 from model.network.checkpoint import Loaded, load
 from tests.checkpoints import noisy_scene
 
@@ -27,7 +27,7 @@ def loaded(untrained_checkpoint: Path) -> Loaded:
 
 def beginning(loaded: Loaded, **controls: Any) -> Row:
     """A row in front of its first decision."""
-    start = CompiledFormat(CF_VLA, loaded.vocabulary).start()
+    start = CompiledFormat(CF_VLA.format, loaded.vocabulary).start()
     asked = PlanRequest("a", noisy_scene(), "cf_vla", Controls(n=1, **controls))
     prompt: Any = SimpleNamespace(shown=b"pictures", last_token=0)
     row = Row(

@@ -33,7 +33,9 @@ from model.engines.torch.request import Request
 from model.engines.torch.rows import Row
 from model.engines.torch.runner import Prompt, Runner
 from model.engines.torch.shortcuts import Shortcuts
-from model.formats.cf_vla import formats_of
+from model.families.cf_vla import CF_VLA
+from model.families.family import Family
+from model.families.registry import families_of
 from model.formats.pieces import Format
 from model.network.checkpoint import Loaded, load
 from model.network.settings import NANO_SETTINGS, VlaSettings
@@ -135,13 +137,23 @@ mixes = st.builds(
 )
 
 
-Formats = Mapping[str, Format]
-made_up: st.SearchStrategy[Formats] = st.one_of(
-    st.just(formats_of("free_text")),
-    st.just(formats_of("phrases")),
-    branching_formats().map(lambda format: {**formats_of("free_text"), "cf_vla": format}),
+Families = Mapping[str, Family]
+NAMES = ("cf_vla", "traj_only")
+
+
+def with_format(format: Format) -> Families:
+    """One that writes ``format`` in the place of `cf_vla`."""
+    revised = CF_VLA.revised_plan if CF_VLA.revised_plan in format.sections() else None
+    changed = replace(CF_VLA, format=format, revised_plan=revised)
+    return {**families_of(NAMES, "free_text"), "cf_vla": changed}
+
+
+made_up: st.SearchStrategy[Families] = st.one_of(
+    st.just(families_of(NAMES, "free_text")),
+    st.just(families_of(NAMES, "phrases")),
+    branching_formats().map(with_format),
 )
-"""Those that there are, or one that nobody thought of in the place of `cf_vla`."""
+"""Those that there are, or one with a format that nobody thought of."""
 
 
 @pytest.fixture(scope="module", params=["every vision token", "resampled"])
@@ -198,10 +210,10 @@ def noted() -> Iterator[Mapping[tuple[str, int], Shares]]:
 compared = 0
 
 
-def plainly(exact: Loaded, requests: list[PlanRequest], formats: Formats) -> dict[tuple[str, int], Draw]:
+def plainly(exact: Loaded, requests: list[PlanRequest], families: Families) -> dict[tuple[str, int], Draw]:
     """What the decoder without shortcuts writes for requests that arrive together and stay."""
     rows = sum(2 * request.controls.n for request in requests)
-    runner = Runner(exact, rows, prompts=rows // 2, reuse=False, formats=formats)
+    runner = Runner(exact, rows, prompts=rows // 2, reuse=False, families=families)
     decoder = Decoder(runner, Shortcuts.none(), clock=lambda: 0.0)
     return decode(decoder, [Arrival(request, 0, None) for request in requests])
 
@@ -220,7 +232,7 @@ def named(mix: int, request: PlanRequest) -> PlanRequest:
 )
 @given(together=st.lists(mixes, min_size=TOGETHER, max_size=TOGETHER), made_up=made_up)
 def test_nothing_that_makes_it_fast_changes_a_response(
-    exact: Loaded, together: list[Mix], made_up: Formats
+    exact: Loaded, together: list[Mix], made_up: Families
 ) -> None:
     global compared
     requests = [named(number, each.request) for number, mix in enumerate(together) for each in mix.arrivals]
@@ -234,7 +246,7 @@ def test_nothing_that_makes_it_fast_changes_a_response(
             reproducible=mix.reproducible,
             reuse=mix.shortcuts.reuse,
             capture=Again if mix.shortcuts.capture else None,
-            formats=made_up,
+            families=made_up,
             usual_tokens=mix.usual_tokens,
         )
         decoder = Decoder(runner, mix.shortcuts, prompt_chunk=mix.chunk, clock=lambda: 0.0)
@@ -261,7 +273,7 @@ def test_nothing_that_makes_it_fast_changes_a_response(
 )
 @given(mix=arrivals(), made_up=made_up)
 def test_the_decoder_without_shortcuts_is_the_one_of_transformers(
-    exact: Loaded, mix: list[Arrival], made_up: Formats
+    exact: Loaded, mix: list[Arrival], made_up: Families
 ) -> None:
     with noted() as shares:
         draws = plainly(exact, [each.request for each in mix], made_up)

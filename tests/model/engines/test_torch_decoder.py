@@ -18,9 +18,9 @@ from model.engines.engine import (
 from model.engines.torch.decoder import Counts, Decoder
 from model.engines.torch.runner import Runner
 from model.engines.torch.shortcuts import Shortcuts
-from model.formats.cf_vla import CF_VLA
+from model.families.cf_vla import CF_VLA
+from model.families.cf_vla.format import BRANCH
 from model.formats.cursor import CompiledFormat
-from model.formats.pieces import BRANCH
 from model.formats.text import parse
 from model.network.checkpoint import Loaded, load
 from tests.model.engines.decoding import Again, decode, request
@@ -103,7 +103,7 @@ def test_cached_steps_equal_a_full_pass(exact: Loaded) -> None:
     one = request("a", 1, n=1, temperature=0.0, thinking="never", numbers="drawn", codes="drawn")
     draw = decode(Decoder(Runner(exact, 1)), one)["a", 0]
     inputs = exact.inputs.build(one.scene, "cf_vla")
-    compiled = CompiledFormat(CF_VLA, exact.vocabulary)
+    compiled = CompiledFormat(CF_VLA.format, exact.vocabulary)
     response = compiled.render(parse(compiled, draw.text))
     ids = torch.tensor([[*inputs.prompt.ids, *(token.id for token in response)]])
     logits = exact.model(
@@ -152,7 +152,7 @@ def test_every_response_parses_at_high_temperature(untrained_checkpoint: Path) -
     loaded = load(untrained_checkpoint)
     requests = [request(f"{k}", k, n=8, temperature=1.5, seed=k) for k in range(3)]
     draws = decode(Decoder(Runner(loaded, 24)), *requests)
-    compiled = CompiledFormat(CF_VLA, loaded.vocabulary)
+    compiled = CompiledFormat(CF_VLA.format, loaded.vocabulary)
     assert len(draws) == 24
     for draw in draws.values():
         values = parse(compiled, draw.text)

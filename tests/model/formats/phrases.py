@@ -4,23 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
+from model.families.cf_vla.format import ACTION, BRANCH, THINKING
+from model.families.trajectory_codes import CODES, TRAJECTORY
 from model.formats.compounds import Number, Repeat
-from model.formats.pieces import (
-    ACTION,
-    BRANCH,
-    CODES,
-    THINKING,
-    TRAJECTORY,
-    Choice,
-    Codes,
-    Format,
-    Literal,
-    Maybe,
-    Option,
-    Record,
-    Section,
-    Sequence,
-)
+from model.formats.pieces import Choice, Codes, Format, Literal, Maybe, Option, Record, Section, Sequence
 from model.formats.plan_tracks import PlanTracks
 
 

@@ -9,14 +9,11 @@ from hypothesis import assume
 from hypothesis import strategies as st
 
 from model.driving.plan import GROUPS, TICKS, WORDS, Group, MetaAction, Plan, plan_from_bins
+from model.families.cf_vla.format import ACTION, BRANCH, THINKING
+from model.families.trajectory_codes import CODES, TRAJECTORY
 from model.formats.compounds import Number, Repeat
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import (
-    ACTION,
-    BRANCH,
-    CODES,
-    THINKING,
-    TRAJECTORY,
     Choice,
     Codes,
     Compound,

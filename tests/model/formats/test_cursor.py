@@ -7,7 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, parse_plan
-from model.formats.cf_vla import CF_VLA, MAX_THINKING_TOKENS, TRAJ_ONLY, formats_of
+from model.families.cf_vla import CF_VLA
+from model.families.cf_vla.format import MAX_THINKING_TOKENS
+from model.families.traj_only import TRAJ_ONLY
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import Format, FormatError, Value, Values
 from model.formats.plan_tracks import MAX_SEGMENTS
@@ -15,8 +17,8 @@ from model.formats.text import parse
 from tests.model.formats.strategies import VOCABULARY, branching_formats, cf_vla_values, plans
 from tests.model.formats.test_laws import walk
 
-COMPILED = CompiledFormat(CF_VLA, VOCABULARY)
-FORMATS = formats_of("free_text")
+COMPILED = CompiledFormat(CF_VLA.format, VOCABULARY)
+FORMATS = {family.name: family.format for family in (CF_VLA, TRAJ_ONLY)}
 FULL = parse_plan("".join(f"- {group}\n  - 0.0s-6.4s: {WORDS[group][0]}\n" for group in GROUPS))
 PLAN = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n- lateral\n  - 0.0s-6.4s: Straight\n")
 
@@ -159,7 +161,7 @@ def test_values_that_cannot_be_written_are_refused(values: dict[str, Value], mes
 
 def test_given_sections_must_exist() -> None:
     with pytest.raises(FormatError, match="has no section"):
-        CompiledFormat(TRAJ_ONLY, VOCABULARY).start({"plan": PLAN})
+        CompiledFormat(TRAJ_ONLY.format, VOCABULARY).start({"plan": PLAN})
 
 
 @given(cf_vla_values())

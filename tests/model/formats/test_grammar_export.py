@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.driving.plan import WORDS
-from model.formats.cf_vla import CF_VLA, formats_of
+from model.families.cf_vla import CF_VLA
+from model.families.traj_only import TRAJ_ONLY
 from model.formats.cursor import AtChoice, CompiledFormat, Cursor
 from model.formats.grammar_export import to_lark
 from model.formats.pieces import Values
@@ -20,8 +21,8 @@ from tests.model.formats.strategies import VOCABULARY, cf_vla_values, compiled_f
 from tests.model.formats.test_laws import walk
 from tests.model.formats.vocabulary import SPECIAL
 
-COMPILED = CompiledFormat(CF_VLA, VOCABULARY)
-FORMATS = formats_of("free_text")
+COMPILED = CompiledFormat(CF_VLA.format, VOCABULARY)
+FORMATS = {family.name: family.format for family in (CF_VLA, TRAJ_ONLY)}
 PHRASED = CompiledFormat(PHRASES, VOCABULARY)
 
 

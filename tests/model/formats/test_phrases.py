@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from model.driving.direction import CHANGES, needed
 from model.driving.phrases import NOTHING, Facts, agrees, corrected, read_facts
 from model.driving.plan import TICKS, Plan, parse_plan
-from model.formats.cf_vla import CF_VLA_PHRASES
+from model.families.cf_vla.format import PHRASES
 from model.formats.cursor import CompiledFormat, Cursor, Token
 from model.formats.pieces import FormatError, Values
 from model.formats.text import parse
@@ -19,7 +19,7 @@ from tests.model.formats.strategies import VOCABULARY, plans
 from tests.model.formats.test_grammar_export import allowed_by, in_plan, matcher
 from tests.model.formats.test_laws import ids_of
 
-COMPILED = CompiledFormat(CF_VLA_PHRASES, VOCABULARY)
+COMPILED = CompiledFormat(PHRASES, VOCABULARY)
 CODES = (0,) * 6
 WAITS = parse_plan(
     "- longitudinal\n  - 0.0s-6.4s: Wait\n"

@@ -8,12 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.driving.plan import GROUPS, WORDS, parse_plan
+from model.families.trajectory_codes import CODES, TRAJECTORY
 from model.formats.compounds import MAX_REPEATS, Number, Repeat
 from model.formats.cursor import CompiledFormat, Cursor
 from model.formats.pieces import (
-    BRANCH,
-    CODES,
-    TRAJECTORY,
     Choice,
     Codes,
     Format,
@@ -287,10 +285,6 @@ CODED = Section("trajectory", Codes(TRAJECTORY, CODES))
         (Sequence((Repeat(Number(0, 9, 1), 3), Literal("0"))), "is in doubt"),
         (Maybe(Literal("")), "must not be empty itself"),
         (Sequence((Section("one", Maybe(Literal("a"))), Section("two", Literal("b")))), "its own section"),
-        (
-            Sequence((Choice((Option("Act"), Option("Acting")), BRANCH), Literal("!"))),
-            "stands at the branch",
-        ),
     ],
 )
 def test_a_format_that_could_be_read_in_two_ways_does_not_compile(part: Piece, message: str) -> None:

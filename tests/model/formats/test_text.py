@@ -2,13 +2,13 @@ from __future__ import annotations
 
 import pytest
 
-from model.formats.cf_vla import CF_VLA
+from model.families.cf_vla import CF_VLA
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import FormatError
 from model.formats.text import parse
 from tests.model.formats.vocabulary import ByteVocabulary, code_text
 
-COMPILED = CompiledFormat(CF_VLA, ByteVocabulary())
+COMPILED = CompiledFormat(CF_VLA.format, ByteVocabulary())
 PLAN = "- longitudinal\n  - 0.0s-0.9s: Keep Speed\n  - 0.9s-6.4s: Accelerate\n- lateral\n"
 PLAN += "  - 0.0s-6.4s: Straight\n- lane\n  - 0.0s-6.4s: Keep Lane\n"
 CODES = "".join(code_text(stage, 3) for stage in range(6))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from model.driving.scene import FRONT_TELE, FRONT_WIDE, Scene, SceneError
+from model.families.family import FamilyError
 from model.network.inputs import InputBuilder, rotary_positions
-from model.network.prompts import PromptError
 from model.network.settings import NANO_SETTINGS, SettingsError, VlaSettings
 from model.network.vocabulary import HISTORY, ROUTE, VIDEO_PAD, Vocabulary
 from tests.model.network.conftest import made_up_scene
@@ -58,7 +58,7 @@ def test_without_route(vocabulary: Vocabulary) -> None:
 
 def test_what_cannot_be_built(vocabulary: Vocabulary, scene: Scene) -> None:
     builder = InputBuilder(vocabulary, SETTINGS)
-    with pytest.raises(PromptError, match="poem"):
+    with pytest.raises(FamilyError, match="poem"):
         builder.build(scene, "poem")
     with pytest.raises(SceneError, match=FRONT_WIDE):
         builder.build(Scene("x", scene.clips[:1], scene.history), "cf_vla")

@@ -16,10 +16,11 @@ from typer.testing import CliRunner
 
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.scene_store import read_scenes
+from model.families.registry import family_named
 from model.network.card import CheckpointError, read_card
 from model.network.checkpoint import load, read_parts
 from model.network.processor import LookTwiceProcessor
-from model.network.prompts import TASKS, chat_template, prompt_text
+from model.network.prompts import chat_template, prompt_text
 from model.network.repository import write_repository
 from model.network.settings import VlaSettings
 from service.cli.commands import app
@@ -78,9 +79,9 @@ def test_the_bundled_folder_is_what_is_written_today(tmp_path: Path) -> None:
 def test_the_chat_template_writes_our_prompts(tmp_path: Path, scene_tokens: int) -> None:
     settings = VlaSettings(with_tracks=True, scene_tokens=scene_tokens)
     tokenizer = read_parts(CHECKPOINT).vocabulary.tokenizer
-    for task, route, tracks in product(TASKS, (False, True), (False, True)):
+    for task, route, tracks in product(("cf_vla", "traj_only"), (False, True), (False, True)):
         kinds = ["video", "history", *["route"] * route, *["tracks"] * tracks]
-        content = [{"type": "text", "text": TASKS[task]}, *({"type": kind} for kind in kinds)]
+        content = [{"type": "text", "text": family_named(task).task}, *({"type": kind} for kind in kinds)]
         written = tokenizer.apply_chat_template(
             [{"role": "user", "content": content}],
             chat_template=chat_template(settings),

@@ -4,7 +4,9 @@ import pytest
 
 from model.driving.phrases import Statement, Thing
 from model.driving.plan import Plan, parse_plan
-from model.formats.cf_vla import CF_VLA, CF_VLA_PHRASES, TRAJ_ONLY
+from model.families.cf_vla import CF_VLA
+from model.families.cf_vla.format import PHRASES
+from model.families.traj_only import TRAJ_ONLY
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import Format, FormatError, Values
 from model.formats.text import parse
@@ -18,7 +20,7 @@ WRONG = parse_plan("- longitudinal\n  - 0.0s-6.4s: Accelerate\n")
 
 
 def test_a_direct_target_says_plan_and_codes_with_the_papers_weights() -> None:
-    compiled = CompiledFormat(CF_VLA, VOCABULARY)
+    compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
     target = make_target(compiled, PLAN, CODES)
     values = parse(compiled, VOCABULARY.decode(target.ids), {"plan": PLAN})
     assert values == Values.of({"plan": PLAN, "branch": "Action:", "trajectory": CODES})
@@ -27,7 +29,7 @@ def test_a_direct_target_says_plan_and_codes_with_the_papers_weights() -> None:
 
 
 def test_traj_only_has_no_plan() -> None:
-    compiled = CompiledFormat(TRAJ_ONLY, VOCABULARY)
+    compiled = CompiledFormat(TRAJ_ONLY.format, VOCABULARY)
     target = make_target(compiled, PLAN, CODES)
     assert parse(compiled, VOCABULARY.decode(target.ids)) == Values.of({"trajectory": CODES})
 
@@ -39,7 +41,7 @@ def test_a_format_without_targets_is_refused() -> None:
 
 
 def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
-    compiled = CompiledFormat(CF_VLA, VOCABULARY)
+    compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
     reflection = Reflection(WRONG, "The car ahead stands still.")
     target = make_target(compiled, PLAN, CODES, PAPER_WEIGHTS, reflection)
     plans = {"plan": WRONG, "revised_plan": PLAN}
@@ -60,7 +62,7 @@ def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
 
 
 def test_a_right_plan_of_its_own_is_acted_on_and_not_taught() -> None:
-    compiled = CompiledFormat(CF_VLA, VOCABULARY)
+    compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
     target = make_target(compiled, PLAN, CODES, PAPER_WEIGHTS, Reflection(WRONG, ""))
     values = parse(compiled, VOCABULARY.decode(target.ids), {"plan": WRONG})
     assert values == Values.of({"plan": WRONG, "branch": "Action:", "trajectory": CODES})
@@ -69,7 +71,7 @@ def test_a_right_plan_of_its_own_is_acted_on_and_not_taught() -> None:
 
 
 def test_a_reflection_in_phrases_leads_to_its_own_plan() -> None:
-    compiled = CompiledFormat(CF_VLA_PHRASES, VOCABULARY)
+    compiled = CompiledFormat(PHRASES, VOCABULARY)
     first, slower = three_tracks("Keep Speed", "Keep Lane"), three_tracks("Wait", "Keep Lane")
     text = str(Statement(Thing("barrier", "my lane", 20), "too close", "slower"))
     expert = three_tracks("Wait", "Left Lane Change")
@@ -88,7 +90,7 @@ def test_a_reflection_in_phrases_leads_to_its_own_plan() -> None:
 
 
 def test_a_plan_that_phrases_do_not_lead_to_is_refused() -> None:
-    compiled = CompiledFormat(CF_VLA_PHRASES, VOCABULARY)
+    compiled = CompiledFormat(PHRASES, VOCABULARY)
     first, slower = three_tracks("Keep Speed", "Keep Lane"), three_tracks("Wait", "Left Lane Change")
     text = str(Statement(Thing("barrier", "my lane", 20), "too close", "slower"))
     with pytest.raises(FormatError, match="changes otherwise"):
@@ -104,4 +106,4 @@ def three_tracks(longitudinal: str, lane: str) -> Plan:
 
 def test_every_section_needs_a_weight() -> None:
     with pytest.raises(KeyError):
-        make_target(CompiledFormat(CF_VLA, VOCABULARY), PLAN, CODES, {"plan": 1.0})
+        make_target(CompiledFormat(CF_VLA.format, VOCABULARY), PLAN, CODES, {"plan": 1.0})

@@ -32,7 +32,7 @@ from model.engines.engine import (
 )
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.vllm.engine import VllmEngine, VllmSettings
-from model.formats.cf_vla import CF_VLA
+from model.families.cf_vla import CF_VLA
 from model.formats.cursor import CompiledFormat
 from model.formats.text import parse
 from model.network.checkpoint import read_parts
@@ -209,7 +209,7 @@ def test_draws_are_valid_and_repeat_with_their_seed(
     assert [draw.text for draw in first] == [draw.text for draw in again]
     assert [draw.text for draw in first] != [draw.text for draw in other]
     assert len({draw.text for draw in first}) == 6
-    compiled = CompiledFormat(CF_VLA, read_parts(CHECKPOINT).vocabulary)
+    compiled = CompiledFormat(CF_VLA.format, read_parts(CHECKPOINT).vocabulary)
     for draw in first + other:
         assert parse(compiled, draw.text)["trajectory"] == draw.codes
 

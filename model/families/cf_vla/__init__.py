@@ -1,0 +1,18 @@
+"""CF-VLA: plans, and looks a second time before it acts where the plan may be wrong."""
+
+from typing import Final
+
+from model.families.cf_vla import format as its
+from model.families.family import Branch, Family
+
+CF_VLA: Final = Family(
+    format=its.FREE_TEXT,
+    dialects={"phrases": its.PHRASES},
+    task="Propose meta-actions; only if they are wrong, reflect and correct them. Then give the trajectory.",
+    first_plan=its.PLAN,
+    branch=Branch(its.BRANCH, direct=its.ACTION, reflecting=its.THINKING),
+    reflection=its.REFLECTION,
+    revised_plan=its.REVISED_PLAN,
+    trajectory=its.TRAJECTORY,
+)
+"""plan, branch { act: trajectory | reflect: reflection, revised plan, trajectory }"""

@@ -1,0 +1,84 @@
+"""What a model family declares, so that everything else asks it and names none of its sections."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from model.formats.pieces import Format, choices
+
+
+class FamilyError(ValueError):
+    """A family that is unknown, cannot be loaded, or does not fit its own format; the text says which."""
+
+
+@dataclass(frozen=True)
+class Branch:
+    """The choice at which a response gives its trajectory or reflects first; controls may decide it.
+
+    Attributes:
+        name: of the choice.
+        direct: the option that leads to the trajectory at once: under a deadline, the draft.
+        reflecting: the option that takes a second look.
+    """
+
+    name: str
+    direct: str
+    reflecting: str
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """A model family. Sections that it does not write are None.
+
+    Attributes:
+        format: of its responses; requests and checkpoints name the family by the format's name.
+        task: what its prompt asks for.
+        trajectory: the section that holds the trajectory.
+        first_plan: the section of the plan that it writes first, and that callers may give.
+        branch: where it may take a second look.
+        reflection: the section where it says what is wrong with its first plan.
+        revised_plan: the section of the plan that takes the first one's place.
+        dialects: other formats of the same name, for checkpoints whose reflections are written otherwise.
+
+    Raises:
+        FamilyError: the format lacks a section or the branch that is declared.
+    """
+
+    format: Format
+    task: str
+    trajectory: str
+    first_plan: str | None = None
+    branch: Branch | None = None
+    reflection: str | None = None
+    revised_plan: str | None = None
+    dialects: Mapping[ReflectionLanguage, Format] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        declared = (self.trajectory, self.first_plan, self.reflection, self.revised_plan)
+        lacking = {section for section in declared if section is not None} - set(self.format.sections())
+        if lacking:
+            raise FamilyError(f"family {self.name!r}: its format has no section {min(lacking)!r}")
+        if self.branch is not None:
+            _check_branch(self.name, self.format, self.branch)
+
+    @property
+    def name(self) -> str:
+        """As requests give it."""
+        return self.format.name
+
+    def in_dialect(self, reflection: ReflectionLanguage) -> Family:
+        """The family of a checkpoint whose reflections are so written."""
+        return replace(self, format=self.dialects.get(reflection, self.format))
+
+
+def _check_branch(family: str, format: Format, branch: Branch) -> None:
+    found = [choice for choice in choices(format.body) if choice.name == branch.name]
+    if len(found) != 1:
+        raise FamilyError(f"family {family!r}: its format has {len(found)} choices {branch.name!r}, not one")
+    texts = [option.text for option in found[0].options]
+    if lacking := {branch.direct, branch.reflecting} - set(texts):
+        raise FamilyError(f"family {family!r}: choice {branch.name!r} has no option {min(lacking)!r}")
+    if len({text[:1] for text in texts}) < len(texts):
+        # Controls decide with the first token.
+        raise FamilyError(f"family {family!r}: the options of {branch.name!r} must begin differently")

@@ -1,0 +1,57 @@
+"""Which families there are: ours, and those that installed packages declare.
+
+A package declares a family by an entry point whose name is the family's::
+
+    [project.entry-points."looktwice.families"]
+    my_family = "my_package.my_family:MY_FAMILY"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Final
+
+from model.driving.phrases import ReflectionLanguage
+from model.families.cf_vla import CF_VLA
+from model.families.family import Family, FamilyError
+from model.families.traj_only import TRAJ_ONLY
+
+GROUP: Final = "looktwice.families"
+"""The entry points that declare families."""
+
+_OURS: Final = {family.name: family for family in (CF_VLA, TRAJ_ONLY)}
+
+
+@cache
+def family_named(name: str) -> Family:
+    """The family of a name, as requests and checkpoints give it.
+
+    Raises:
+        FamilyError: nobody declares it, more than one package does, or it cannot be loaded.
+    """
+    found = list(entry_points(group=GROUP, name=name))
+    if name in _OURS and not found:
+        return _OURS[name]
+    if not found:
+        known = sorted({*_OURS, *(each.name for each in entry_points(group=GROUP))})
+        raise FamilyError(f"no model family {name!r}; known are {', '.join(known)}")
+    if len(found) > 1 or name in _OURS:
+        raise FamilyError(f"model family {name!r} is declared more than once: {', '.join(map(str, found))}")
+    return _loaded(found[0])
+
+
+def families_of(names: Iterable[str], reflection: ReflectionLanguage) -> dict[str, Family]:
+    """Families by name, in the dialect of a checkpoint whose reflections are so written."""
+    return {name: family_named(name).in_dialect(reflection) for name in names}
+
+
+def _loaded(entry: EntryPoint) -> Family:
+    try:
+        family = entry.load()
+    except Exception as error:  # a user's module may raise anything
+        raise FamilyError(f"model family {entry.name!r} ({entry.value}) cannot be loaded: {error}") from error
+    if not isinstance(family, Family) or family.name != entry.name:
+        raise FamilyError(f"entry point {entry.name!r} ({entry.value}) is no family of that name: {family!r}")
+    return family

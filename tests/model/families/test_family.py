@@ -1,0 +1,41 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from model.families.cf_vla import CF_VLA
+from model.families.family import Branch, FamilyError
+from model.families.traj_only import TRAJ_ONLY
+from model.formats.pieces import Choice, Format, Literal, Option, Section, Sequence
+
+
+def branching(*texts: str, times: int = 1) -> Format:
+    choice = Choice(tuple(map(Option, texts)), name="way")
+    return Format("made up", Section("end", Sequence((choice,) * times + (Literal("!"),))))
+
+
+def test_the_branch_is_a_choice_of_the_format() -> None:
+    way = Branch("way", direct="go", reflecting="stop")
+    family = replace(TRAJ_ONLY, format=branching("go", "stop", "wait"), trajectory="end", branch=way)
+    assert family.branch == way
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"first_plan": "verse"}, "family 'traj_only': its format has no section 'verse'"),
+        ({"trajectory": "verse"}, "has no section 'verse'"),
+        ({"branch": CF_VLA.branch}, "its format has 0 choices 'branch', not one"),
+        ({"format": branching("go", "stop", times=2)}, "has 2 choices 'way', not one"),
+        ({"format": branching("go", "halt")}, "choice 'way' has no option 'stop'"),
+        # Controls decide with one token: those who plan and those who stop must differ in their first.
+        ({"format": branching("go", "stop", "stopping")}, "the options of 'way' must begin differently"),
+    ],
+)
+def test_a_family_fits_its_format(changes: dict[str, Any], message: str) -> None:
+    if "format" in changes:
+        changes |= {"trajectory": "end", "branch": Branch("way", direct="go", reflecting="stop")}
+    with pytest.raises(FamilyError, match=message):
+        replace(TRAJ_ONLY, **changes)
