@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, get_args
 
 import numpy as np
 
@@ -76,6 +76,13 @@ def wire_plan(plan: Plan) -> wire.Plan:
     return wire.Plan(text=str(plan), tracks=wire.Tracks(**tracks))
 
 
+def wire_branch(*, looked_twice: bool) -> wire.Branch:
+    """The wire's word for the option that was taken, whatever a family calls it."""
+    direct, reflecting = get_args(wire.Branch)
+    taken: wire.Branch = reflecting if looked_twice else direct
+    return taken
+
+
 def wire_trajectory(draw: Draw) -> list[list[float]]:
     """A draw's trajectory for the wire."""
     rows: list[list[float]] = draw.trajectory.astype(float).round(_DECIMALS).tolist()
@@ -90,12 +97,12 @@ def _draw(draw: Draw, agreement: Agreement, draft: Draw | None) -> wire.Draw:
     return wire.Draw(
         index=draw.index,
         plan=None if draw.plan is None else wire_plan(draw.plan),
-        branch=draw.branch,
+        branch=None if draw.branch is None else wire_branch(looked_twice=draw.looked_twice),
         think_probability=draw.think_probability,
         thinking=draw.thinking,
         revised_plan=None if draw.revised_plan is None else wire_plan(draw.revised_plan),
         trajectory=wire_trajectory(draw),
-        draft_trajectory=None if draft is None or draw.thinking is None else wire_trajectory(draft),
+        draft_trajectory=None if draft is None or not draw.looked_twice else wire_trajectory(draft),
         cut=draw.cut,
         consistent=agreement.consistent,
         disagreements=list(agreement.disagreements),

@@ -33,8 +33,6 @@ PROBABILITY_BUCKETS: Final = tuple(step / 10 for step in range(1, 11))
 # When a series began is of use to nobody here, and in Prometheus' own format it is one more gauge each.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
-BRANCH_LABELS: Final = {"Action:": "direct", "Thinking:": "think", None: "none"}
-
 
 class Metrics:
     """The service's metrics in one registry: ``looktwice_…``, and ``process_…`` of its process.
@@ -271,7 +269,8 @@ class Metrics:
 
     def draw_finished(self, draw: Draw, thinking: Thinking, endpoint: str) -> None:
         """Count one draw."""
-        self._branches.labels(BRANCH_LABELS[draw.branch], thinking, endpoint).inc()
+        taken = "none" if draw.branch is None else "think" if draw.looked_twice else "direct"
+        self._branches.labels(taken, thinking, endpoint).inc()
         if draw.plan is not None and draw.revised_plan is not None:
             self._revised_iou.labels(endpoint).observe(plan_iou(draw.plan, draw.revised_plan))
         if draw.think_probability is not None:

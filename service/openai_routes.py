@@ -68,7 +68,9 @@ def openai_router(parts: Parts) -> APIRouter:
             events = parts.planning.events(asked, arrival)
             if not chat.stream:
                 return JSONResponse(completion.whole(await while_connected(request, last(events))))
-            return await streamed(request, events, lambda told: _chunks(told, completion), parts.metrics)
+            return await streamed(
+                request, events, lambda told: _chunks(told, completion), asked.format, parts.metrics
+            )
         except ProblemError as problem:
             raise ChatPlaces(chat).problem(problem) from problem
 

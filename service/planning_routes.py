@@ -206,7 +206,11 @@ async def _one(
             raise ProblemError(INVALID_REQUEST, f"{wire.IDEMPOTENCY_KEY_HEADER} cannot go with stream: true")
         events = parts.planning.events(asked, arrival)
         return await streamed(
-            request, events, lambda told: server_sent(told, answer, arrival.request_id), parts.metrics
+            request,
+            events,
+            lambda told: server_sent(told, answer, arrival.request_id),
+            asked.format,
+            parts.metrics,
         )
 
     async def work() -> Response:

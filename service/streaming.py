@@ -19,8 +19,9 @@ from model.engines.engine import (
     SectionFinished,
     TextWritten,
 )
-from model.families.cf_vla.format import BRANCH
-from service.answers import wire_plan, wire_trajectory
+from model.families.family import Family
+from model.families.registry import family_named
+from service.answers import wire_branch, wire_plan, wire_trajectory
 from service.callers import CallerLeft, while_connected
 from service.errors import problem_document
 from service.metrics import Metrics
@@ -40,19 +41,21 @@ Told = tuple[str, Written] | Planned
 
 
 async def told_events(
-    first: Happened, events: AsyncGenerator[Happened], metrics: Metrics
+    first: Happened, events: AsyncGenerator[Happened], format: str, metrics: Metrics
 ) -> AsyncGenerator[Told]:
     """What happens to a scene in the wire's words; closing it early frees everything.
 
     Args:
         first: was asked for already, so that a scene that is not let in gets a plain problem.
         events: what follows.
+        format: that the response is in.
         metrics: where a failure is counted, as no status shows it.
 
     Raises:
         ProblemError: whatever went wrong; the status is sent, so nothing but an event can tell.
     """
     told: dict[int, str] = {}
+    family = family_named(format)
     async with aclosing(events):
         try:
             event: Happened | None = first
@@ -60,7 +63,7 @@ async def told_events(
                 if isinstance(event, Planned):
                     yield event
                     return
-                for each in _data(event, told):
+                for each in _data(event, family, told):
                     yield each
                 event = await anext(events, None)
         except ProblemError as error:
@@ -89,6 +92,7 @@ async def streamed(
     request: Request,
     events: AsyncGenerator[Happened],
     sent: Callable[[AsyncGenerator[Told]], AsyncGenerator[bytes]],
+    format: str,
     metrics: Metrics,
 ) -> StreamingResponse:
     """A scene's events as they come, in the bytes that ``sent`` makes of them.
@@ -103,25 +107,26 @@ async def streamed(
     except CallerLeft:
         await events.aclose()
         raise
-    told = told_events(first, events, metrics)
+    told = told_events(first, events, format, metrics)
     return StreamingResponse(sent(told), media_type=wire.SSE_MEDIA_TYPE, headers=_NO_BUFFERING)
 
 
-def _data(event: Happened, told: dict[int, str]) -> list[tuple[str, Written]]:
+def _data(event: Happened, family: Family, told: dict[int, str]) -> list[tuple[str, Written]]:
     match event:
-        case TextWritten(index, section, text):
-            return _text(index, section, text, told)
-        case SectionFinished(index, section, text) if section == "thinking":
+        case TextWritten(index, section, text) if section == family.reflection:
+            return _text(index, text, told)
+        case SectionFinished(index, section, text) if section == family.reflection:
             # What was not told yet; spaces around the text belong to the format.
             rest = text.strip().removeprefix(told.get(index, ""))
-            return _text(index, section, rest, told)
-        case SectionFinished(index, section, text) if section == BRANCH:
-            branch: wire.Branch = "Thinking:" if "Thinking:" in text else "Action:"
+            return _text(index, rest, told)
+        case SectionFinished(index, section, text) if family.branch and section == family.branch.name:
+            branch = wire_branch(looked_twice=family.branch.reflecting in text)
             return [("branch", wire.BranchTaken(index=index, branch=branch))]
-        case SectionFinished(index, section, text) if section in ("plan", "revised_plan"):
+        case SectionFinished(index, section, text) if section in family.plans:
             # The words that lead to a plan's first bullet belong to the format.
             plan = parse_plan(text[text.index("- ") :])
-            return [(section, wire.PlanWritten(index=index, plan=wire_plan(plan)))]
+            name = "plan" if section == family.first_plan else "revised_plan"
+            return [(name, wire.PlanWritten(index=index, plan=wire_plan(plan)))]
         case DraftFinished(draw):
             trajectory = wire.TrajectoryWritten(index=draw.index, trajectory=wire_trajectory(draw))
             return [("draft_trajectory", trajectory)]
@@ -136,13 +141,13 @@ def _data(event: Happened, told: dict[int, str]) -> list[tuple[str, Written]]:
     return []
 
 
-def _text(index: int, section: str, text: str, told: dict[int, str]) -> list[tuple[str, Written]]:
+def _text(index: int, text: str, told: dict[int, str]) -> list[tuple[str, Written]]:
     before = told.get(index, "")
     new = text if before else text.lstrip()
     if not new:
         return []
     told[index] = before + new
-    return [(section, wire.ThinkingWritten(index=index, text=new))]
+    return [("thinking", wire.ThinkingWritten(index=index, text=new))]
 
 
 def _event(name: str, data: BaseModel) -> bytes:

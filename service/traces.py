@@ -128,7 +128,7 @@ class _Span:
             {
                 "gen_ai.usage.output_tokens": tokens,
                 "gen_ai.response.finish_reasons": ["length" if draw.cut else "stop" for draw in draws],
-                "looktwice.think_rate": sum(draw.thinking is not None for draw in draws) / len(draws),
+                "looktwice.think_rate": sum(draw.looked_twice for draw in draws) / len(draws),
                 "looktwice.forced_share": 1 - sum(draw.chosen for draw in draws) / max(1, tokens),
                 "looktwice.passes": max(draw.passes for draw in draws),
             }

@@ -24,7 +24,6 @@ BoolArray = npt.NDArray[np.bool_]
 
 BOUND_IOU: Final = FOLLOWS_IOU
 """First codes with less IOU with the plan are left out, as far as there are any with more."""
-_PLANS: Final = ("revised_plan", "plan")
 _FIRST_STAGE: Final = 0
 
 
@@ -61,14 +60,16 @@ class Binding:
         self._done = np.stack([label_plan(each, history, None).bins() for each in trajectories])
         self._left: dict[str, BoolArray] = {}
 
-    def leaves(self, ids: npt.NDArray[np.int64], written: Sequence[Token]) -> BoolArray | None:
+    def leaves(
+        self, ids: npt.NDArray[np.int64], written: Sequence[Token], plans: Sequence[str]
+    ) -> BoolArray | None:
         """Which of the allowed ``ids`` remain; None where they are no first codes, or no plan is written.
 
-        At least one remains.
+        At least one remains. ``plans`` are the sections that may hold the plan, the one that counts first.
         """
         if len(ids) != len(self._ids) or ids[0] != self._ids.start:
             return None
-        text = next((text for name in _PLANS if (text := self._text(name, written))), None)
+        text = next((text for name in plans if (text := self._text(name, written))), None)
         if text is None:
             return None
         if text not in self._left:

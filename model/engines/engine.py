@@ -12,11 +12,9 @@ from typing import Any, Literal, Protocol
 from model.driving.plan import Plan
 from model.driving.scene import Scene
 from model.driving.trajectory import FloatArray
-from model.families.cf_vla.format import ACTION, THINKING
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
-Branch = Literal["Action:", "Thinking:"]
 Cut = Literal["skipped", "shortened", "replaced"]
 """What a deadline did to a second look: not begun, ended early, given up for the draft."""
 
@@ -96,15 +94,11 @@ class Controls:
             if not 0.0 <= self.think_threshold <= 1.0:
                 raise RequestError(f"think_threshold must lie in 0..1, got {self.think_threshold}")
 
-    def branch(self, think_probability: float) -> Branch | None:
-        """The branch that is decided by these controls; None leaves it to the draw."""
-        if self.thinking == "never":
-            return ACTION
-        if self.thinking == "always":
-            return THINKING
-        if self.think_threshold is None:
-            return None
-        return THINKING if think_probability > self.think_threshold else ACTION
+    def second_look(self, think_probability: float) -> bool | None:
+        """Whether these controls decide for a second look; None leaves it to the draw."""
+        if self.thinking != "adaptive":
+            return self.thinking == "always"
+        return None if self.think_threshold is None else think_probability > self.think_threshold
 
 
 @dataclass(frozen=True)
@@ -134,8 +128,9 @@ class Draw:
         index: 0..n-1.
         text: the whole response as written.
         plan, branch, thinking, revised_plan: its parts; None where the format or the branch has none.
-        think_probability: probability of ``Thinking:`` at the branch, at temperature 1, over the two
-            branch words; None where the format has no branch.
+            ``branch`` is the option as the format writes it, ``thinking`` the reflection.
+        think_probability: probability of a second look at the branch, at temperature 1, over its options;
+            None where the format has no branch.
         trajectory: float32 [64, 4] in the ego frame.
         codes: the trajectory codes it was decoded from.
         tokens: tokens per section, forced ones included.
@@ -147,7 +142,7 @@ class Draw:
     index: int
     text: str
     plan: Plan | None
-    branch: Branch | None
+    branch: str | None
     think_probability: float | None
     thinking: str | None
     revised_plan: Plan | None
@@ -157,6 +152,11 @@ class Draw:
     passes: int = 0
     chosen: int = 0
     cut: Cut | None = None
+
+    @property
+    def looked_twice(self) -> bool:
+        """Whether it took the branch that reflects."""
+        return self.thinking is not None or self.revised_plan is not None
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class TextWritten:
 
 @dataclass(frozen=True)
 class SectionFinished:
-    """A draw has finished a section (`plan`, `branch`, `thinking`, `revised_plan`, `trajectory`)."""
+    """A draw has finished a section of its format."""
 
     index: int
     section: str

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import cast
 
 from model.driving.plan import Plan
-from model.engines.engine import Branch, Draw, ModelCard, PlanRequest, RequestError
+from model.engines.engine import Draw, ModelCard, PlanRequest, RequestError
 from model.engines.response import Response
-from model.families.cf_vla.format import ACTION, BRANCH, THINKING
+from model.families.family import Branch, Family
 from model.formats.cursor import CompiledFormat, Cursor
 from model.formats.pieces import FormatError
 from model.formats.text import parse
@@ -17,8 +16,16 @@ from model.network.codec import TrajectoryCodec
 from model.network.vocabulary import Vocabulary
 
 
-def begin(request: PlanRequest, card: ModelCard, formats: Mapping[str, CompiledFormat]) -> Cursor:
+def begin(
+    request: PlanRequest,
+    card: ModelCard,
+    families: Mapping[str, Family],
+    formats: Mapping[str, CompiledFormat],
+) -> Cursor:
     """The cursor at which the response to a request begins.
+
+    Args:
+        families, formats: of the checkpoint, by name.
 
     Raises:
         RequestError: it can never be served: an unknown format, a missing camera, or a prefill that the
@@ -27,8 +34,11 @@ def begin(request: PlanRequest, card: ModelCard, formats: Mapping[str, CompiledF
     if request.format not in formats:
         known = ", ".join(formats)
         raise RequestError(f"unknown format {request.format!r}; this checkpoint writes {known}")
+    family = families[request.format]
+    if request.controls.prefill is not None and family.first_plan is None:
+        raise RequestError(f"prefill: responses in format {request.format!r} have no plan to be given")
     try:
-        start = formats[request.format].start(_given(request))
+        start = formats[request.format].start(given_plans(request, family))
     except FormatError as error:
         raise RequestError(f"prefill: {error}") from error
     cameras = {clip.camera for clip in request.scene.clips}
@@ -37,19 +47,20 @@ def begin(request: PlanRequest, card: ModelCard, formats: Mapping[str, CompiledF
     return start
 
 
-def _given(request: PlanRequest) -> dict[str, Plan]:
+def given_plans(request: PlanRequest, family: Family) -> dict[str, Plan]:
     """The plans that the caller gives, by section."""
     prefill = request.controls.prefill
-    return {} if prefill is None else {"plan": prefill}
+    return {} if prefill is None or family.first_plan is None else {family.first_plan: prefill}
 
 
-def branch_of(cursor: Cursor, token: int) -> Branch:
-    """At the branch: where ``token`` leads."""
-    return THINKING if THINKING in cursor.option_texts(token) else ACTION
+def leads_to_reflection(branch: Branch, cursor: Cursor, token: int) -> bool:
+    """At the branch: whether ``token`` leads to a second look."""
+    return branch.reflecting in cursor.option_texts(token)
 
 
 def read(
     request: PlanRequest,
+    family: Family,
     response: Response,
     passes: int,
     draws: Iterable[int],
@@ -62,24 +73,20 @@ def read(
         FormatError: the text is no response of the format.
     """
     text = vocabulary.decode([token.id for token in response.tokens])
-    values = parse(response.cursor.compiled, text, _given(request))
-    codes, branch, thinking = values["trajectory"], values.get(BRANCH), values.get("thinking")
-    assert isinstance(codes, tuple)
-    codes = cast("tuple[int, ...]", codes)
-    plan, revised = values.get("plan"), values.get("revised_plan")
-    trajectory = codec.decode(request.scene.history[None], [codes])[0]
+    values = parse(response.cursor.compiled, text, given_plans(request, family))
+    reading = family.read(values, lambda codes: codec.decode(request.scene.history[None], [codes])[0])
     counts = dict(Counter(token.section for token in response.tokens))
     return [
         Draw(
             index=index,
             text=text,
-            plan=plan if isinstance(plan, Plan) else None,
-            branch=THINKING if branch == THINKING else ACTION if branch == ACTION else None,
+            plan=reading.plan,
+            branch=reading.branch,
             think_probability=response.think_probability,
-            thinking=thinking if isinstance(thinking, str) else None,
-            revised_plan=revised if isinstance(revised, Plan) else None,
-            trajectory=trajectory,
-            codes=codes,
+            thinking=reading.reflection,
+            revised_plan=reading.revised_plan,
+            trajectory=reading.trajectory,
+            codes=reading.codes,
             tokens=counts,
             passes=passes,
             chosen=response.chosen,

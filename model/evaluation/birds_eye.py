@@ -130,7 +130,7 @@ def _draw_agent(axes: Axes, agent: Agent) -> None:
 
 
 def _draw_trajectory(axes: Axes, draw: Draw, *, bold: bool) -> None:
-    colour = REFLECTED_COLOUR if draw.branch == "Thinking:" else DIRECT_COLOUR
+    colour = REFLECTED_COLOUR if draw.looked_twice else DIRECT_COLOUR
     points = _up(_from_origin(draw.trajectory))
     axes.plot(
         *points.T,
@@ -188,9 +188,9 @@ def _draw_scale(axes: Axes, left: float, right: float, low: float, high: float) 
 
 def _draw_legend(axes: Axes, scene: Scene, labelled: LabelledScene | None, draws: Sequence[Draw]) -> None:
     handles = []
-    if any(draw.branch != "Thinking:" for draw in draws):
+    if any(not draw.looked_twice for draw in draws):
         handles.append(Line2D([], [], color=DIRECT_COLOUR, linewidth=2, label="direct"))
-    if any(draw.branch == "Thinking:" for draw in draws):
+    if any(draw.looked_twice for draw in draws):
         handles.append(Line2D([], [], color=REFLECTED_COLOUR, linewidth=2, label="second look"))
     if labelled is not None:
         handles.append(Line2D([], [], color=EXPERT_COLOUR, linewidth=5, alpha=0.55, label="expert"))

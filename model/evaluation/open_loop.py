@@ -180,7 +180,7 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw], greedy: Draw 
         trajectory_iou(draw.revised_plan or draw.plan, draw.trajectory, labelled.scene.history)
         for draw in draws
     ]
-    branches = [draw.branch for draw in draws if draw.branch is not None]
+    branching = [draw for draw in draws if draw.branch is not None]
     change, seen, unknown = _words(labelled, draws)
     return replace(
         evaluate_trajectories(labelled, np.stack([draw.trajectory for draw in draws])),
@@ -195,7 +195,7 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw], greedy: Draw 
         plan_iou_best=max(first, default=None),
         plan_iou_revised=_mean(last),
         output_tokens=_mean([float(sum(draw.tokens.values())) for draw in draws]),
-        think_rate=_mean([float(branch == "Thinking:") for branch in branches]),
+        think_rate=_mean([float(draw.looked_twice) for draw in branching]),
         thought_iou_first=_mean([first for first, _ in thought]),
         thought_iou_revised=_mean([revised for _, revised in thought]),
     )

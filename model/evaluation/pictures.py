@@ -96,7 +96,7 @@ def _draw_title(
     headline, colour = "Planned without a plan in words", DIRECT_COLOUR
     if chosen is None:
         headline, colour = "Nothing planned yet", _GREY
-    elif chosen.branch == "Thinking:":
+    elif chosen.looked_twice:
         headline, colour = "Looked twice", REFLECTED_COLOUR
     elif chosen.branch is not None:
         headline = "Acted directly"

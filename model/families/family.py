@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
-from model.formats.pieces import Format, choices
+from model.driving.phrases import ReflectionLanguage
+from model.driving.plan import Plan
+from model.driving.trajectory import FloatArray
+from model.formats.pieces import Format, Values, choices
 
 
 class FamilyError(ValueError):
@@ -17,7 +21,7 @@ class Branch:
     """The choice at which a response gives its trajectory or reflects first; controls may decide it.
 
     Attributes:
-        name: of the choice.
+        name: of the choice, and of the section that it is in.
         direct: the option that leads to the trajectory at once: under a deadline, the draft.
         reflecting: the option that takes a second look.
     """
@@ -25,6 +29,31 @@ class Branch:
     name: str
     direct: str
     reflecting: str
+
+
+Decode = Callable[[Sequence[int]], FloatArray]
+"""Makes a trajectory float32 [64, 4] of codes, with the checkpoint's codec and the scene's history."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What a response says. What it does not say is None.
+
+    Attributes:
+        trajectory: float32 [64, 4] in the ego frame.
+        codes: the trajectory codes that it was decoded from, if any.
+        plan: the first one, or the one that the caller gave.
+        branch: the option that was taken.
+        reflection: what is wrong with the first plan, in words.
+        revised_plan: what takes its place.
+    """
+
+    trajectory: FloatArray
+    codes: tuple[int, ...] = ()
+    plan: Plan | None = None
+    branch: str | None = None
+    reflection: str | None = None
+    revised_plan: Plan | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +64,9 @@ class Family:
         format: of its responses; requests and checkpoints name the family by the format's name.
         task: what its prompt asks for.
         trajectory: the section that holds the trajectory.
+        read: what the values of a response say.
         first_plan: the section of the plan that it writes first, and that callers may give.
-        branch: where it may take a second look.
+        branch: where it may take a second look, which is a reflection, a revised plan, or both.
         reflection: the section where it says what is wrong with its first plan.
         revised_plan: the section of the plan that takes the first one's place.
         dialects: other formats of the same name, for checkpoints whose reflections are written otherwise.
@@ -48,6 +78,7 @@ class Family:
     format: Format
     task: str
     trajectory: str
+    read: Callable[[Values, Decode], Reading]
     first_plan: str | None = None
     branch: Branch | None = None
     reflection: str | None = None
@@ -55,17 +86,27 @@ class Family:
     dialects: Mapping[ReflectionLanguage, Format] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        declared = (self.trajectory, self.first_plan, self.reflection, self.revised_plan)
+        declared = (
+            *(self.trajectory, self.first_plan, self.reflection, self.revised_plan),
+            None if self.branch is None else self.branch.name,
+        )
         lacking = {section for section in declared if section is not None} - set(self.format.sections())
         if lacking:
             raise FamilyError(f"family {self.name!r}: its format has no section {min(lacking)!r}")
         if self.branch is not None:
+            if self.reflection is None and self.revised_plan is None:
+                raise FamilyError(f"family {self.name!r}: a second look writes a reflection or a plan")
             _check_branch(self.name, self.format, self.branch)
 
     @property
     def name(self) -> str:
         """As requests give it."""
         return self.format.name
+
+    @cached_property
+    def plans(self) -> tuple[str, ...]:
+        """The sections of plans, the one that counts first where several are written."""
+        return tuple(each for each in (self.revised_plan, self.first_plan) if each is not None)
 
     def in_dialect(self, reflection: ReflectionLanguage) -> Family:
         """The family of a checkpoint whose reflections are so written."""

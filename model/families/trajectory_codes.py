@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, cast
 
-from model.formats.pieces import Codes, Literal, Sequence
+from model.formats.pieces import Codes, Literal, Sequence, Value
 
 TRAJECTORY: Final = "trajectory"
 """The alphabet of trajectory codes: one codebook for each of its `CODES` stages."""
@@ -15,3 +15,9 @@ TRAJECTORY_CODES: Final = Sequence(
     (Literal("\n<|traj_future_start|>"), Codes(TRAJECTORY, CODES), Literal("<|traj_future_end|><|im_end|>"))
 )
 """The codes between their begin and end tokens, and the end of the message."""
+
+
+def codes_in(value: Value) -> tuple[int, ...]:
+    """The codes that are the value of `TRAJECTORY_CODES`."""
+    assert isinstance(value, tuple)
+    return cast("tuple[int, ...]", value)

@@ -119,12 +119,8 @@ def followed_table(
 def _asked(labelled: LabelledScene, never: Sequence[Draw], adaptive: Sequence[Draw]) -> Asked:
     """The trajectories of all first plans, then those of the second looks."""
     trajectories: list[FloatArray] = [draw.trajectory for draw in never]
-    trajectories += [draw.trajectory for draw in adaptive if _looked(draw)]
+    trajectories += [draw.trajectory for draw in adaptive if draw.looked_twice]
     return Moment.of(labelled), trajectories
-
-
-def _looked(draw: Draw) -> bool:
-    return draw.branch == "Thinking:"
 
 
 def _draws(
@@ -133,11 +129,11 @@ def _draws(
     """Draws with their outcomes; None for those whose runs do not begin with the same plan."""
     looks = iter(found.plans[len(never) :])
     for alone, draw, first in zip(never, adaptive, found.plans[: len(never)], strict=True):
-        last = next(looks) if _looked(draw) else first
+        last = next(looks) if draw.looked_twice else first
         if alone.plan != draw.plan or draw.think_probability is None:
             yield None
         else:
-            yield FollowedDraw(episode_id, draw.think_probability, first, _looked(draw), last)
+            yield FollowedDraw(episode_id, draw.think_probability, first, draw.looked_twice, last)
 
 
 def _episodes(asked: Sequence[Asked]) -> Iterator[list[Asked]]:

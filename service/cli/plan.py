@@ -120,7 +120,7 @@ def _told(scene_id: str, draws: list[Draw], chosen: int) -> list[str]:
     lines = [f"scene {scene_id}"]
     for draw in draws:
         x_m, y_m, *_ = draw.trajectory[-1]
-        branch = "thinks" if draw.thinking is not None else "acts  "
+        branch = "thinks" if draw.looked_twice else "acts  "
         share = "" if draw.think_probability is None else f", think probability {draw.think_probability:.3f}"
         mark = "*" if draw.index == chosen else " "
         lines.append(f"{mark} draw {draw.index} {branch} in 6.4 s at x {x_m:.1f} m, y {y_m:.1f} m{share}")

@@ -10,6 +10,7 @@ from clients import wire
 from clients.wire_values import wire_tracks
 from model.driving import plan, scene, tracks, trajectory
 from model.engines import engine
+from model.families.cf_vla import CF_VLA
 from tests.service.serving import body
 
 
@@ -18,7 +19,8 @@ def test_the_contract_speaks_the_words_of_the_model() -> None:
     assert get_args(wire.Thinking) == get_args(engine.Thinking)
     assert get_args(wire.AgentKind) == scene.AGENT_KINDS
     assert get_args(wire.Light) == scene.LIGHTS
-    assert get_args(wire.Branch) == get_args(engine.Branch)
+    assert CF_VLA.branch is not None
+    assert get_args(wire.Branch) == (CF_VLA.branch.direct, CF_VLA.branch.reflecting)
     assert tuple(wire.Tracks.model_fields) == plan.GROUPS
     asked = wire.Controls()
     assert engine.Controls(**asked.model_dump()) == engine.Controls()

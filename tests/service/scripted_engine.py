@@ -13,7 +13,6 @@ import numpy as np
 from model.driving.plan import GROUPS, Plan, parse_plan
 from model.driving.trajectory import FUTURE_STEPS, STEP_S, FloatArray, present_speed
 from model.engines.engine import (
-    Branch,
     DraftFinished,
     Draw,
     DrawFinished,
@@ -155,7 +154,7 @@ def _draw(request: PlanRequest, index: int) -> Draw:
     )
     first = controls.prefill or KEEP_ON
     followed = SLOW_DOWN if think else first
-    branch: Branch = "Thinking:" if think else "Action:"
+    branch = "Thinking:" if think else "Action:"
     tokens = {"plan": 40, "branch": 1, "trajectory": 8} | (
         {"thinking": 48, "revised_plan": 52} if think else {}
     )

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import Final
 
-from model.engines.requests import branch_of
-from model.families.cf_vla.format import ACTION, BRANCH, THINKING
+from model.engines.requests import leads_to_reflection
+from model.families.family import Branch
 from model.formats.cursor import Cursor
 
 _WEIGHT: Final = 0.1
@@ -71,13 +71,13 @@ class LatencyModel:
         return now_s + self.step_s + _LATE_DEVIATIONS * self.deviation_s > deadline_s
 
 
-def drafts_of(cursor: Cursor, chosen: Choices) -> list[tuple[int, tuple[int, ...]]]:
+def drafts_of(branch: Branch, cursor: Cursor, chosen: Choices) -> list[tuple[int, tuple[int, ...]]]:
     """The drafts to begin where draws choose ``chosen`` at ``cursor``.
 
     Returns:
-        The token of the direct branch with the draws that chose to reflect; nothing away from the branch.
+        The token of the direct option with the draws that chose to reflect; nothing away from the branch.
     """
-    if cursor.allowed().choice != BRANCH:
+    if cursor.allowed().choice != branch.name:
         return []
-    direct = next(int(id) for id in cursor.allowed().ids if branch_of(cursor, int(id)) == ACTION)
-    return [(direct, draws) for token, draws in chosen if branch_of(cursor, token) == THINKING]
+    direct = next(int(id) for id in cursor.allowed().ids if branch.direct in cursor.option_texts(int(id)))
+    return [(direct, draws) for token, draws in chosen if leads_to_reflection(branch, cursor, token)]

@@ -132,9 +132,10 @@ class Decoder:
         if plan_request.request_id in self._scheduler:
             raise RequestError(f"request id {plan_request.request_id} is in use")
         loaded = self._runner.loaded
-        origin = begin(plan_request, loaded.card, self._runner.formats)
+        origin = begin(plan_request, loaded.card, self._runner.families, self._runner.formats)
         arrived_s = self._clock() if submitted_s is None else submitted_s
-        request = Request(plan_request, origin, arrived_s, self._least_error)
+        family = self._runner.families[plan_request.format]
+        request = Request(plan_request, family, origin, arrived_s, self._least_error)
         request.binding = binding or binding_of(plan_request, loaded.codec, loaded.vocabulary)
         request.draws_a_tree = self._scheduler.draws_a_tree(request)
         request.plant(share=self._shortcuts.shared_rows)
@@ -341,7 +342,8 @@ class Decoder:
         time_for = self._latency.time_for(row.request.deadline_s, self._clock())
         chosen = sorted(row.choices(logits, time_for), key=lambda choice: choice[0] != guess)
         self._drafter.observe(row, len(logits), chosen)
-        drafts = drafts_of(row.cursor, chosen) if row.request.makes_drafts else []
+        branch = row.request.family.branch if row.request.makes_drafts else None
+        drafts = [] if branch is None else drafts_of(branch, row.cursor, chosen)
         parts = [
             (row.tree.fork(row, draws, self._memory, draft=draft), token)
             for some, draft in ((chosen[1:], False), (drafts, True))
@@ -356,7 +358,15 @@ class Decoder:
     def _finish(self, row: Row) -> list[Event]:
         """Take a row out that is done, and read its response."""
         request, loaded = row.request, self._runner.loaded
-        draws = read(request.plan_request, row, row.passes, row.draws, loaded.vocabulary, loaded.codec)
+        draws = read(
+            request.plan_request,
+            request.family,
+            row,
+            row.passes,
+            row.draws,
+            loaded.vocabulary,
+            loaded.codec,
+        )
         if row.passes_before_ending:
             self._latency.saw_ending(row.passes - row.passes_before_ending)
         if row.draft:

@@ -42,7 +42,6 @@ track's name."""
 _MAX_CONTEXTS: Final = 50_000
 _MAX_RESPONSES: Final = 256
 """Scenes whose last responses are kept; each takes some 10 kB."""
-_FIRST, _REVISED = "plan", "revised_plan"
 
 
 class Drafter:
@@ -121,10 +120,11 @@ class Drafter:
 
 def _first_plan(row: Row) -> Sequence[int]:
     """Within a revised plan: how the first plan went on from here, while the revised one repeats it."""
-    if row.cursor.section != _REVISED:
+    family = row.request.family
+    if row.cursor.section != family.revised_plan:
         return ()
-    first = [token.id for token in row.tokens if token.section == _FIRST]
-    revised = [token.id for token in row.tokens if token.section == _REVISED]
+    first = [token.id for token in row.tokens if token.section == family.first_plan]
+    revised = [token.id for token in row.tokens if token.section == family.revised_plan]
     return first[len(revised) :] if first[: len(revised)] == revised else ()
 
 

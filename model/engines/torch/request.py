@@ -19,7 +19,7 @@ from model.engines.engine import Controls, Draw, PlanRequest
 from model.engines.least_error import LeastError
 from model.engines.torch.memory import Memory
 from model.engines.torch.rows import Row
-from model.families.cf_vla.format import BRANCH
+from model.families.family import Family
 from model.formats.cursor import Cursor
 
 if TYPE_CHECKING:
@@ -99,6 +99,7 @@ class Request:
 
     Attributes:
         plan_request: what is asked.
+        family: of the response.
         origin: the cursor at which responses begin.
         submitted_s: what its deadline counts from.
         least_error: tells how far apart numbers and codes lie.
@@ -112,6 +113,7 @@ class Request:
     """
 
     plan_request: PlanRequest
+    family: Family
     origin: Cursor
     submitted_s: float
     least_error: LeastError
@@ -142,7 +144,7 @@ class Request:
     @cached_property
     def makes_drafts(self) -> bool:
         """Whether a direct trajectory is made beside every reflection."""
-        reflects = BRANCH in self.origin.compiled.format.sections() and self.controls.thinking != "never"
+        reflects = self.family.branch is not None and self.controls.thinking != "never"
         return self.controls.deadline_ms is not None and reflects
 
     @property

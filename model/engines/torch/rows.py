@@ -11,11 +11,10 @@ import numpy.typing as npt
 
 from model.engines.engine import Event, SectionFinished, TextWritten
 from model.engines.least_error import least_error
-from model.engines.requests import branch_of
+from model.engines.requests import leads_to_reflection
 from model.engines.response import Response, SectionText
 from model.engines.sampling import choose, probabilities, uniforms
 from model.engines.torch.deadlines import TimeFor
-from model.families.cf_vla.format import ACTION, BRANCH, THINKING
 from model.formats.cursor import Allowed
 from model.network.vocabulary import Vocabulary
 
@@ -126,22 +125,25 @@ class Row(Response):
         """Which of the allowed ids the request's controls and its deadline leave."""
         controls = self.request.controls
         everything = np.ones(len(allowed.ids), np.bool_)
-        if allowed.choice != BRANCH:
+        family = self.request.family
+        if family.branch is None or allowed.choice != family.branch.name:
             if self.cursor.stop_id in allowed.ids and self._ends(time_for):
                 self.cut = "shortened"
                 stops: npt.NDArray[np.bool_] = allowed.ids == self.cursor.stop_id
                 return stops
             binding = self.request.binding
-            bound = None if binding is None else binding.leaves(allowed.ids, self.tokens)
+            bound = None if binding is None else binding.leaves(allowed.ids, self.tokens, family.plans)
             return everything if bound is None else bound
-        leads = np.array([branch_of(self.cursor, int(token)) == THINKING for token in allowed.ids])
+        leads = np.array(
+            [leads_to_reflection(family.branch, self.cursor, int(token)) for token in allowed.ids]
+        )
         self.think_probability = float(probabilities(logits)[leads].sum())
-        wanted = controls.branch(self.think_probability)
-        if time_for is TimeFor.END_NOW and wanted != ACTION:
-            self.cut, wanted = "skipped", ACTION
+        wanted = controls.second_look(self.think_probability)
+        if time_for is TimeFor.END_NOW and wanted is not False:
+            self.cut, wanted = "skipped", False
         if wanted is None:
             return everything
-        return leads if wanted == THINKING else ~leads
+        return leads if wanted else ~leads
 
     def _ends(self, time_for: TimeFor) -> bool:
         """Whether a text stops here."""

@@ -23,9 +23,9 @@ from model.engines.engine import (
     TextWritten,
 )
 from model.engines.least_error import Expected, LeastError, least_error
-from model.engines.requests import branch_of, read
+from model.engines.requests import leads_to_reflection, read
 from model.engines.response import Response, SectionText
-from model.families.cf_vla.format import ACTION, BRANCH, THINKING
+from model.families.family import Branch, Family
 from model.formats.cursor import Allowed, Cursor
 from model.network.checkpoint import Parts
 
@@ -75,6 +75,7 @@ class Decoding:
         parts: of the checkpoint that it runs.
         grammar: what may follow a cursor, for vLLM.
         request: what is asked.
+        family: of the response.
         start: where its response begins.
         least_error: tells how far apart numbers and codes lie.
     """
@@ -85,11 +86,13 @@ class Decoding:
         parts: Parts,
         grammar: Callable[[Cursor], str],
         request: PlanRequest,
+        family: Family,
         start: Cursor,
         least_error: LeastError,
     ) -> None:
         self._llm, self._parts, self._grammar = llm, parts, grammar
-        self._request, self._start, self._least_error = request, start, least_error
+        self._request, self._family = request, family
+        self._start, self._least_error = start, least_error
         self._happened: asyncio.Queue[Event | Exception] = asyncio.Queue()
         self._tasks: set[asyncio.Task[None]] = set()
         self._requests = 0
@@ -199,10 +202,10 @@ class Decoding:
 
     def _branch_ids(self, draw: _Walk) -> list[int] | None:
         """The tokens whose probabilities decide the branch, where it is still to come."""
-        compiled = draw.cursor.compiled
-        if draw.think_probability is not None or BRANCH not in compiled.format.sections():
+        branch = self._family.branch
+        if draw.think_probability is not None or branch is None:
             return None
-        return [compiled.literal(word)[0] for word in (ACTION, THINKING)]
+        return [draw.cursor.compiled.literal(word)[0] for word in (branch.direct, branch.reflecting)]
 
     def _walk(
         self,
@@ -219,9 +222,10 @@ class Decoding:
             if expected is not None and not _told(weighed, allowed.ids):
                 break
             draw.passes += 1
-            if allowed.choice == BRANCH and len(allowed.ids) > 1:
+            branch = self._family.branch
+            if branch is not None and allowed.choice == branch.name and len(allowed.ids) > 1:
                 assert weighed is not None
-                wanted = self._decide(draw, token, weighed)
+                wanted = self._decide(branch, draw, token, weighed)
             if expected is not None:
                 assert weighed is not None
                 logits = np.array([weighed[int(id)].logprob for id in allowed.ids])
@@ -242,17 +246,20 @@ class Decoding:
             return True
         return False
 
-    def _decide(self, draw: _Walk, token: int, logprobs: Mapping[int, Any]) -> int:
+    def _decide(self, branch: Branch, draw: _Walk, token: int, logprobs: Mapping[int, Any]) -> int:
         """At the branch: the token that the controls decide for, vLLM's own where they leave it open."""
-        options = {branch_of(draw.cursor, int(id)): int(id) for id in draw.cursor.allowed().ids}
-        action, thinking = (logprobs[options[branch]].logprob for branch in (ACTION, THINKING))
-        draw.think_probability = 1 / (1 + math.exp(min(action - thinking, _FAR)))
-        branch = self._request.controls.branch(draw.think_probability)
-        return token if branch is None else options[branch]
+        options = {
+            leads_to_reflection(branch, draw.cursor, int(id)): int(id) for id in draw.cursor.allowed().ids
+        }
+        direct, reflecting = (logprobs[options[reflects]].logprob for reflects in (False, True))
+        draw.think_probability = 1 / (1 + math.exp(min(direct - reflecting, _FAR)))
+        wanted = self._request.controls.second_look(draw.think_probability)
+        return token if wanted is None else options[wanted]
 
     def _finish(self, draw: _Walk) -> None:
         for finished in read(
             self._request,
+            self._family,
             draw,
             draw.passes,
             [draw.index],

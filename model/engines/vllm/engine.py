@@ -141,12 +141,13 @@ class VllmEngine:
         llm = self.llm
         if request.request_id in self._running:
             raise RequestError(f"request id {request.request_id} is in use")
-        start = begin(request, self._card, self._formats)
+        start = begin(request, self._card, self._families, self._formats)
         if request.controls.deadline_ms is not None:
             raise RequestError("deadline_ms needs the torch engine: vLLM cannot cut a text short and go on")
         if request.controls.bind:
             raise RequestError("bind needs the torch engine: vLLM has no grammar that depends on the plan")
-        decoding = Decoding(llm, self._parts, self._grammar_of, request, start, self._least_error)
+        family = self._families[request.format]
+        decoding = Decoding(llm, self._parts, self._grammar_of, request, family, start, self._least_error)
         self._running[request.request_id] = decoding
         try:
             prompt = await self._pictures.run(lambda: self.prompt(request.scene, request.format))

@@ -3,6 +3,7 @@
 from typing import Final
 
 from model.families.cf_vla import format as its
+from model.families.cf_vla.read import read
 from model.families.family import Branch, Family
 
 CF_VLA: Final = Family(
@@ -14,5 +15,6 @@ CF_VLA: Final = Family(
     reflection=its.REFLECTION,
     revised_plan=its.REVISED_PLAN,
     trajectory=its.TRAJECTORY,
+    read=read,
 )
 """plan, branch { act: trajectory | reflect: reflection, revised plan, trajectory }"""

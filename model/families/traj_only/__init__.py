@@ -3,13 +3,21 @@
 from typing import Final
 
 from model.families.cf_vla.format import ACTION, TRAJECTORY
-from model.families.family import Family
-from model.families.trajectory_codes import TRAJECTORY_CODES
-from model.formats.pieces import Format, Literal, Section, Sequence
+from model.families.family import Decode, Family, Reading
+from model.families.trajectory_codes import TRAJECTORY_CODES, codes_in
+from model.formats.pieces import Format, Literal, Section, Sequence, Values
+
+
+def read(values: Values, decode: Decode) -> Reading:
+    """The trajectory of a response."""
+    codes = codes_in(values[TRAJECTORY])
+    return Reading(decode(codes), codes)
+
 
 TRAJ_ONLY: Final = Family(
     format=Format("traj_only", Section(TRAJECTORY, Sequence((Literal(ACTION), TRAJECTORY_CODES)))),
     task="Give the trajectory.",
     trajectory=TRAJECTORY,
+    read=read,
 )
 """trajectory"""

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 from transformers import DynamicCache
 
+from model.driving.plan import Plan
 from model.engines.binding import binding_of
 from model.engines.engine import Draw, PlanRequest
 from model.engines.least_error import LeastError, least_error
 from model.engines.sampling import choose, probabilities, uniform
-from model.families.cf_vla.format import BRANCH
 from model.families.family import Family
 from model.families.registry import families_of
 from model.formats.cursor import CompiledFormat, Token
@@ -86,7 +86,9 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
         past_key_values=cache,
         use_cache=True,
     ).logits[0, -1]
-    given = {} if controls.prefill is None else {"plan": controls.prefill}
+    given: dict[str, Plan] = {}
+    if controls.prefill is not None and family.first_plan is not None:
+        given[family.first_plan] = controls.prefill
     compiled = CompiledFormat(family.format, loaded.vocabulary)
     cursor = compiled.start(given)
     tokens: list[Token] = []
@@ -100,14 +102,15 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
         left = np.ones(len(allowed.ids), np.bool_)
         if len(allowed.ids) > 1:
             shares[len(tokens)] = probabilities(scores)
-        if allowed.choice == BRANCH and len(allowed.ids) > 1:
-            thinks = np.array(["Thinking:" in cursor.option_texts(int(id)) for id in allowed.ids])
+        if family.branch is not None and allowed.choice == family.branch.name and len(allowed.ids) > 1:
+            reflecting = family.branch.reflecting
+            thinks = np.array([reflecting in cursor.option_texts(int(id)) for id in allowed.ids])
             think_probability = float(probabilities(scores)[thinks].sum())
             if controls.thinking != "adaptive":
                 left = thinks == (controls.thinking == "always")
             elif controls.think_threshold is not None:
                 left = thinks == (think_probability > controls.think_threshold)
-        if binding is not None and (bound := binding.leaves(allowed.ids, tokens)) is not None:
+        if binding is not None and (bound := binding.leaves(allowed.ids, tokens, family.plans)) is not None:
             left = bound
         expected = least.expected(allowed, controls)
         number = np.array([uniform(controls.seed, index, len(tokens))])
@@ -126,17 +129,20 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
             use_cache=True,
         ).logits[0, -1]
     text = loaded.vocabulary.decode([token.id for token in tokens])
-    values: Any = parse(compiled, text, given)
+    history = request.scene.history[None]
+    reading = family.read(
+        parse(compiled, text, given), lambda codes: loaded.codec.decode(history, [codes])[0]
+    )
     draw = Draw(
         index=index,
         text=text,
-        plan=values.get("plan"),
-        branch=values.get(BRANCH),
+        plan=reading.plan,
+        branch=reading.branch,
         think_probability=think_probability,
-        thinking=values.get("thinking"),
-        revised_plan=values.get("revised_plan"),
-        trajectory=loaded.codec.decode(request.scene.history[None], [values["trajectory"]])[0],
-        codes=values["trajectory"],
+        thinking=reading.reflection,
+        revised_plan=reading.revised_plan,
+        trajectory=reading.trajectory,
+        codes=reading.codes,
         tokens=dict(Counter(token.section for token in tokens)),
     )
     return draw, shares

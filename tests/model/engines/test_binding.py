@@ -11,6 +11,7 @@ from model.driving.plan import WORDS, MetaAction, Plan, parse_plan, plan_from_bi
 from model.engines.binding import BOUND_IOU, Binding, first_codes
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.runner import Runner
+from model.families.cf_vla import CF_VLA
 from model.formats.cursor import Token
 from model.network.checkpoint import Loaded
 from tests.checkpoints import noisy_scene
@@ -62,14 +63,14 @@ def test_codes_are_read_with_the_scenes_own_history(exact: Loaded) -> None:
     binding = Binding(history, exact.codec, exact.vocabulary)
     first = np.asarray(exact.vocabulary.code_ids(0))
     written = [Token(token, "plan") for token in exact.vocabulary.encode(str(KEEP))]
-    left = binding.leaves(first, written)
+    left = binding.leaves(first, written, CF_VLA.plans)
     assert left is not None
     ious = [trajectory_iou(KEEP, each, history) or 0.0 for each in exact.codec.first_trajectories(history)]
     assert left.tolist() == [iou >= min(BOUND_IOU, max(ious)) for iou in ious]
     # The plan that counts is the last one.
     best = label_plan(exact.codec.first_trajectories(history)[3], history, None)
     revised = [Token(token, "revised_plan") for token in exact.vocabulary.encode(str(best))]
-    again = binding.leaves(first, [*written, *revised])
+    again = binding.leaves(first, [*written, *revised], CF_VLA.plans)
     assert again is not None
     assert again[3]
 
@@ -77,9 +78,9 @@ def test_codes_are_read_with_the_scenes_own_history(exact: Loaded) -> None:
 def test_other_tokens_are_left_alone(exact: Loaded) -> None:
     binding = Binding(noisy_scene(1).history, exact.codec, exact.vocabulary)
     written = [Token(token, "plan") for token in exact.vocabulary.encode(str(KEEP))]
-    assert binding.leaves(np.asarray(exact.vocabulary.code_ids(1)), written) is None
-    assert binding.leaves(np.array([1, 2, 3]), written) is None
-    assert binding.leaves(np.asarray(exact.vocabulary.code_ids(0)), []) is None
+    assert binding.leaves(np.asarray(exact.vocabulary.code_ids(1)), written, CF_VLA.plans) is None
+    assert binding.leaves(np.array([1, 2, 3]), written, CF_VLA.plans) is None
+    assert binding.leaves(np.asarray(exact.vocabulary.code_ids(0)), [], CF_VLA.plans) is None
 
 
 @pytest.mark.usefixtures("inference")
@@ -101,7 +102,7 @@ def test_a_bound_request_decodes_as_the_reference_does(exact: Loaded) -> None:
     for index in range(3):
         draw = draws["bound", index]
         written = [Token(token, "plan") for token in exact.vocabulary.encode(str(draw.plan))]
-        left = binding.leaves(first, written)
+        left = binding.leaves(first, written, CF_VLA.plans)
         assert left is not None
         assert left[draw.codes[0]]
         assert parse_plan(str(draw.plan)) == draw.plan

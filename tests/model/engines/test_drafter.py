@@ -8,13 +8,13 @@ import pytest
 
 from model.engines.engine import Controls, PlanRequest
 from model.engines.least_error import LeastError
-from model.engines.requests import branch_of
+from model.engines.requests import leads_to_reflection
 from model.engines.sampling import uniform
 from model.engines.torch.drafter import _CONTEXTS, Drafter, _Ngrams, _Responses
 from model.engines.torch.request import Request, Tree
 from model.engines.torch.rows import Row
 from model.families.cf_vla import CF_VLA
-from model.families.cf_vla.format import BRANCH, THINKING
+from model.families.cf_vla.format import BRANCH
 from model.formats.cursor import CompiledFormat
 from model.network.checkpoint import Loaded, load
 from tests.checkpoints import noisy_scene
@@ -32,12 +32,17 @@ def beginning(loaded: Loaded, **controls: Any) -> Row:
     prompt: Any = SimpleNamespace(shown=b"pictures", last_token=0)
     row = Row(
         start,
-        Tree(Request(asked, start, 0.0, LeastError(loaded.codec, loaded.vocabulary)), prompt=prompt),
+        Tree(Request(asked, CF_VLA, start, 0.0, LeastError(loaded.codec, loaded.vocabulary)), prompt=prompt),
         (0,),
     )
     row.start(0)
     row.write((), loaded.vocabulary)
     return row
+
+
+def _reflects(row: Row, token: int) -> bool:
+    assert CF_VLA.branch is not None
+    return leads_to_reflection(CF_VLA.branch, row.cursor, token)
 
 
 def whole(loaded: Loaded) -> Row:
@@ -85,7 +90,7 @@ def test_a_revised_plan_is_fed_as_the_first_went_on_while_it_repeats_it(loaded: 
     while row.cursor.section != "revised_plan":
         ids, stop_id = row.cursor.allowed().ids, row.cursor.stop_id
         if row.cursor.allowed().choice == BRANCH:
-            ids = ids[[branch_of(row.cursor, int(id)) == THINKING for id in ids]]
+            ids = ids[[_reflects(row, int(id)) for id in ids]]
         row.write((int(ids[0]) if stop_id is None or stop_id not in ids else stop_id,), loaded.vocabulary)
     first = [token.id for token in row.tokens if token.section == "plan"]
     already = sum(token.section == "revised_plan" for token in row.tokens)
@@ -119,7 +124,7 @@ def test_texts_are_guessed_though_any_word_may_follow(loaded: Loaded) -> None:
         allowed = row.cursor.allowed()
         token = int(allowed.ids[-1])
         if allowed.choice == BRANCH:
-            token = next(int(id) for id in allowed.ids if branch_of(row.cursor, int(id)) == THINKING)
+            token = next(int(id) for id in allowed.ids if _reflects(row, int(id)))
         row.write((token,), loaded.vocabulary)
     ids = row.cursor.allowed().ids
     assert len(ids) > 64

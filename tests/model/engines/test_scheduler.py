@@ -6,6 +6,7 @@ from model.engines.engine import Controls, PlanRequest
 from model.engines.torch.memory import Memory
 from model.engines.torch.request import Phase, Request
 from model.engines.torch.scheduler import Scheduler
+from model.families.cf_vla import CF_VLA
 from tests.checkpoints import noisy_scene
 
 SCENE = noisy_scene(0)
@@ -21,7 +22,7 @@ class Queue:
     def add(self, name: str, n: int = 2, deadline_ms: int | None = None) -> Request:
         asked = PlanRequest(name, SCENE, "cf_vla", Controls(n=n, deadline_ms=deadline_ms, thinking="never"))
         unused: Any = None  # where responses begin and how numbers are chosen is of no account here
-        request = Request(asked, unused, 0.0, unused, draws_a_tree=2)
+        request = Request(asked, CF_VLA, unused, 0.0, unused, draws_a_tree=2)
         request.__dict__["makes_drafts"] = False
         request.plant(share=True)
         self.scheduler.add(request)

@@ -217,7 +217,7 @@ def test_cancelling_frees_rows_and_spares_others(exact: Loaded) -> None:
     [
         ({"format": "elf_vla"}, "unknown format"),
         ({"n": 9}, "at most 8 draws"),
-        ({"format": "traj_only", "prefill": PLAN}, "has no section 'plan'"),
+        ({"format": "traj_only", "prefill": PLAN}, "'traj_only' have no plan to be given"),
     ],
 )
 def test_impossible_requests_are_refused(exact: Loaded, change: dict[str, object], message: str) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 from model.driving.plan import Plan
 from model.driving.trajectory import FloatArray, constant_velocity
 from model.engines.engine import (
-    Branch,
     Draw,
     DrawFinished,
     EngineError,
@@ -30,7 +29,7 @@ def draw_of(
     tokens: int = 20,
 ) -> Draw:
     """A draw; it has reflected when it has a revised plan."""
-    branch: Branch | None = None if plan is None else ("Action:" if revised is None else "Thinking:")
+    branch = None if plan is None else ("Action:" if revised is None else "Thinking:")
     return Draw(
         index=index,
         text="",

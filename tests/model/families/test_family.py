@@ -13,13 +13,15 @@ from model.formats.pieces import Choice, Format, Literal, Option, Section, Seque
 
 def branching(*texts: str, times: int = 1) -> Format:
     choice = Choice(tuple(map(Option, texts)), name="way")
-    return Format("made up", Section("end", Sequence((choice,) * times + (Literal("!"),))))
+    return Format("made up", Section("way", Sequence((choice,) * times + (Literal("!"),))))
 
 
 def test_the_branch_is_a_choice_of_the_format() -> None:
     way = Branch("way", direct="go", reflecting="stop")
-    family = replace(TRAJ_ONLY, format=branching("go", "stop", "wait"), trajectory="end", branch=way)
-    assert family.branch == way
+    changed = replace(TRAJ_ONLY, format=branching("go", "stop", "wait"), trajectory="way")
+    assert replace(changed, branch=way, reflection="way").branch == way
+    with pytest.raises(FamilyError, match="a second look writes a reflection or a plan"):
+        replace(changed, branch=way)
 
 
 @pytest.mark.parametrize(
@@ -27,7 +29,7 @@ def test_the_branch_is_a_choice_of_the_format() -> None:
     [
         ({"first_plan": "verse"}, "family 'traj_only': its format has no section 'verse'"),
         ({"trajectory": "verse"}, "has no section 'verse'"),
-        ({"branch": CF_VLA.branch}, "its format has 0 choices 'branch', not one"),
+        ({"branch": CF_VLA.branch}, "its format has no section 'branch'"),
         ({"format": branching("go", "stop", times=2)}, "has 2 choices 'way', not one"),
         ({"format": branching("go", "halt")}, "choice 'way' has no option 'stop'"),
         # Controls decide with one token: those who plan and those who stop must differ in their first.
@@ -36,6 +38,7 @@ def test_the_branch_is_a_choice_of_the_format() -> None:
 )
 def test_a_family_fits_its_format(changes: dict[str, Any], message: str) -> None:
     if "format" in changes:
-        changes |= {"trajectory": "end", "branch": Branch("way", direct="go", reflecting="stop")}
+        way = Branch("way", direct="go", reflecting="stop")
+        changes = {"trajectory": "way", "branch": way, "reflection": "way"} | changes
     with pytest.raises(FamilyError, match=message):
         replace(TRAJ_ONLY, **changes)

@@ -13,10 +13,15 @@ from model.families.registry import GROUP, families_of, family_named
 from model.families.traj_only import TRAJ_ONLY
 
 MODULE = """
-from model.families.family import Family
+from model.families.family import Family, Reading
 from model.formats.pieces import Format, Literal, Section
 
-POEM = Family(Format("poem", Section("verse", Literal("Roses are red"))), "Write a poem.", trajectory="verse")
+POEM = Family(
+    Format("poem", Section("verse", Literal("Roses are red"))),
+    "Write a poem.",
+    trajectory="verse",
+    read=lambda values, decode: Reading(decode([0] * 6)),
+)
 """
 
 
