@@ -56,6 +56,28 @@ class Reading:
     revised_plan: Plan | None = None
 
 
+@dataclass(frozen=True)
+class Reflection:
+    """A counterfactual example's own parts: a plan of the model's own, and why it is to be corrected.
+
+    ``thinking`` is empty where it is not: such a plan is acted on. ``revised_plan`` is what the reasoning
+    leads to, where that is not the expert's plan in all tracks.
+    """
+
+    first_plan: Plan
+    thinking: str
+    revised_plan: Plan | None = None
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What a labelled scene has to teach: the expert's plan and trajectory codes, perhaps a reflection."""
+
+    plan: Plan
+    codes: tuple[int, ...]
+    reflection: Reflection | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Family:
     """A model family. Sections that it does not write are None.
@@ -69,6 +91,7 @@ class Family:
         branch: where it may take a second look, which is a reflection, a revised plan, or both.
         reflection: the section where it says what is wrong with its first plan.
         revised_plan: the section of the plan that takes the first one's place.
+        teach: the values of the response that a labelled scene teaches; None where nothing is trained.
         dialects: other formats of the same name, for checkpoints whose reflections are written otherwise.
 
     Raises:
@@ -83,6 +106,7 @@ class Family:
     branch: Branch | None = None
     reflection: str | None = None
     revised_plan: str | None = None
+    teach: Callable[[Lesson], Values] | None = None
     dialects: Mapping[ReflectionLanguage, Format] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

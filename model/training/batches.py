@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
+from model.driving.plan import Plan
 from model.driving.trajectory import HISTORY_STEPS, STEP_S, present_speed
+from model.families.family import Reflection
 from model.families.registry import families_of
 from model.families.trajectory_codes import CODES
 from model.formats.cursor import CompiledFormat
@@ -24,7 +26,7 @@ from model.network.track_features import MIRRORED, without_route
 from model.network.vocabulary import Vocabulary
 from model.training.examples import Examples, example_frames
 from model.training.soft_codes import SoftCodes
-from model.training.targets import Reflection, SectionWeights, Target, Task, make_target
+from model.training.targets import SectionWeights, Target, make_target
 from model.training.vision_cache import VisionCache
 
 Batch = dict[str, Tensor]
@@ -54,7 +56,7 @@ class Item:
     """
 
     index: int
-    task: Task
+    task: str
     route: bool
     reflections: tuple[int, ...] = ()
     tracks: bool = False
@@ -123,13 +125,15 @@ class ResponseDataset(Dataset[Sample]):
         self._soft = SoftCodes(codec, codec.vectors(examples.history, examples.future))
         self._random = np.random.default_rng(seed)
         self._weights, self._pictures, self._vocabulary = weights, pictures, vocabulary
-        families = families_of(inputs.settings.formats, inputs.settings.reflection)
-        self._formats = {name: CompiledFormat(each.format, vocabulary) for name, each in families.items()}
+        self._families = families_of(inputs.settings.formats, inputs.settings.reflection)
+        self._formats = {
+            name: CompiledFormat(family.format, vocabulary) for name, family in self._families.items()
+        }
         for reflection in reflections:
             # Before hours of training: the format must be able to say it.
             no_codes = [0] * CODES
             plan = reflection.revised_plan or reflection.first_plan
-            make_target(self._formats["cf_vla"], plan, no_codes, weights, reflection)
+            self._target("cf_vla", plan, no_codes, reflection)
 
     def __len__(self) -> int:
         return len(self._examples)
@@ -153,7 +157,7 @@ class ResponseDataset(Dataset[Sample]):
         return Sample(
             prompt=self._prompt(item),
             responses=[
-                make_target(self._formats[item.task], plan, drawn.codes.tolist(), self._weights, reflection)
+                self._target(item.task, plan, drawn.codes.tolist(), reflection)
                 for drawn, reflection in zip(soft, reflections, strict=True)
             ],
             seen=self._vision.tokens(index, item.mirror) if self._vision is not None else None,
@@ -165,6 +169,10 @@ class ResponseDataset(Dataset[Sample]):
             code_shares=np.stack([drawn.shares for drawn in soft]),
             code_errors_m=np.stack([drawn.errors_m for drawn in soft]),
         )
+
+    def _target(self, task: str, plan: Plan, codes: Sequence[int], reflection: Reflection | None) -> Target:
+        family, compiled = self._families[task], self._formats[task]
+        return make_target(family, compiled, plan, codes, self._weights, reflection)
 
     def _prompt(self, item: Item) -> list[int]:
         if self._pictures:
@@ -210,7 +218,7 @@ class TaskSampler(BatchSampler):
         self,
         has_route: npt.NDArray[np.bool_],
         batch_size: int,
-        tasks: Mapping[Task, float],
+        tasks: Mapping[str, float],
         route_share: float,
         seed: int,
         processes: int = 1,
@@ -302,7 +310,7 @@ class TaskSampler(BatchSampler):
     def _rounds(self, items: list[Item], size: int) -> tuple[list[list[list[Item]]], list[list[Item]]]:
         """Batches of like items, as many in a round as there are processes; and batches of the rest."""
         rounds: list[list[list[Item]]] = []
-        buckets: dict[tuple[Task, bool, bool, int], list[Item]] = {}
+        buckets: dict[tuple[str, bool, bool, int], list[Item]] = {}
         for item in items:
             key = (item.task, item.route, item.tracks, len(item.reflections))
             bucket = buckets.setdefault(key, [])

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Final, Literal
 
-from model.training.targets import PAPER_WEIGHTS, SectionWeights, Task
+from model.families.cf_vla.targets import NANO_WEIGHTS, PAPER_WEIGHTS
+from model.training.targets import SectionWeights
 
 Goal = Literal["ground", "read", "respond"]
 
@@ -48,7 +48,7 @@ class Recipe:
     learning_rate: float
     warmup_steps: int
     pictures: bool = True
-    tasks: Mapping[Task, float] = field(default_factory=dict)
+    tasks: Mapping[str, float] = field(default_factory=dict)
     route_share: float = 0.5
     weights: SectionWeights = field(default_factory=lambda: PAPER_WEIGHTS)
     vision_rate: float = 1.0
@@ -59,13 +59,6 @@ class Recipe:
     head_weight: float = 0.0
     reflections: Literal["learned", "scenes"] | None = None
     seed: int = 0
-
-
-NANO_WEIGHTS: Final[SectionWeights] = MappingProxyType(
-    {"plan": 3.0, "branch": 3.0, "thinking": 3.0, "revised_plan": 3.0, "trajectory": 10.0}
-)
-"""A model from scratch learns trajectories too, which the paper's brings along. The tenths of a plan's times
-are next to unknowable: with the paper's weights their noise drowns what codes teach."""
 
 
 def _with_control(*recipes: Recipe) -> tuple[Recipe, ...]:

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from model.driving.phrases import facts_of
 from model.driving.reflection_store import LabelledReflection
+from model.families.family import Reflection
 from model.training.examples import Examples
-from model.training.targets import Reflection
 
 _PLAIN: Final = str.maketrans(
     {

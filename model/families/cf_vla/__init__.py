@@ -4,6 +4,7 @@ from typing import Final
 
 from model.families.cf_vla import format as its
 from model.families.cf_vla.read import read
+from model.families.cf_vla.targets import teach
 from model.families.family import Branch, Family
 
 CF_VLA: Final = Family(
@@ -14,6 +15,7 @@ CF_VLA: Final = Family(
     branch=Branch(its.BRANCH, direct=its.ACTION, reflecting=its.THINKING),
     reflection=its.REFLECTION,
     revised_plan=its.REVISED_PLAN,
+    teach=teach,
     trajectory=its.TRAJECTORY,
     read=read,
 )

@@ -3,7 +3,7 @@
 from typing import Final
 
 from model.families.cf_vla.format import ACTION, TRAJECTORY
-from model.families.family import Decode, Family, Reading
+from model.families.family import Decode, Family, Lesson, Reading
 from model.families.trajectory_codes import TRAJECTORY_CODES, codes_in
 from model.formats.pieces import Format, Literal, Section, Sequence, Values
 
@@ -14,10 +14,16 @@ def read(values: Values, decode: Decode) -> Reading:
     return Reading(decode(codes), codes)
 
 
+def teach(lesson: Lesson) -> Values:
+    """The expert's trajectory."""
+    return Values.of({TRAJECTORY: lesson.codes})
+
+
 TRAJ_ONLY: Final = Family(
     format=Format("traj_only", Section(TRAJECTORY, Sequence((Literal(ACTION), TRAJECTORY_CODES)))),
     task="Give the trajectory.",
     trajectory=TRAJECTORY,
     read=read,
+    teach=teach,
 )
 """trajectory"""

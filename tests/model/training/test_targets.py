@@ -1,16 +1,20 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from model.driving.phrases import Statement, Thing
 from model.driving.plan import Plan, parse_plan
 from model.families.cf_vla import CF_VLA
 from model.families.cf_vla.format import PHRASES
+from model.families.cf_vla.targets import PAPER_WEIGHTS
+from model.families.family import Reflection
 from model.families.traj_only import TRAJ_ONLY
 from model.formats.cursor import CompiledFormat
-from model.formats.pieces import Format, FormatError, Values
+from model.formats.pieces import FormatError, Values
 from model.formats.text import parse
-from model.training.targets import PAPER_WEIGHTS, Reflection, make_target
+from model.training.targets import make_target
 from tests.model.formats.vocabulary import ByteVocabulary
 
 VOCABULARY = ByteVocabulary()
@@ -21,7 +25,7 @@ WRONG = parse_plan("- longitudinal\n  - 0.0s-6.4s: Accelerate\n")
 
 def test_a_direct_target_says_plan_and_codes_with_the_papers_weights() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
-    target = make_target(compiled, PLAN, CODES)
+    target = make_target(CF_VLA, compiled, PLAN, CODES, PAPER_WEIGHTS)
     values = parse(compiled, VOCABULARY.decode(target.ids), {"plan": PLAN})
     assert values == Values.of({"plan": PLAN, "branch": "Action:", "trajectory": CODES})
     tokens = compiled.render(values, {"plan": PLAN})
@@ -30,20 +34,20 @@ def test_a_direct_target_says_plan_and_codes_with_the_papers_weights() -> None:
 
 def test_traj_only_has_no_plan() -> None:
     compiled = CompiledFormat(TRAJ_ONLY.format, VOCABULARY)
-    target = make_target(compiled, PLAN, CODES)
+    target = make_target(TRAJ_ONLY, compiled, PLAN, CODES, PAPER_WEIGHTS)
     assert parse(compiled, VOCABULARY.decode(target.ids)) == Values.of({"trajectory": CODES})
 
 
-def test_a_format_without_targets_is_refused() -> None:
-    unknown = CompiledFormat(Format("unknown", CF_VLA.body), VOCABULARY)
-    with pytest.raises(ValueError, match="no targets for format 'unknown'"):
-        make_target(unknown, PLAN, CODES)
+def test_a_family_that_teaches_nothing_is_refused() -> None:
+    family, compiled = replace(CF_VLA, teach=None), CompiledFormat(CF_VLA.format, VOCABULARY)
+    with pytest.raises(ValueError, match="no targets for format 'cf_vla'"):
+        make_target(family, compiled, PLAN, CODES, PAPER_WEIGHTS)
 
 
 def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
     reflection = Reflection(WRONG, "The car ahead stands still.")
-    target = make_target(compiled, PLAN, CODES, PAPER_WEIGHTS, reflection)
+    target = make_target(CF_VLA, compiled, PLAN, CODES, PAPER_WEIGHTS, reflection)
     plans = {"plan": WRONG, "revised_plan": PLAN}
     values = parse(compiled, VOCABULARY.decode(target.ids), plans)
     assert (values["plan"], values["revised_plan"]) == (WRONG, PLAN)
@@ -63,7 +67,7 @@ def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
 
 def test_a_right_plan_of_its_own_is_acted_on_and_not_taught() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
-    target = make_target(compiled, PLAN, CODES, PAPER_WEIGHTS, Reflection(WRONG, ""))
+    target = make_target(CF_VLA, compiled, PLAN, CODES, PAPER_WEIGHTS, Reflection(WRONG, ""))
     values = parse(compiled, VOCABULARY.decode(target.ids), {"plan": WRONG})
     assert values == Values.of({"plan": WRONG, "branch": "Action:", "trajectory": CODES})
     taught = [id for id, weight in zip(target.ids, target.weights, strict=True) if weight > 0]
@@ -75,7 +79,7 @@ def test_a_reflection_in_phrases_leads_to_its_own_plan() -> None:
     first, slower = three_tracks("Keep Speed", "Keep Lane"), three_tracks("Wait", "Keep Lane")
     text = str(Statement(Thing("barrier", "my lane", 20), "too close", "slower"))
     expert = three_tracks("Wait", "Left Lane Change")
-    target = make_target(compiled, expert, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
+    target = make_target(CF_VLA, compiled, expert, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
     values = parse(compiled, VOCABULARY.decode(target.ids))
     assert (values["thinking"], values["revised_plan"]) == (text, slower)
     # The expert goes to the left, of which nothing is stated: its trajectory is not what was planned.
@@ -84,7 +88,7 @@ def test_a_reflection_in_phrases_leads_to_its_own_plan() -> None:
         token.section: weight for token, weight in zip(tokens, target.weights, strict=True) if weight != 10
     }
     assert weights == {"plan": 0.0, "trajectory": 0.0}
-    same = make_target(compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
+    same = make_target(CF_VLA, compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
     assert same.ids == target.ids
     assert set(same.weights) == {0.0, 1.0, 10.0}
 
@@ -94,9 +98,11 @@ def test_a_plan_that_phrases_do_not_lead_to_is_refused() -> None:
     first, slower = three_tracks("Keep Speed", "Keep Lane"), three_tracks("Wait", "Left Lane Change")
     text = str(Statement(Thing("barrier", "my lane", 20), "too close", "slower"))
     with pytest.raises(FormatError, match="changes otherwise"):
-        make_target(compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
+        make_target(CF_VLA, compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
     with pytest.raises(FormatError, match="no reflection in phrases"):
-        make_target(compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, "I should slow down.", slower))
+        make_target(
+            CF_VLA, compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, "I should slow down.", slower)
+        )
 
 
 def three_tracks(longitudinal: str, lane: str) -> Plan:
@@ -106,4 +112,4 @@ def three_tracks(longitudinal: str, lane: str) -> Plan:
 
 def test_every_section_needs_a_weight() -> None:
     with pytest.raises(KeyError):
-        make_target(CompiledFormat(CF_VLA.format, VOCABULARY), PLAN, CODES, {"plan": 1.0})
+        make_target(CF_VLA, CompiledFormat(CF_VLA.format, VOCABULARY), PLAN, CODES, {"plan": 1.0})

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from model.families.cf_vla.targets import PAPER_WEIGHTS
 from model.network.checkpoint import Loaded, load
 from model.network.patches import patchify
 from model.training.batches import Item, ResponseDataset, collate
 from model.training.examples import Examples, example_frames
 from model.training.learner import ResponseLearner
-from model.training.targets import PAPER_WEIGHTS
 from model.training.vision_cache import VisionCache, open_vision
 from tests.model.training.scenes import training_scene
 
