@@ -11,6 +11,7 @@ from fastapi import APIRouter, Request
 from starlette.responses import JSONResponse
 
 import clients.wire as wire
+from service.answers import wire_branch
 from service.callers import while_connected
 from service.errors import validated
 from service.openai_chat import (
@@ -107,7 +108,7 @@ def _text(name: str, data: Written) -> str | None:
     match data:
         case wire.PlanWritten():
             return f"\n{data.plan.text}" if name == "revised_plan" else data.plan.text
-        case wire.BranchTaken(branch="Thinking:"):
+        case wire.BranchTaken() if data.branch == wire_branch(looked_twice=True):
             return THINKING
         case wire.ThinkingWritten():
             return data.text

@@ -12,6 +12,7 @@ from typing import Final
 
 from model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, track_from_words
 from model.driving.scene import CAMERAS
+from model.families.cf_vla.format import ACTION, PLAN_START, THINKING
 from model.families.registry import family_named
 from model.network.prompts import SYSTEM, prompt_text
 from model.network.settings import LEAST_SCENE_TOKENS, VlaSettings
@@ -182,10 +183,9 @@ across along around through within about per hour kilometers ahead, vehicle. lan
 """
 
 _FORMATS: Final = ("cf_vla", "traj_only")
-_PLAN_START: Final = "Meta Actions:\n"
 _KINDS: Final = ("vehicle", "pedestrian", "traffic cone", "barrier")
-_PHRASES: Final = tuple(
-    """
+_PHRASES: Final = (
+    *"""
  is in my lane
  is in the left lane
  is in the right lane
@@ -223,9 +223,9 @@ There is room in the right lane
 , so I should move to the left lane
 , so I should move to the right lane
 s:
-Action:
-Thinking:
-""".strip("\n").splitlines()
+""".strip("\n").splitlines(),
+    ACTION,
+    THINKING,
 )
 """Phrases of reflections: what is seen and where, what would come of it, what is better."""
 
@@ -268,9 +268,9 @@ def response_texts(count: int = 300, seed: int = 0) -> Iterator[str]:
     random_ = random.Random(seed)
     plans = random_plans(2 * count, seed)
     for first, second in zip(plans, plans, strict=True):
-        yield f"Meta Actions:\n{first}Action:\n"
+        yield f"{PLAN_START}{first}{ACTION}\n"
         thinking = " ".join(random_.sample(sentences, 3))
-        yield f"Meta Actions:\n{first}Thinking:\n{thinking}\nMeta Actions:\n{second}Action:\n"
+        yield f"{PLAN_START}{first}{THINKING}\n{thinking}\n{PLAN_START}{second}{ACTION}\n"
 
 
 def nano_phrases() -> tuple[str, ...]:
@@ -283,7 +283,7 @@ def nano_phrases() -> tuple[str, ...]:
     words = [f" {word}" for words in WORDS.values() for word in words]
     groups = [f"- {group}\n" for group in GROUPS]
     tasks = (family_named(name).task for name in _FORMATS)
-    return (SYSTEM, *tasks, _PLAN_START, *groups, *words, *objects, *distances, *_PHRASES)
+    return (SYSTEM, *tasks, PLAN_START, *groups, *words, *objects, *distances, *_PHRASES)
 
 
 def nano_corpus() -> Iterator[str]:

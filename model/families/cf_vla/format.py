@@ -23,20 +23,21 @@ THINKING: Final = "Thinking:"
 MAX_THINKING_TOKENS: Final = 160
 """Teachers write at most 80 words (CF-VLA section 8); two tokens a word leave room to spare."""
 
-_PLAN_START: Final = "Meta Actions:\n"
+PLAN_START: Final = "Meta Actions:\n"
+"""What both plans begin with."""
 
 
 def _cf_vla(thinking: Piece, revised: Piece) -> Format:
     reflection = Sequence(
         (
             Section(REFLECTION, Sequence((Literal("\n"), thinking))),
-            Section(REVISED_PLAN, Sequence((Literal(_PLAN_START), revised))),
+            Section(REVISED_PLAN, Sequence((Literal(PLAN_START), revised))),
             Section(TRAJECTORY, Sequence((Literal(ACTION), TRAJECTORY_CODES))),
         )
     )
     direct = Section(TRAJECTORY, TRAJECTORY_CODES)
     branch = Choice((Option(ACTION, direct), Option(THINKING, reflection)), name=BRANCH)
-    plan = Section(PLAN, Sequence((Literal(_PLAN_START), PlanTracks())))
+    plan = Section(PLAN, Sequence((Literal(PLAN_START), PlanTracks())))
     return Format("cf_vla", Sequence((plan, Section(BRANCH, branch))))
 
 

@@ -1,0 +1,80 @@
+"""Only CF-VLA's own folder names its sections and branch words; everybody else asks the family."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+
+from model.families.cf_vla import CF_VLA
+from tests.test_architecture import ROOT, modules
+
+assert CF_VLA.branch is not None
+SECTIONS = frozenset(CF_VLA.format.sections())
+BRANCH_WORDS = (CF_VLA.branch.direct, CF_VLA.branch.reflecting)
+HOME = "model/families/cf_vla/"
+ROOMS = ("model/", "service/")
+"""Where responses are known: others only know the HTTP contract."""
+
+STILL_NAMED = {
+    "clients/labelling/export.py": 1,
+    "service/cli/plan.py": 1,
+    "service/openai_chat.py": 1,
+}
+"""Files that write CF-VLA's texts themselves, and how often. To be emptied, never to be added to."""
+
+OTHERWISE = {
+    # Fields, events and words of the HTTP contract, which is CF-VLA's for all families.
+    "clients/wire.py": 4,
+    "service/cli/plan.py": 3,
+    "service/errors.py": 1,
+    "service/examples.py": 2,
+    "service/metrics.py": 3,
+    "service/openai_chat.py": 1,
+    "service/openai_routes.py": 2,
+    "service/streaming.py": 5,
+    # Controls and columns of tables.
+    "model/bench/report.py": 3,
+    "model/evaluation/table.py": 1,
+    "service/cli/bench.py": 1,
+    # Commands, routes and kinds of work.
+    "service/cli/commands.py": 1,
+    "service/cli/loadtest.py": 1,
+    "service/planning.py": 1,
+    # Records of draws.
+    "model/driving/trajectory.py": 1,
+    "model/evaluation/kept.py": 9,
+    "model/evaluation/pictures.py": 1,
+    # The alphabet of trajectory codes.
+    "model/families/trajectory_codes.py": 1,
+}
+"""Where the same words mean something else, and how often."""
+
+
+def literals(source: str) -> Iterator[str]:
+    """The texts in a module, those that stand alone (docstrings) apart."""
+    tree = ast.parse(source)
+    alone = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in alone:
+            yield node.value
+
+
+def named(source: str, sections: frozenset[str] = SECTIONS) -> int:
+    """How often a module names one of some sections, or writes a word of the branch."""
+    return sum(text in sections or any(word in text for word in BRANCH_WORDS) for text in literals(source))
+
+
+def test_nobody_else_names_sections_and_branch_words() -> None:
+    counts: dict[str, int] = {}
+    for _, path in modules():
+        place = str(path.relative_to(ROOT))
+        if not place.startswith(HOME):
+            counts[place] = named(path.read_text(), SECTIONS if place.startswith(ROOMS) else frozenset())
+    assert {path: count for path, count in counts.items() if count} == {
+        path: STILL_NAMED.get(path, 0) + OTHERWISE.get(path, 0) for path in {*STILL_NAMED, *OTHERWISE}
+    }
+
+
+def test_literals_are_counted_and_docstrings_are_not() -> None:
+    assert named('"""Thinking: it over."""\nsection = "revised_plan"\nplan = thinking\n') == 1
+    assert named('text = f"Thinking: {it} over"\n') == 1
