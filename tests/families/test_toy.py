@@ -1,0 +1,121 @@
+"""A family that nothing but its folder knows plans over the engine, as the reference writes it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from prometheus_client import CollectorRegistry
+
+import clients.wire as wire
+from model.driving.agreement import agreement
+from model.driving.plan import parse_plan
+from model.engines.engine import Controls, Draw, PlanRequest, SectionFinished, TextWritten
+from model.engines.torch.decoder import Decoder
+from model.engines.torch.runner import Runner
+from model.families.registry import GROUP, family_named
+from model.formats.cursor import CompiledFormat
+from model.formats.text import parse
+from model.network.checkpoint import Loaded, load
+from model.network.settings import VlaSettings
+from model.training.targets import make_target
+from service.metrics import Metrics
+from service.planning import Judged
+from service.planning import Told as Happened
+from service.streaming import told_events
+from tests.checkpoints import noisy_scene, write_untrained
+from tests.families.toy import TOY, drive
+from tests.model.engines.decoding import decode
+from tests.model.engines.reference import exactly, reference_draws
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loaded]:
+    """A checkpoint of the family, which an installed package declares."""
+    installed = tmp_path_factory.mktemp("installed")
+    about = installed / "toy-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: toy\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[{GROUP}]\ntoy = tests.families.toy:TOY\n")
+    with pytest.MonkeyPatch.context() as patch, torch.inference_mode():
+        patch.syspath_prepend(installed)
+        folder = Path(tmp_path_factory.mktemp("toy") / "checkpoint")
+        write_untrained(folder, narrow=True, settings=VlaSettings(name="toy", formats=("toy",)))
+        yield exactly(load(folder, torch.float64))
+    family_named.cache_clear()
+
+
+def planned(toy: Loaded, **controls: object) -> list[Draw]:
+    """What the engine writes, which is what the reference writes."""
+    asked = PlanRequest("a", noisy_scene(1), "toy", Controls(**controls))  # type: ignore[arg-type]
+    with torch.inference_mode():
+        draws = decode(Decoder(Runner(toy, 2 * asked.controls.n), clock=lambda: 0.0), asked)
+        expected = reference_draws(toy, asked)
+    found = [draws["a", index] for index in range(asked.controls.n)]
+    assert [(draw.text, draw.tokens) for draw in found] == [(draw.text, draw.tokens) for draw in expected]
+    return found
+
+
+def test_it_plans_in_its_own_words(toy: Loaded) -> None:
+    draws = planned(toy, n=4, numbers="drawn", seed=3)
+    for draw in draws:
+        assert set(draw.tokens) in ({"mood", "speeds"}, {"mood", "why", "speeds"})
+        speeds = [float(word) for word in draw.text.split(" at ")[-1].split(" m/s")[0].split(" ")]
+        np.testing.assert_array_equal(draw.trajectory, drive(tuple(speeds)))
+        assert (draw.plan, draw.codes) == (None, ())
+
+
+@pytest.mark.parametrize(("thinking", "word"), [("never", "Sure,"), ("always", "Hmm,")])
+def test_controls_decide_at_its_branch(toy: Loaded, thinking: str, word: str) -> None:
+    for draw in planned(toy, n=2, thinking=thinking):
+        assert (draw.branch, draw.looked_twice) == (word, word == "Hmm,")
+        assert draw.thinking is None or draw.thinking in draw.text
+        assert draw.think_probability is not None
+
+
+def test_a_deadline_makes_drafts_of_its_direct_option(toy: Loaded) -> None:
+    asked = PlanRequest("a", noisy_scene(1), "toy", Controls(n=2, thinking="always", deadline_ms=0))
+    late = iter(range(1_000_000))
+    with torch.inference_mode():
+        draws = decode(Decoder(Runner(toy, 4), clock=lambda: float(next(late))), asked)
+    assert {draw.branch for draw in draws.values()} == {"Sure,"}
+    assert {draw.cut for draw in draws.values()} <= {"skipped", "replaced"}
+
+
+def test_it_is_streamed_in_the_words_of_the_wire(toy: Loaded) -> None:
+    [draw] = planned(toy, n=1, thinking="always")
+    happened: list[Happened] = [
+        TextWritten(0, "why", " It"),
+        SectionFinished(0, "why", " It rains.\n"),
+        Judged(draw, agreement(None, "It rains.", None, draw.trajectory, noisy_scene(1).history)),
+    ]
+
+    async def told() -> list[Any]:
+        async def events() -> AsyncGenerator[Happened]:
+            for event in happened:
+                yield event
+
+        first, metrics = SectionFinished(0, "mood", "Hmm,"), Metrics(CollectorRegistry())
+        return [event async for event in told_events(first, events(), "toy", metrics)]
+
+    branch, it, rains, trajectory = asyncio.run(told())
+    assert branch == ("branch", wire.BranchTaken(index=0, branch="Thinking:"))
+    assert [it, rains] == [
+        ("thinking", wire.ThinkingWritten(index=0, text=text)) for text in ("It", " rains.")
+    ]
+    assert trajectory[0] == "trajectory"
+
+
+def test_a_labelled_scene_teaches_it(toy: Loaded) -> None:
+    compiled = CompiledFormat(TOY.format, toy.vocabulary)
+    plan = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
+    target = make_target(TOY, compiled, plan, [0] * 6, {"mood": 2.0, "why": 1.0, "speeds": 5.0})
+    text = toy.vocabulary.decode(target.ids)
+    assert text == "Sure, at 10 5 0 0 m/s<|im_end|>"
+    assert parse(compiled, text)["speeds"] == (10.0, 5.0, 0.0, 0.0)
+    assert set(target.weights) == {2.0, 5.0}
