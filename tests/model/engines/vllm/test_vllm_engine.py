@@ -19,6 +19,7 @@ from model.driving.scene_store import read_scenes
 from model.driving.tracks import Track
 from model.engines.engine import (
     Controls,
+    Decision,
     Draw,
     DrawFinished,
     Engine,
@@ -195,11 +196,13 @@ def test_a_given_plan_is_kept(
     assert draw.text == mine.text
 
 
+@pytest.mark.parametrize(("numbers", "different"), [("least_error", 2), ("drawn", 6)])
 def test_draws_are_valid_and_repeat_with_their_seed(
-    loop: asyncio.AbstractEventLoop, vllm: VllmEngine
+    loop: asyncio.AbstractEventLoop, vllm: VllmEngine, numbers: Decision, different: int
 ) -> None:
     def request(name: str, seed: int) -> PlanRequest:
-        return PlanRequest(name, BUNDLED[2], controls=Controls(n=6, temperature=1.5, seed=seed))
+        controls = Controls(n=6, temperature=1.5, seed=seed, numbers=numbers)
+        return PlanRequest(f"{numbers}-{name}", BUNDLED[2], controls=controls)
 
     async def all_three() -> list[list[Draw]]:
         return [await plan(vllm, request(f"{k}", seed)) for k, seed in enumerate((3, 3, 4))]
@@ -208,7 +211,7 @@ def test_draws_are_valid_and_repeat_with_their_seed(
     assert [draw.index for draw in first] == list(range(6))
     assert [draw.text for draw in first] == [draw.text for draw in again]
     assert [draw.text for draw in first] != [draw.text for draw in other]
-    assert len({draw.text for draw in first}) == 6
+    assert len({draw.text for draw in first}) >= different
     compiled = CompiledFormat(CF_VLA.format, read_parts(CHECKPOINT).vocabulary)
     for draw in first + other:
         assert parse(compiled, draw.text)["trajectory"] == draw.codes
