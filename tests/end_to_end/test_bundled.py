@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from clients import wire
-from clients.planner import Patience, PlannerClient
+from clients.planner import Patience, PlannerClient, PlanResult
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.plan import parse_plan
 from model.driving.scene import split_of_seed
@@ -126,11 +126,13 @@ def test_a_thousand_hot_draws_all_parse() -> None:
 
 
 def test_the_same_seed_gives_the_same_answer(planner: PlannerClient) -> None:
-    first, second = (planner.plan(BUNDLED[0].scene, wire.Controls(n=2, seed=5)) for _ in range(2))
-    for one, other in zip(first.draws, second.draws, strict=True):
-        assert np.array_equal(one.trajectory, other.trajectory)
-    other_seed = planner.plan(BUNDLED[0].scene, wire.Controls(n=2, seed=6))
-    assert not np.array_equal(first.draws[0].trajectory, other_seed.draws[0].trajectory)
+    def planned(seed: int) -> PlanResult:
+        return planner.plan(BUNDLED[0].scene, wire.Controls(n=2, seed=seed, numbers="drawn", codes="drawn"))
+
+    first, second, other = map(planned, (5, 5, 6))
+    for one, again in zip(first.draws, second.draws, strict=True):
+        assert np.array_equal(one.trajectory, again.trajectory)
+    assert not np.array_equal(first.draws[0].trajectory, other.draws[0].trajectory)
 
 
 def test_broken_json_is_a_problem_and_disturbs_nobody(

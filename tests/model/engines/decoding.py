@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 from torch import Tensor
 
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
+from model.engines.least_error import LeastError
 from model.engines.torch.decoder import Decoder, Failed
+from model.engines.torch.request import Request, Tree
+from model.engines.torch.rows import Row
+from model.families.cf_vla import CF_VLA
+from model.formats.cursor import CompiledFormat
+from model.network.checkpoint import Loaded
 from tests.checkpoints import noisy_scene
 
 
@@ -50,3 +58,18 @@ def decode(decoder: Decoder, *requests: PlanRequest) -> Draws:
     draws, failed = decode_some(decoder, *requests)
     assert not failed, failed
     return draws
+
+
+def beginning(loaded: Loaded, **controls: Any) -> Row:
+    """A row in front of its first decision."""
+    start = CompiledFormat(CF_VLA.format, loaded.vocabulary).start()
+    asked = PlanRequest("a", noisy_scene(), "cf_vla", Controls(n=1, **controls))
+    prompt: Any = SimpleNamespace(shown=b"pictures", last_token=0)
+    row = Row(
+        start,
+        Tree(Request(asked, CF_VLA, start, 0.0, LeastError(loaded.codec, loaded.vocabulary)), prompt=prompt),
+        (0,),
+    )
+    row.start(0)
+    row.write((), loaded.vocabulary)
+    return row

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import re
-
+import numpy as np
 import pytest
-import torch
 
-from model.bundled import CHECKPOINT, SCENES
-from model.driving.scene_store import read_scenes
+from model.driving.plan import plan_from_bins
 from model.engines.engine import (
-    Controls,
     DraftFinished,
     Draw,
     DrawFinished,
@@ -18,12 +14,13 @@ from model.engines.engine import (
     SectionFinished,
     Started,
 )
-from model.engines.torch.deadlines import LatencyModel
+from model.engines.torch.deadlines import LatencyModel, TimeFor
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.runner import Runner
-from model.network.checkpoint import Loaded, load
-from tests.model.engines.decoding import decode, request
-from tests.model.engines.reference import exactly, reference_draws
+from model.formats.pieces import Value, Values
+from model.network.checkpoint import Loaded
+from tests.model.engines.decoding import beginning, decode, request
+from tests.model.engines.reference import reference_draws
 
 pytestmark = pytest.mark.usefixtures("inference")
 
@@ -185,20 +182,28 @@ def test_thinking_is_cut_when_the_rest_would_not_fit(exact: Loaded) -> None:
     assert draw.plan == unhurried.plan
 
 
-def test_thinking_ends_at_a_sentence_when_time_gets_short() -> None:
-    trained = exactly(load(CHECKPOINT, dtype=torch.float64))
-    [labelled, *_] = read_scenes(SCENES)
-    controls = Controls(n=1, seed=1, thinking="always", deadline_ms=100_000)
-    asked = PlanRequest("a", labelled.scene, "cf_vla", controls)
-    unhurried = decode(Decoder(Runner(trained, 2), clock=Clock()), asked)["a", 0]
-    draw = at_the_branch(trained, asked, 99.5)  # 50 steps are left and 40 are needed
-    assert draw.cut == "shortened"
-    assert draw.thinking is not None
-    assert unhurried.thinking is not None
-    first, *rest = re.split(r"(?<=[.!?]) ", unhurried.thinking)
-    assert rest, "there is a sentence to leave out"
-    assert draw.thinking == first
-    assert draw.revised_plan is not None
+def test_thinking_ends_at_a_sentence_when_time_gets_short(exact: Loaded) -> None:
+    row = beginning(exact, temperature=0.0)
+    plan = plan_from_bins(np.zeros((3, 64), np.int8))
+    values: dict[str, Value] = {
+        "plan": plan,
+        "branch": "Thinking:",
+        "thinking": "A car stands ahead. I should slow down.",
+        "revised_plan": plan,
+        "trajectory": (0,) * 6,
+    }
+    ends = list[str]()
+    for token in row.cursor.compiled.render(Values.of(values))[len(row.tokens) :]:
+        if token.section == "thinking" and row.cursor.stop_id is not None:
+            allowed = row.cursor.allowed().ids
+            if row.cursor.stop_id in allowed:
+                [(chosen, _)] = row.choices(np.zeros(len(allowed)), TimeFor.END_SENTENCE)
+                if row.cut == "shortened":
+                    assert chosen == row.cursor.stop_id
+                    ends.append(exact.vocabulary.decode([each.id for each in row.tokens[-1:]]))
+                    row.cut = None
+        row.append(token.id, exact.vocabulary)
+    assert [end[-1] for end in ends] == [".", "."]
 
 
 def test_who_is_late_already_makes_nobody_else_late(exact: Loaded) -> None:

@@ -1,43 +1,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
-from model.engines.engine import Controls, PlanRequest
-from model.engines.least_error import LeastError
 from model.engines.requests import leads_to_reflection
 from model.engines.sampling import uniform
 from model.engines.torch.drafter import _CONTEXTS, Drafter, _Ngrams, _Responses
-from model.engines.torch.request import Request, Tree
 from model.engines.torch.rows import Row
 from model.families.cf_vla import CF_VLA
 from model.families.cf_vla.format import BRANCH
-from model.formats.cursor import CompiledFormat
 from model.network.checkpoint import Loaded, load
-from tests.checkpoints import noisy_scene
+from tests.model.engines.decoding import beginning
 
 
 @pytest.fixture(scope="module")
 def loaded(untrained_checkpoint: Path) -> Loaded:
     return load(untrained_checkpoint)
-
-
-def beginning(loaded: Loaded, **controls: Any) -> Row:
-    """A row in front of its first decision."""
-    start = CompiledFormat(CF_VLA.format, loaded.vocabulary).start()
-    asked = PlanRequest("a", noisy_scene(), "cf_vla", Controls(n=1, **controls))
-    prompt: Any = SimpleNamespace(shown=b"pictures", last_token=0)
-    row = Row(
-        start,
-        Tree(Request(asked, CF_VLA, start, 0.0, LeastError(loaded.codec, loaded.vocabulary)), prompt=prompt),
-        (0,),
-    )
-    row.start(0)
-    row.write((), loaded.vocabulary)
-    return row
 
 
 def _reflects(row: Row, token: int) -> bool:

@@ -1,17 +1,15 @@
 from __future__ import annotations
 
-from pathlib import Path
-
+from model.bundled import CHECKPOINT
 from model.driving.phrases import CONSEQUENCES, CORRECTIONS, GOING_ON, HEADS, details
 from model.network.checkpoint import read_parts
 
-LANGUAGE = Path(__file__).parents[3] / "docs" / "data" / "nano-meta-act"
 SPELT_OUT = {"The road runs straight on"}
 """Phrases that are younger than this tokenizer. Only their first token is a decision."""
 
 
 def test_a_decision_of_a_reflection_is_a_token_of_the_nano_models() -> None:
-    parts = read_parts(LANGUAGE)
+    parts = read_parts(CHECKPOINT)
     assert parts.settings.reflection == "phrases"
     behind = {text for head in HEADS.values() for texts in details(head) for text in texts if text}
     texts = {*HEADS, *behind, *CONSEQUENCES, *CORRECTIONS, GOING_ON} - SPELT_OUT
