@@ -132,7 +132,7 @@ def test_both_engines_write_the_same_at_temperature_0(
 def test_both_engines_write_the_same_with_a_resampler_and_tracks(
     loop: asyncio.AbstractEventLoop, resampling_checkpoint: Path
 ) -> None:
-    """With and without tracks and a route; the vLLM engine of its own ends before others use the cores."""
+    """With and without tracks and a route, and told live; vLLM ends before others use the cores."""
     arguments = {"enforce_eager": True, "block_size": 32}
     settings = VllmSettings(rows=8, dtype="float32", arguments=arguments)
     theirs = VllmEngine(resampling_checkpoint, settings)
@@ -143,15 +143,27 @@ def test_both_engines_write_the_same_with_a_resampler_and_tracks(
     ]
     requests = [greedy(scene.scene_id, scene) for scene in scenes]
 
-    async def texts(engine: Engine) -> list[str]:
+    live = PlanRequest("live", scenes[0], controls=Controls(n=2, thinking="always"), live=True)
+
+    async def texts(engine: Engine) -> tuple[list[str], list[Event]]:
         await engine.start()
         try:
-            return [draw.text for [draw] in await plans(engine, requests)]
+            draws = await plans(engine, requests)
+            return [draw.text for [draw] in draws], await events_of(engine, live)
         finally:
             await engine.stop()
 
-    written = loop.run_until_complete(texts(theirs))
-    assert written == loop.run_until_complete(texts(mine))
+    written, events = loop.run_until_complete(texts(theirs))
+    assert written == loop.run_until_complete(texts(mine))[0]
+    for index in range(2):
+        told = [event.text for event in events if isinstance(event, TextWritten) and event.index == index]
+        [whole] = [
+            event.text
+            for event in events
+            if isinstance(event, SectionFinished) and (event.index, event.section) == (index, "thinking")
+        ]
+        assert len(told) > 1
+        assert whole.startswith("".join(told))
     assert len(set(written)) > 12
 
 
@@ -228,9 +240,6 @@ def test_sections_come_before_their_draw(loop: asyncio.AbstractEventLoop, vllm: 
             if isinstance(event, SectionFinished) and event.index == index
         }
         assert list(sections) == ["plan", "branch", "thinking", "revised_plan", "trajectory"]
-        told = [event.text for event in events if isinstance(event, TextWritten) and event.index == index]
-        assert len(told) > 1
-        assert sections["thinking"].startswith("".join(told))
 
 
 def test_leaving_early_frees_vllm(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
