@@ -37,6 +37,8 @@ from model.families.cf_vla import CF_VLA
 from model.formats.cursor import CompiledFormat
 from model.formats.text import parse
 from model.network.checkpoint import read_parts
+from model.network.settings import NANO_SETTINGS
+from tests.checkpoints import write_untrained
 
 T = TypeVar("T")
 Run = Callable[[Awaitable[T]], T]
@@ -130,13 +132,14 @@ def test_both_engines_write_the_same_at_temperature_0(
 
 
 def test_both_engines_write_the_same_with_a_resampler_and_tracks(
-    loop: asyncio.AbstractEventLoop, resampling_checkpoint: Path
+    loop: asyncio.AbstractEventLoop, tmp_path: Path
 ) -> None:
-    """With and without tracks and a route, and told live; vLLM ends before others use the cores."""
+    """With and without tracks and a route, free text told live; vLLM ends before others use the cores."""
+    checkpoint = write_untrained(tmp_path / "free", settings=replace(NANO_SETTINGS, reflection="free_text"))
     arguments = {"enforce_eager": True, "block_size": 32}
     settings = VllmSettings(rows=8, dtype="float32", arguments=arguments)
-    theirs = VllmEngine(resampling_checkpoint, settings)
-    mine = TorchEngine(resampling_checkpoint, TorchSettings(products=None))
+    theirs = VllmEngine(checkpoint, settings)
+    mine = TorchEngine(checkpoint, TorchSettings(products=None))
     scenes = [
         replace(scene, tracks=None if k % 3 == 1 else some_tracks(k))
         for k, scene in enumerate(mixed_scenes(24))
