@@ -50,9 +50,9 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loaded]:
     family_named.cache_clear()
 
 
-def planned(toy: Loaded, **controls: object) -> list[Draw]:
+def planned(toy: Loaded, **controls: Any) -> list[Draw]:
     """What the engine writes, which is what the reference writes."""
-    asked = PlanRequest("a", noisy_scene(1), "toy", Controls(**controls))  # type: ignore[arg-type]
+    asked = PlanRequest("a", noisy_scene(1), "toy", Controls(**controls))
     with torch.inference_mode():
         draws = decode(Decoder(Runner(toy, 2 * asked.controls.n), clock=lambda: 0.0), asked)
         expected = reference_draws(toy, asked)

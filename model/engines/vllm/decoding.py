@@ -138,11 +138,15 @@ class Decoding:
         try:
             written = [token.id for token in draws[0].tokens]
             number, self._requests = self._requests, self._requests + 1
-            stream = self._llm.generate(
-                self._prompt.then(written), self._parameters(draws), f"{self._request.request_id}/{number}"
-            )
+            allowed = draws[0].cursor.allowed()
             # What is weighed is the same for all draws, so vLLM is asked for one.
-            weighs, alone = self._weighs(draws[0].cursor), self._alone(draws[0].cursor)
+            weighs = self._expected(allowed) is not None
+            alone = weighs or self._between_numbers(allowed)
+            stream = self._llm.generate(
+                self._prompt.then(written),
+                self._parameters(draws, allowed, weighs=weighs, alone=alone),
+                f"{self._request.request_id}/{number}",
+            )
             following = {draw.index for draw in draws}
             async with aclosing(stream):
                 async for output in stream:
@@ -162,16 +166,14 @@ class Decoding:
         except Exception as error:  # vLLM's own, of whatever type
             self.fail(EngineError.because("vLLM failed", error))
 
-    def _parameters(self, draws: Sequence[_Walk]) -> Any:
+    def _parameters(self, draws: Sequence[_Walk], allowed: Allowed, *, weighs: bool, alone: bool) -> Any:
         from vllm import SamplingParams
         from vllm.sampling_params import RequestOutputKind, StructuredOutputsParams
 
         controls, first = self._request.controls, draws[0]
-        ids = first.cursor.allowed().ids
-        weighs, alone = self._weighs(first.cursor), self._alone(first.cursor)
         named = self._branch_ids(first)
         if weighs:
-            named = ids.tolist() if len(ids) <= _MOST_NAMED else None
+            named = allowed.ids.tolist() if len(allowed.ids) <= _MOST_NAMED else None
         grammar = None if alone else StructuredOutputsParams(grammar=self._grammar(first.cursor))
         return SamplingParams(
             n=1 if weighs else len(draws),
@@ -181,20 +183,15 @@ class Decoding:
             max_tokens=1 if alone else first.cursor.compiled.longest(),
             logprobs=-1 if weighs and named is None else None,
             logprob_token_ids=named,
-            allowed_token_ids=ids.tolist() if alone else None,
+            allowed_token_ids=allowed.ids.tolist() if alone else None,
             structured_outputs=grammar,
             detokenize=False,
             output_kind=RequestOutputKind.DELTA,
         )
 
-    def _weighs(self, cursor: Cursor) -> bool:
-        """Whether we choose the next token by its expected error, the same for all draws."""
-        return self._expected(cursor.allowed()) is not None
-
-    def _alone(self, cursor: Cursor) -> bool:
+    def _between_numbers(self, allowed: Allowed) -> bool:
         """Whether vLLM is asked for the next token alone: between numbers no grammar is needed."""
-        few = len(cursor.allowed().ids) <= _MOST_NAMED
-        return self._weighs(cursor) or (few and self._request.controls.numbers == "least_error")
+        return self._request.controls.numbers == "least_error" and len(allowed.ids) <= _MOST_NAMED
 
     def _expected(self, allowed: Allowed) -> Expected | None:
         """The expected error of each allowed id, to be weighed by it; None where vLLM's own choice stands."""
