@@ -25,11 +25,16 @@ _IMAGE: Final = "<image>"
 DATASET: Final = "looktwice"
 
 
-def reflections(ledger: Ledger, label: Run) -> Iterator[LabelledReflection]:
+def reflections(ledger: Ledger, label: Run, *, by_outcome: bool = False) -> Iterator[LabelledReflection]:
     """What a teacher wrote, with its provenance, scene by scene.
 
     A reflection in phrases leads to the expert's plan in the tracks that it speaks of; the others stay as the
     model planned them.
+
+    Args:
+        ledger, label: where the labels are.
+        by_outcome: plans that failed when they were followed deserve a second look. Of all others it is not
+            known: their reflections teach how to think, not whether to.
     """
     rollout = _rollout_of(ledger, label)
     for entry in ledger.entries(label):
@@ -40,6 +45,7 @@ def reflections(ledger: Ledger, label: Run) -> Iterator[LabelledReflection]:
             predicted_plan=predicted,
             reflection=entry.record["reflection"],
             expert_plan=expert if facts is None else corrected(predicted, expert, facts),
+            judged=not by_outcome or entry.record["failure"] is not None,
             key=entry.key,
             model=rollout.config["model"],
             model_revision=rollout.config["revision"],
@@ -85,6 +91,7 @@ def _to_act_on(rollout: Run, entry: Entry, plans: Iterable[str]) -> Iterator[Lab
             predicted_plan=parse_plan(plan),
             reflection="",
             expert_plan=expert,
+            judged=True,
             key=entry.key,
             model=rollout.config["model"],
             model_revision=rollout.config["revision"],

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from model.driving.agents import AgentKind
@@ -148,6 +148,19 @@ CORRECTIONS: Final[Mapping[str, Correction]] = {
     ", so I should move to the right lane": "lane_right",
     ", so I should stay in my lane": "keep_lane",
 }
+_OTHER_SIDE: Final[Mapping[Side, Side]] = {"left": "right", "right": "left"}
+_OTHER_PLACE: Final[Mapping[Spot, Spot]] = {
+    "the left lane": "the right lane",
+    "the right lane": "the left lane",
+    "the left side": "the right side",
+    "the right side": "the left side",
+}
+_OTHER_WAY: Final[Mapping[Correction, Correction]] = {
+    "left": "right",
+    "right": "left",
+    "lane_left": "lane_right",
+    "lane_right": "lane_left",
+}
 _LANE_OF: Final[Mapping[Side, Correction]] = {"left": "lane_left", "right": "lane_right"}
 
 
@@ -210,6 +223,11 @@ class Statement:
         """What the plan is to do more of."""
         return change_of(self.correction)
 
+    def mirrored(self) -> Statement:
+        """The same with left and right swapped."""
+        correction = _OTHER_WAY.get(self.correction, self.correction)
+        return Statement(_mirrored(self.cue), self.consequence, correction)
+
     def texts(self) -> tuple[str, ...]:
         """The texts of its decisions; raises `PhraseError` for a cue that there are no words for."""
         return (
@@ -239,6 +257,10 @@ class Facts:
             raise PhraseError(
                 f"a reflection states one change of each track, in the order {', '.join(GROUPS)}"
             )
+
+    def mirrored(self) -> Facts:
+        """The same with left and right swapped."""
+        return Facts(tuple(each.mirrored() for each in self.statements))
 
     @property
     def changes(self) -> tuple[Change, ...]:
@@ -310,6 +332,16 @@ def head_of(cue: Cue) -> Head:
             return (kind, state)
         case Bend(side):
             return Bend(side)
+        case _:
+            return cue
+
+
+def _mirrored(cue: Cue) -> Cue:
+    match cue:
+        case Thing(place=place):
+            return replace(cue, place=_OTHER_PLACE.get(place, place))
+        case Bend(side) | Junction(side) | Room(side):
+            return replace(cue, side=_OTHER_SIDE[side])
         case _:
             return cue
 

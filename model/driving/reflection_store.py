@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from model.driving.parquet_rows import write_rows
 from model.driving.plan import Plan, PlanError, parse_plan
 
-REFLECTION_VERSION: Final = "1"
+REFLECTION_VERSION: Final = "2"
 _VERSION_KEY: Final = b"looktwice.reflection_version"
 _ROW_GROUP: Final = 4096
 
@@ -36,6 +36,7 @@ class LabelledReflection:
         reflection: a teacher's paragraph; empty where the plan is right and is to be acted on.
         expert_plan: what it leads to: the expert's plan, of which a reflection in phrases takes over the
             tracks that it speaks of.
+        judged: whether it is known that the plan deserves a second look, or none; see `Reflection`.
         key: of the label in the ledger it comes from.
         model, model_revision: who planned.
         teacher, teacher_revision: who wrote; empty where nobody did.
@@ -47,6 +48,7 @@ class LabelledReflection:
     predicted_plan: Plan
     reflection: str
     expert_plan: Plan
+    judged: bool
     key: str
     model: str
     model_revision: str
@@ -58,7 +60,7 @@ class LabelledReflection:
 
 _SCHEMA: Final = pa.schema(
     [
-        (name, pa.int32() if name == "attempts" else pa.string())
+        (name, {"attempts": pa.int32(), "judged": pa.bool_()}.get(name, pa.string()))
         for name in LabelledReflection.__dataclass_fields__
     ]
 )

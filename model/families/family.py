@@ -61,12 +61,14 @@ class Reflection:
     """A counterfactual example's own parts: a plan of the model's own, and why it is to be corrected.
 
     ``thinking`` is empty where it is not: such a plan is acted on. ``revised_plan`` is what the reasoning
-    leads to, where that is not the expert's plan in all tracks.
+    leads to, where that is not the expert's plan in all tracks. ``judged`` says whether it is known that the
+    plan deserves a second look, or none; otherwise nothing is taught of the branch.
     """
 
     first_plan: Plan
     thinking: str
     revised_plan: Plan | None = None
+    judged: bool = True
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from model.network.prompts import motion_text
 from model.network.track_features import MIRRORED, without_route
 from model.network.vocabulary import Vocabulary
 from model.training.examples import Examples, example_frames
+from model.training.reflections import mirrored
 from model.training.soft_codes import SoftCodes
 from model.training.targets import SectionWeights, Target, make_target
 from model.training.vision_cache import VisionCache
@@ -151,8 +152,10 @@ class ResponseDataset(Dataset[Sample]):
         if item.blur:
             history = steady_history(present_speed(history))
         vector = self._codec.vectors(history[None], future[None])[0]
-        reflections: Sequence[Reflection | None] = [self._reflections[place] for place in item.reflections]
-        reflections = reflections or [None]
+        found = [self._reflections[place] for place in item.reflections]
+        if item.mirror:
+            found = [mirrored(each) for each in found]
+        reflections: Sequence[Reflection | None] = found or [None]
         soft = [self._soft.draw(vector, self._random) for _ in reflections]
         return Sample(
             prompt=self._prompt(item),
@@ -206,7 +209,8 @@ class TaskSampler(BatchSampler):
         tasks: share of the examples for each task.
         route_share: share of the examples, among those that have one, that are given their route.
         tracks_share, mirror_share, blur_share: shares of the examples that are given their tracks, mirrored,
-            and given no history but the present speed; see `Item`. Reflections are never mirrored.
+            and given no history but the present speed; see `Item`.
+        mirror_reflected: whether reflections are mirrored too: those in phrases can be.
         seed: of the order; every epoch has another one.
         processes: so many batches in a row are alike, as those who share the work wait for the slowest.
         reflected: int64 [r], the example that each reflection is on.
@@ -228,7 +232,9 @@ class TaskSampler(BatchSampler):
         tracks_share: float = 0.0,
         mirror_share: float = 0.0,
         blur_share: float = 0.0,
+        mirror_reflected: bool = False,
     ) -> None:
+        self._mirror_reflected = mirror_reflected
         self._shares = {"tracks": tracks_share, "mirror": mirror_share, "blur": blur_share}
         self._processes, self._has_route, self._tasks = processes, has_route, tasks
         self._route_share, self._seed, self._epoch = route_share, seed, 0
@@ -284,7 +290,8 @@ class TaskSampler(BatchSampler):
     def _reflected(self, random: np.random.Generator) -> list[Item]:
         example = np.array(list(self._reflections), np.int64)
         given = self._given(example, random)
-        tracks, _, blur = (self._drawn(name, len(example), random) for name in _CHANCES)
+        tracks, mirror, blur = (self._drawn(name, len(example), random) for name in _CHANCES)
+        mirror &= self._mirror_reflected
         return [
             Item(
                 index,
@@ -292,6 +299,7 @@ class TaskSampler(BatchSampler):
                 bool(given[place]),
                 tuple(self._reflections[index]),
                 tracks=bool(tracks[place]),
+                mirror=bool(mirror[place]),
                 blur=bool(blur[place]),
             )
             for place in random.permutation(len(example))

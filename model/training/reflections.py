@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.phrases import facts_of
+from model.driving.phrases import facts_of, read_facts
 from model.driving.reflection_store import LabelledReflection
 from model.families.family import Reflection
 from model.training.examples import Examples
@@ -25,6 +26,17 @@ _PLAIN: Final = str.maketrans(
     }
 )
 """Typographic quotes, dashes and dots as ASCII: small tokenizers have no tokens for them."""
+
+
+def mirrored(reflection: Reflection) -> Reflection:
+    """A reflection with left and right swapped; raises `PhraseError` where it is not in phrases."""
+    revised = reflection.revised_plan
+    return replace(
+        reflection,
+        first_plan=reflection.first_plan.mirrored(),
+        thinking=str(read_facts(reflection.thinking).mirrored()) if reflection.thinking else "",
+        revised_plan=None if revised is None else revised.mirrored(),
+    )
 
 
 class OnExamples(NamedTuple):
@@ -48,5 +60,5 @@ def reflections_on(examples: Examples, found: Iterable[LabelledReflection]) -> O
         places.append(place_of[each.scene_id])
         thinking = each.reflection.translate(_PLAIN)
         revised = None if facts_of(thinking) is None else each.expert_plan
-        reflections.append(Reflection(each.predicted_plan, thinking, revised))
+        reflections.append(Reflection(each.predicted_plan, thinking, revised, each.judged))
     return OnExamples(np.array(places, np.int64), reflections)

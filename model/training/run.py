@@ -211,6 +211,7 @@ def _prepare(
         tracks_share=recipe.tracks_share if loaded.settings.with_tracks else 0.0,
         mirror_share=recipe.mirror_share,
         blur_share=recipe.blur_share,
+        mirror_reflected=loaded.settings.reflection == "phrases",
     )
     for part in vision_parts(loaded.model):
         part.requires_grad_(recipe.vision_rate > 0)

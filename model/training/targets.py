@@ -57,6 +57,8 @@ def make_target(
     untaught: set[str | None] = set()
     if reflection is not None:
         untaught.add(family.first_plan)
+        if not reflection.judged and family.branch is not None:
+            untaught.add(family.branch.name)
         if reflection.revised_plan is not None and wanted_changes(reflection.revised_plan, plan):
             untaught.add(family.trajectory)
     taught = {section: 0.0 if section in untaught else weight for section, weight in weights.items()}

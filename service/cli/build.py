@@ -317,7 +317,7 @@ def export(
         bool,
         typer.Option(
             "--right-outcomes",
-            help="parquet: also the model's plans that hold when followed, to be acted on.",
+            help="parquet: outcomes decide which plans deserve a second look; those that hold are acted on.",
         ),
     ] = False,
     plans_per_scene: PlansPerScene = 1,
@@ -347,7 +347,8 @@ def export(
                 right = right_plans(ledger, labels, right_iou)
             elif right_outcomes:
                 right = held_plans(ledger, labels)
-            count = write_reflections(to, chain(reflections(ledger, labels), right))
+            labelled = reflections(ledger, labels, by_outcome=right_outcomes)
+            count = write_reflections(to, chain(labelled, right))
         elif scenes is None:
             raise ValueError(f"--form {form} needs --scenes")
         elif form == "messages":

@@ -126,6 +126,9 @@ def test_a_question_tells_what_its_plan_failed_at(ledger: Ledger, file: Path) ->
     assert {question.outcome for question in again.questions} == {late}
     told = [entry.record["failure"] for entry in ledger.entries(run)]
     assert sorted(told, key=str) == [None] * SCENES + ["falls behind by 18 m"] * 2
+    assert {each.judged for each in reflections(ledger, run)} == {True}
+    judged = [each.judged for each in reflections(ledger, run, by_outcome=True)]
+    assert sorted(judged) == [False] * SCENES + [True] * 2, "only of a plan that failed it is known"
     parts = user_message(again.questions[0], (), "free_text")
     assert any(isinstance(part, Text) and "your plan falls behind by 18 m" in part.text for part in parts)
     parts = user_message(teacher.questions[0], (), "free_text")

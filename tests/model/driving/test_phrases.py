@@ -37,6 +37,15 @@ def test_facts_are_read_back_from_their_text(facts: Facts) -> None:
     assert read_facts(str(facts)) == facts
 
 
+@given(facts())
+def test_facts_mirrored_twice_are_the_same(facts: Facts) -> None:
+    mirrored = facts.mirrored()
+    assert mirrored.mirrored() == facts
+    swapped = str(facts).replace("left", "RIGHT").replace("right", "left").replace("RIGHT", "right")
+    # "right ahead" is no side.
+    assert str(mirrored).replace("left ahead", "right ahead") == swapped.replace("left ahead", "right ahead")
+
+
 def test_a_reflection_reads_as_english() -> None:
     assert str(Facts((SLOWER, STAY))) == (
         "A standing vehicle is in my lane some 25 metres ahead. "

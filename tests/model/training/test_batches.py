@@ -129,6 +129,21 @@ def test_reflections_are_examples_beside_all_others() -> None:
     assert sorted(item.index for item in items if not item.reflections) == list(range(8))
 
 
+@pytest.mark.parametrize("phrases", [True, False])
+def test_only_reflections_in_phrases_are_mirrored(phrases: bool) -> None:
+    sampler = TaskSampler(
+        np.ones(8, np.bool_),
+        1,
+        {"cf_vla": 1.0},
+        0.5,
+        seed=0,
+        reflected=REFLECTED,
+        mirror_share=1.0,
+        mirror_reflected=phrases,
+    )
+    assert {item.mirror for batch in sampler for item in batch if item.reflections} == {phrases}
+
+
 def test_every_batch_reaches_a_process() -> None:
     reflected = np.arange(300).repeat(4)
     sampler = TaskSampler(

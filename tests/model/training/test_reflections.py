@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import pytest
 
+from model.driving.phrases import PhraseError
 from model.driving.plan import parse_plan
 from model.driving.reflection_store import LabelledReflection
 from model.driving.scene import FRONT_WIDE
+from model.families.family import Reflection
 from model.training.examples import Examples
-from model.training.reflections import reflections_on
+from model.training.reflections import mirrored, reflections_on
 from tests.model.training.scenes import training_scene
 
 PLAN = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
@@ -14,7 +16,9 @@ EXAMPLES = Examples.from_scenes((training_scene(k) for k in range(3)), (FRONT_WI
 
 
 def reflection(scene_id: str, text: str) -> LabelledReflection:
-    return LabelledReflection(scene_id, PLAN, text, PLAN, "key", "nano", "1", "rules", "1", 1, "2026-01-01")
+    return LabelledReflection(
+        scene_id, PLAN, text, PLAN, False, "key", "nano", "1", "rules", "1", 1, "2026-01-01"
+    )
 
 
 def test_reflections_find_their_examples_in_plain_punctuation() -> None:
@@ -24,6 +28,23 @@ def test_reflections_find_their_examples_in_plain_punctuation() -> None:
     )
     assert found.examples.tolist() == [2]
     assert found.reflections[0].thinking == 'The car\'s brake lights... I "wait".'
+    assert not found.reflections[0].judged
+
+
+def test_a_mirrored_reflection_says_the_other_side() -> None:
+    plans = [parse_plan(f"- lane\n  - 0.0s-6.4s: {side} Lane Change\n") for side in ("Left", "Right")]
+    text = (
+        "There is room in the {} lane. "
+        "Going on like this would get me stuck, so I should move to the {} lane."
+    )
+    left, right = (
+        Reflection(PLAN, text.format(side, side), plan, judged=False)
+        for side, plan in zip(("left", "right"), plans, strict=True)
+    )
+    assert mirrored(left) == right
+    assert mirrored(Reflection(plans[0], "")) == Reflection(plans[1], "")
+    with pytest.raises(PhraseError):
+        mirrored(Reflection(PLAN, "I should slow down."))
 
 
 def test_a_reflection_on_an_unknown_scene_is_refused() -> None:

@@ -179,4 +179,4 @@ def reflection(labelled: LabelledScene) -> LabelledReflection:
     """A reflection on a scene, by nobody in particular."""
     wrong, right = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n"), expert_plan(labelled)
     text = "The road ahead is clear, so I should drive on."
-    return LabelledReflection(labelled.scene.scene_id, wrong, text, right, *("x",) * 5, 1, "now")
+    return LabelledReflection(labelled.scene.scene_id, wrong, text, right, True, *("x",) * 5, 1, "now")

@@ -65,6 +65,28 @@ def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
     }
 
 
+def test_a_plan_that_nobody_judged_teaches_no_branch() -> None:
+    compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
+    told = Reflection(WRONG, "The car ahead stands still.")
+    judged, unjudged = (
+        make_target(CF_VLA, compiled, PLAN, CODES, PAPER_WEIGHTS, replace(told, judged=judged))
+        for judged in (True, False)
+    )
+    assert judged.ids == unjudged.ids
+    plans = {"plan": WRONG, "revised_plan": PLAN}
+    values = parse(compiled, VOCABULARY.decode(judged.ids), plans)
+    sections = [token.section for token in compiled.render(values, plans)]
+    differ = {
+        section
+        for section, one, other in zip(sections, judged.weights, unjudged.weights, strict=True)
+        if one != other
+    }
+    assert differ == {"branch"}
+    assert {
+        weight for weight, section in zip(unjudged.weights, sections, strict=True) if section == "branch"
+    } == {0.0}
+
+
 def test_a_right_plan_of_its_own_is_acted_on_and_not_taught() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
     target = make_target(CF_VLA, compiled, PLAN, CODES, PAPER_WEIGHTS, Reflection(WRONG, ""))
