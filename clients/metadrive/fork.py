@@ -16,6 +16,7 @@ import numpy as np
 
 from clients.metadrive.actors import STEP_S, Body, Drift, Obstacle, Pedestrian, Vehicle
 from clients.metadrive.episode import World
+from clients.metadrive.episode_log import EpisodeLog
 from clients.metadrive.roads import Array, RoadMap
 from clients.metadrive.tracking import FreeVehicle, world_trajectory
 from model.driving.outcome import HitKind
@@ -47,6 +48,7 @@ class Forked:
         hit: what it collided with, or None.
         off_road_s: when it first left the road, or None.
         off_route_s: when it first left all lanes of its route (`OFF_ROUTE_M`), or None; on rails none does.
+        log: the whole episode, of which the fork is the end.
     """
 
     trajectory: FloatArray
@@ -56,6 +58,7 @@ class Forked:
     hit: HitKind | None
     off_road_s: float | None
     off_route_s: float | None
+    log: EpisodeLog
 
     @property
     def is_safe(self) -> bool:
@@ -149,6 +152,7 @@ def _run(world: World, steps: int, way: Array | None) -> Forked:
         None if world.hit is None else kind_of(world.hit),
         off_road_s,
         off_route_s,
+        world.log(),
     )
 
 

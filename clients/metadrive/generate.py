@@ -6,7 +6,7 @@ import json
 import multiprocessing
 import multiprocessing.connection
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -23,11 +23,16 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from clients import wire
 from clients.metadrive import simulator
+from clients.metadrive.drive import DriveConfig
 from clients.metadrive.episode import run_episode
 from clients.metadrive.maps import MapError
+from clients.metadrive.own_states import own_states
+from clients.metadrive.pilots import ServicePilot
 from clients.metadrive.rig import Rig
 from clients.metadrive.windows import labelled_scenes, window_steps
+from clients.planner import Access, Patience, PlannerClient
 from model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS
 from model.driving.scene import LabelledScene, split_of_seed
 from model.driving.scene_store import SCENE_VERSION, write_scenes
@@ -55,6 +60,9 @@ class GenerateConfig:
         drifts: the expert strays from its line now and then; scenes show how it comes back.
         lapses: it brakes late now and then; scenes show how it brakes then.
         width_px: of the pictures, which are twice as wide as high.
+        driver: name and revision of the model that drives; scenes are then of its own states, with what the
+            expert would do from there (`own_states`). None for the expert.
+        tracks: whether that model is told the tracks of the objects around.
     """
 
     stride_s: float = 0.5
@@ -65,6 +73,15 @@ class GenerateConfig:
     drifts: bool = False
     lapses: bool = False
     width_px: int = 224
+    driver: str | None = None
+    tracks: bool = False
+
+    def __post_init__(self) -> None:
+        if self.driver is not None and (self.dense or self.surround or self.drifts or self.lapses):
+            raise GenerationError(
+                "scenes of a model's own drives have no dense targets and no surround cameras, "
+                "and its expert neither drifts nor lapses"
+            )
 
 
 @dataclass(frozen=True)
@@ -96,8 +113,17 @@ def generate(
     workers: int = 2,
     config: GenerateConfig | None = None,
     console: Console | None = None,
+    service: str | None = None,
 ) -> GenerateReport:
     """Generate the scenes of ``seeds`` into ``out_dir``; blocks that are there already are left alone.
+
+    Args:
+        out_dir: of the files.
+        seeds: of the episodes.
+        workers: processes.
+        config: what to generate.
+        console: of the progress bar.
+        service: URL of the model that drives, where the config names one.
 
     Raises:
         SimulatorMissing: MetaDrive is not installed.
@@ -118,7 +144,7 @@ def generate(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
         task = progress.add_task(out_dir.name, total=len(blocks), completed=report.blocks_resumed)
-        for _ in _run_blocks(out_dir, missing, workers, config):
+        for _ in _run_blocks(out_dir, missing, workers, config, service):
             report.blocks_written += 1
             progress.advance(task)
             write_manifest(out_dir, config)
@@ -145,7 +171,7 @@ def _check_config(out_dir: Path, config: GenerateConfig) -> None:
 
 
 def _run_blocks(
-    out_dir: Path, blocks: Sequence[range], workers: int, config: GenerateConfig
+    out_dir: Path, blocks: Sequence[range], workers: int, config: GenerateConfig, service: str | None
 ) -> Iterator[range]:
     """Run every block in a process of its own, ``workers`` at a time; a dead worker's is tried again."""
     context = multiprocessing.get_context("spawn")
@@ -155,7 +181,8 @@ def _run_blocks(
         while waiting or running:
             while waiting and len(running) < workers:
                 block, attempt = waiting.pop(0)
-                process = context.Process(target=write_block, args=(out_dir, block, config), daemon=True)
+                arguments = (out_dir, block, config, service)
+                process = context.Process(target=write_block, args=arguments, daemon=True)
                 process.start()
                 running[process] = (block, attempt)
             multiprocessing.connection.wait([process.sentinel for process in running])
@@ -177,14 +204,15 @@ def _run_blocks(
             process.join()
 
 
-def write_block(out_dir: Path, seeds: range, config: GenerateConfig) -> None:
+def write_block(out_dir: Path, seeds: range, config: GenerateConfig, service: str | None = None) -> None:
     """Generate one block in this process and put its file in place."""
     cameras = FRONT_CAMERAS + (SURROUND_CAMERAS if config.surround else ())
     rig = Rig(tuple(camera.resized(config.width_px) for camera in cameras))
     scenes: list[LabelledScene] = []
     outcomes: list[EpisodeOutcome] = []
+    run = run_seed if service is None else _driven_by(service, config)
     for seed in seeds:
-        made, outcome = run_seed(seed, rig, config)
+        made, outcome = run(seed, rig, config)
         scenes += made
         outcomes.append(outcome)
     rig.close()
@@ -205,6 +233,28 @@ def run_seed(seed: int, rig: Rig, config: GenerateConfig) -> tuple[list[Labelled
     dropped = len(window_steps(log, config.stride_s)) - len(made)
     seconds = round(time.monotonic() - started, 2)
     return made, EpisodeOutcome(seed, log.outcome, log.road_map.blocks, len(made), dropped, seconds)
+
+
+def _driven_by(
+    service: str, config: GenerateConfig
+) -> Callable[[int, Rig, GenerateConfig], tuple[list[LabelledScene], EpisodeOutcome]]:
+    """What takes the place of `run_seed` where a served model drives."""
+    # Without second looks: those are taught by what comes of first plans.
+    planner = PlannerClient(service, Patience(timeout_s=120.0), access=Access.from_environment())
+    pilot = ServicePilot(planner, "never", wire.Controls(n=6, thinking="never"), tracks=config.tracks)
+
+    def run(seed: int, rig: Rig, config: GenerateConfig) -> tuple[list[LabelledScene], EpisodeOutcome]:
+        started = time.monotonic()
+        every = max(1, round(config.stride_s / DriveConfig().replan_s))
+        try:
+            made, drove = own_states(seed, pilot, rig, DriveConfig(config.duration_s), every)
+        except (MapError, shapely.errors.GEOSException) as error:
+            return [], EpisodeOutcome(seed, type(error).__name__, "", 0, 0, time.monotonic() - started)
+        dropped = drove.plans // every - len(made)
+        seconds = round(time.monotonic() - started, 2)
+        return made, EpisodeOutcome(seed, drove.ended, "", len(made), dropped, seconds)
+
+    return run
 
 
 def write_manifest(out_dir: Path, config: GenerateConfig) -> dict[str, Any]:

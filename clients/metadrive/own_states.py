@@ -1,50 +1,48 @@
 """What a planner meets when it drives itself, with what the expert would do from there (DAgger).
 
 A planner that learned only from the expert's states errs in its own: small errors lead where no example was
-(https://arxiv.org/abs/1011.0686). Here it drives, and at every other plan the world is forked and the expert
+(https://arxiv.org/abs/1011.0686). Here it drives, and at some of its plans the world is forked and the expert
 goes on from where the car is. Forks in which even the expert fails are left out: there is nothing to learn.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from clients.metadrive.drive import Drive, DriveConfig, drive
 from clients.metadrive.episode import World
 from clients.metadrive.fork import ForkError, fork_expert
+from clients.metadrive.lane_maps import LaneMaps
 from clients.metadrive.pilots import Pilot
-from model.driving.scene import Scene
-from model.driving.trajectory import FUTURE_STEPS, FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class OwnState:
-    """A moment of a drive, and the expert's way on from it.
-
-    Attributes:
-        seed: of the episode.
-        scene: what the planner saw.
-        future: float32 [64, 4], the expert's trajectory from there.
-    """
-
-    seed: int
-    scene: Scene
-    future: FloatArray
+from clients.metadrive.rig import Rig
+from clients.metadrive.windows import labelled_scene
+from model.driving.scene import LabelledScene, Scene
+from model.driving.trajectory import FUTURE_STEPS
 
 
 def own_states(
-    seed: int, pilot: Pilot, config: DriveConfig = DriveConfig(), every: int = 2
-) -> tuple[list[OwnState], Drive]:
-    """Let a pilot without eyes drive an episode, and label every so many-th of its plans.
+    seed: int, pilot: Pilot, rig: Rig | None = None, config: DriveConfig = DriveConfig(), every: int = 2
+) -> tuple[list[LabelledScene], Drive]:
+    """Let a pilot drive an episode, and label every so many-th of its plans.
+
+    Args:
+        seed: of the episode.
+        pilot: that drives.
+        rig: of its cameras; None for one without eyes, whose scenes have blank pictures.
+        config: see there.
+        every: so many plans lie between two scenes.
+
+    Returns:
+        Scenes whose past is the pilot's and whose future the expert's; and how the pilot drove.
 
     Raises:
         MapError: no map fits the seed.
+        PlannerError: the pilot's service does not answer.
     """
-    states: list[OwnState] = []
+    states: list[LabelledScene] = []
+    lane_maps: LaneMaps | None = None
     plans = 0
 
     def label(world: World, scene: Scene) -> None:
-        nonlocal plans
+        nonlocal plans, lane_maps
         plans += 1
         if plans % every:
             return
@@ -52,8 +50,12 @@ def own_states(
             forked = fork_expert(world)
         except ForkError:
             return
-        if forked.is_safe and len(forked.trajectory) == FUTURE_STEPS:
-            states.append(OwnState(seed, scene, forked.trajectory))
+        if not forked.is_safe or len(forked.trajectory) < FUTURE_STEPS:
+            return
+        lane_maps = lane_maps or LaneMaps(world.live)
+        labelled = labelled_scene(forked.log, world.now, scene.clips, lane_maps.at(world.now))
+        if labelled is not None:
+            states.append(labelled)
 
-    drove = drive(seed, pilot, None, config, on_plan=label)
+    drove = drive(seed, pilot, rig, config, on_plan=label)
     return states, drove

@@ -109,6 +109,11 @@ def setting_of(scenes: Path) -> EpisodeSetting:
             f"{manifest.parent} was made with settings unknown here: {', '.join(sorted(unknown))}"
         )
     whole = asdict(GenerateConfig()) | config
+    if whole["driver"] is not None:
+        raise ReplayError(
+            f"{manifest.parent} holds what {whole['driver']} met when it drove: "
+            "its worlds cannot be made again"
+        )
     return EpisodeSetting(whole["duration_s"], whole["drifts"], whole["lapses"])
 
 

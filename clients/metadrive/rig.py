@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +43,11 @@ class Rig:
         self._host: Any = None
         self.ego = self.root.attachNewNode("ego")
         self._cameras = [self._camera(spec) for spec in specs]
+
+    @classmethod
+    def of_width(cls, width_px: int) -> Self:
+        """The front cameras; pictures of another size than a model's are stretched, and it sees less."""
+        return cls(tuple(camera.resized(width_px) for camera in FRONT_CAMERAS))
 
     def _camera(self, spec: CameraSpec) -> tuple[Any, Any, Any]:
         core = simulator.panda()

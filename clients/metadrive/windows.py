@@ -15,6 +15,7 @@ from clients.metadrive.lane_maps import LaneMaps
 from clients.metadrive.rig import Picture, Rig
 from clients.metadrive.roads import Array
 from clients.metadrive.stage import Stage
+from model.driving.lane_map import LaneMap
 from model.driving.metrics import collides, leaves_road
 from model.driving.scene import (
     CLIP_FRAMES,
@@ -25,6 +26,7 @@ from model.driving.scene import (
     LabelledScene,
     LaneTrace,
     Scene,
+    Tag,
 )
 from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
 
@@ -75,21 +77,27 @@ def labelled_scenes(
                     dense_target(spec, picture.depth_m, log, step, moment.area)
                     for spec, picture in zip(rig.specs, shots[step], strict=True)
                 )
-            yield LabelledScene(
-                Scene(f"{log.seed:06d}-{step:04d}", clips, moment.history, route_ahead(log, step)),
-                f"{log.seed:06d}",
-                log.seed,
-                moment.future,
-                moment.agents,
-                moment.drivable,
-                moment.lane_lines(),
-                moment.lane_trace(),
-                tagger.tags(step),
-                dense,
-                lane_maps.at(step),
-            )
+            yield moment.labelled(clips, tagger.tags(step), lane_maps.at(step), dense)
     finally:
         stage.close()
+
+
+def labelled_scene(
+    log: EpisodeLog, step: int, clips: tuple[Clip, ...], lane_map: LaneMap
+) -> LabelledScene | None:
+    """The moment at ``step`` with what happened around it, without dense targets.
+
+    Args:
+        log: with at least 1.6 s before the step and 6.4 s behind it.
+        step: whose scene is wanted.
+        clips: what was seen then.
+        lane_map: of that moment.
+
+    Returns:
+        None where the future collides, leaves the road or strays.
+    """
+    moment = _Moment(log, step)
+    return moment.labelled(clips, Tagger(log).tags(step), lane_map) if moment.is_safe else None
 
 
 def history_at(log: EpisodeLog, step: int) -> FloatArray:
@@ -129,6 +137,29 @@ class _Moment:
         future = self.future[None]
         return not (collides(future, self.agents, 6.4)[0] or leaves_road(future, self.drivable)[0])
 
+    def labelled(
+        self,
+        clips: tuple[Clip, ...],
+        tags: frozenset[Tag],
+        lane_map: LaneMap,
+        dense: tuple[DenseTarget, ...] = (),
+    ) -> LabelledScene:
+        """All that is known of the moment."""
+        name = f"{self._log.seed:06d}"
+        return LabelledScene(
+            Scene(f"{name}-{self._step:04d}", clips, self.history, route_ahead(self._log, self._step)),
+            name,
+            self._log.seed,
+            self.future,
+            self.agents,
+            self.drivable,
+            self._lane_lines(),
+            self._lane_trace(),
+            tags,
+            dense,
+            lane_map,
+        )
+
     def _area(self) -> Any:
         x, y, heading, _ = self._ego
         near = shapely.clip_by_rect(
@@ -155,8 +186,7 @@ class _Moment:
             lights = lights_on(int(actor.lights[self._step]))
             yield Agent(actor.actor_id, actor.kind, *actor.size, poses.astype(np.float32), lights)
 
-    def lane_lines(self) -> tuple[FloatArray, ...]:
-        """Centre lines of the lanes around."""
+    def _lane_lines(self) -> tuple[FloatArray, ...]:
         lines = []
         for lane in self._log.road_map.lanes:
             points = np.concatenate([lane.centre[::_LANE_POINT_STEP], lane.centre[-1:]])
@@ -166,8 +196,7 @@ class _Moment:
                 lines.append(seen.astype(np.float32))
         return tuple(lines)
 
-    def lane_trace(self) -> LaneTrace:
-        """The ego's lanes over the window."""
+    def _lane_trace(self) -> LaneTrace:
         lanes = [self._log.road_map.lanes[lane] for lane in self._log.lanes[self._window]]
         return LaneTrace(
             np.array([lane.road for lane in lanes], np.int32),

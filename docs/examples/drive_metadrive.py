@@ -19,8 +19,9 @@ parser.add_argument("--film", type=Path, default=Path("drive.gif"))
 parser.add_argument("--seconds", type=float, default=20.0)
 asked = parser.parse_args()
 
-film, rig = Film(), Rig()
+film = Film()
 with PlannerClient(asked.service) as planner:
+    rig = Rig.of_width(planner.models()[0].image_size[0])
     pilot = ServicePilot(planner, "looktwice", Controls(n=6))
     drove = drive(600_000, pilot, rig, DriveConfig(asked.seconds), film.add)
 rig.close()

@@ -58,6 +58,7 @@ def drive(
     from clients.metadrive.pilots import ConstantVelocity, Pilot, ServicePilot
     from clients.metadrive.rig import Rig
     from clients.planner import Access, Patience, PlannerClient
+    from model.driving.cameras import FRONT_CAMERAS
     from model.driving.hashing import hash_of
     from model.driving.scene import split_of_seed
     from service.cli.small_pilot import SmallPilot
@@ -85,7 +86,8 @@ def drive(
             return hash_of(driver, seed, seconds, small_pilots[driver].revision)
         if driver in ("expert", "constant-velocity"):
             return hash_of(driver, seed, seconds)
-        return hash_of(driver, seed, seconds, controls_of(driver).model_dump_json(), route, tracks, models)
+        asked = controls_of(driver).model_dump_json()
+        return hash_of(driver, seed, seconds, asked, route, tracks, models, width_px)
 
     with told():
         small_pilots = {pilot.name: pilot for pilot in map(SmallPilot, small or ())}
@@ -101,9 +103,12 @@ def drive(
         seeds = range(first_seed, first_seed + episodes)
         for seed in (seeds[0], seeds[-1]):
             split_of_seed(seed)
-        rig, film, config = Rig(), Film(), DriveConfig(seconds)
+        cards = planner.models() if asks else []
+        models = [card.revision for card in cards]
+        width_px = max((card.image_size[0] for card in cards), default=FRONT_CAMERAS[0].width)
+        rig = Rig.of_width(width_px)
+        film, config = Film(), DriveConfig(seconds)
         kept = KeptDrives(keep) if keep is not None else None
-        models = [card.revision for card in planner.models()] if asks else []
         found: dict[str, list[Drive]] = {}
         # Progress goes to stderr, so that stdout holds nothing but the table.
         with Progress(console=Console(stderr=True, quiet=as_json)) as progress:

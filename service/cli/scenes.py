@@ -41,6 +41,14 @@ def generate(
         bool,
         typer.Option(help="Store what each picture cell shows, which `ground` needs."),
     ] = True,
+    service: Annotated[
+        str | None,
+        typer.Option(
+            help="URL of a service whose model drives in the expert's place: scenes are of what it meets "
+            "itself, with what the expert would do from there. Needs --no-dense."
+        ),
+    ] = None,
+    tracks: Annotated[bool, typer.Option(help="Tell that model the tracks of the objects around.")] = False,
 ) -> None:
     """Drive episodes in MetaDrive and store their scenes; run again after a kill, it resumes."""
     with told():
@@ -53,9 +61,19 @@ def generate(
             drifts=drifts,
             lapses=lapses,
             width_px=width,
+            driver=None if service is None else _model_at(service),
+            tracks=tracks,
         )
-        report = generate(out, range(first_seed, first_seed + episodes), workers=workers, config=config)
+        seeds = range(first_seed, first_seed + episodes)
+        report = generate(out, seeds, workers=workers, config=config, service=service)
         typer.echo(str(report))
+
+
+def _model_at(service: str) -> str:
+    from clients.planner import Access, PlannerClient
+
+    with PlannerClient(service, access=Access.from_environment()) as planner:
+        return ", ".join(f"{card.name} {card.revision}" for card in planner.models())
 
 
 @app.command("import")

@@ -15,8 +15,8 @@ from rich.progress import Progress, TextColumn
 
 from clients.metadrive.drive import DriveConfig
 from clients.metadrive.maps import MapError
-from clients.metadrive.own_states import OwnState, own_states
-from model.driving.scene import split_of_seed
+from clients.metadrive.own_states import own_states
+from model.driving.scene import LabelledScene, split_of_seed
 from model.network.codec import TrajectoryCodec
 from model.network.small_planner import WEIGHTS_FILE, SmallKind, small_inputs
 from model.training.small import SmallExamples, SmallSettings, train_small
@@ -93,13 +93,13 @@ def _collect(planner: Path, seeds: range, path: Path) -> None:
         if split_of_seed(seed) != "train":
             raise ValueError(f"seed {seed} is not a training seed: fewer rounds or episodes, please")
     pilot = SmallPilot(planner)
-    states: list[OwnState] = []
+    states: list[LabelledScene] = []
     collisions = 0
     with Progress() as progress:
         task = progress.add_task(f"{path.parent.name}: driving", total=len(seeds))
         for seed in seeds:
             try:
-                found, drove = own_states(seed, pilot, DriveConfig(_SECONDS))
+                found, drove = own_states(seed, pilot, config=DriveConfig(_SECONDS))
             except MapError:
                 continue
             finally:
@@ -111,8 +111,8 @@ def _collect(planner: Path, seeds: range, path: Path) -> None:
     _examples(states).save(path)
 
 
-def _examples(states: list[OwnState]) -> SmallExamples:
-    inputs = small_inputs([state.scene for state in states], "teacher")
+def _examples(states: list[LabelledScene]) -> SmallExamples:
+    inputs = small_inputs([state.given(route=True, tracks=True) for state in states], "teacher")
     return SmallExamples.of_arrays(
         inputs.history.numpy(),
         inputs.route.numpy(),

@@ -75,7 +75,8 @@ def test_an_outcome_does_not_depend_on_the_other_plans() -> None:
 
 
 def forked(**changed: Any) -> Forked:
-    steady = Forked(straight(10.0), np.full(FUTURE_STEPS, 10.0, np.float32), 64.0, None, None, None, None)
+    speeds_ms, log = np.full(FUTURE_STEPS, 10.0, np.float32), driven(0).log()
+    steady = Forked(straight(10.0), speeds_ms, 64.0, None, None, None, None, log)
     return replace(steady, **changed)
 
 
