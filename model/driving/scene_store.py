@@ -116,9 +116,9 @@ def write_scenes(
 
 
 def scene_files(path: Path) -> list[Path]:
-    """The Parquet files at ``path``: the file itself, or those in the folder, by name."""
+    """The Parquet files at ``path``: the file itself, or those in the folder and in its folders, by name."""
     if path.is_dir():
-        files = sorted(path.glob("*.parquet"))
+        files = sorted(path.rglob("*.parquet"))
         if not files:
             raise SceneFileError(f"{path} holds no .parquet scene files")
         return files

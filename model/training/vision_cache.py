@@ -1,14 +1,14 @@
 """What a frozen tower sees in all examples, worked out once: an epoch then costs no tower.
 
-The tokens lie in one file of float16, mapped into memory. The file's name tells tower, cameras and pictures
-apart, so tokens of others are never taken; a count beside it lets a killed run go on.
+The tokens lie in files of float16, one an episode, mapped into memory. A file's name tells tower, cameras
+and pictures apart, so tokens of others are never taken. Scenes that are added cost what they add, and a
+killed run goes on behind the last whole episode.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +24,7 @@ from model.network.precision import bfloat16_is_fast
 from model.training.examples import Examples, example_frames
 
 _BATCH: Final = 16
-_VERSION: Final = 1
+_VERSION: Final = 2
 
 Tokens = npt.NDArray[np.float16]
 
@@ -33,20 +33,22 @@ class VisionCache:
     """Vision tokens of examples, and of their mirror images where they were asked for.
 
     Args:
-        tokens: float16 [sides, n, v, hidden].
+        parts: float16 [sides, n, v, hidden] each; the examples lie one part behind the other.
     """
 
-    def __init__(self, tokens: Tokens) -> None:
-        self._tokens = tokens
+    def __init__(self, parts: Sequence[Tokens]) -> None:
+        self._parts = parts
+        self._starts = np.cumsum([0, *(part.shape[1] for part in parts)])
 
     @property
     def mirrored(self) -> bool:
         """Whether mirror images are there too."""
-        return len(self._tokens) > 1
+        return len(self._parts[0]) > 1
 
     def tokens(self, index: int, mirror: bool) -> Tokens:
         """Of one example, [v, hidden]; raises IndexError for a mirror image that is not there."""
-        found: Tokens = self._tokens[int(mirror), index]
+        part = int(np.searchsorted(self._starts, index, side="right")) - 1
+        found: Tokens = self._parts[part][int(mirror), index - int(self._starts[part])]
         return found
 
 
@@ -63,60 +65,53 @@ def open_vision(
     Args:
         loaded: whose tower it is.
         examples: to look at.
-        folder: where the file lies or goes.
+        folder: where the files lie or go.
         mirrored: look at mirror images too.
-        on_done: told how many of how many pictures' scenes are done.
+        on_done: told how many of how many episodes are done, whenever one is.
     """
-    settings = loaded.settings
-    text: Any = loaded.model.config.text_config
-    sides, width = 1 + int(mirrored), text.hidden_size
-    shape = (sides, len(examples), settings.vision_tokens, width)
-    stem = f"vision-{_key(loaded, examples, sides)}"
-    folder.mkdir(parents=True, exist_ok=True)
-    path, count = folder / f"{stem}.f16", folder / f"{stem}.json"
-    tokens = np.memmap(path, np.float16, "r+" if path.exists() else "w+", shape=shape)
-    done = json.loads(count.read_text())["done"] if count.exists() else 0
-    total = sides * len(examples)
-    for start in range(done, total, _BATCH):
-        places = range(start, min(start + _BATCH, total))
-        patches = np.concatenate(
-            [
-                patchify(
-                    example_frames(examples, place % len(examples), place >= len(examples), loaded.inputs),
-                    settings,
-                )
-                for place in places
-            ]
-        )
-        flat = tokens.reshape(total, *shape[2:])
-        flat[places.start : places.stop] = _look(loaded, patches, len(places))
-        if start // _BATCH % 50 == 0 or places.stop == total:
-            tokens.flush()
-            _write(count, places.stop)
-        if on_done is not None:
-            on_done(places.stop, total)
-    return VisionCache(tokens)
+    tower = _tower(loaded)
+    ends = [*np.flatnonzero(np.diff(examples.episode)) + 1, len(examples)]
+    episodes = [range(start, end) for start, end in zip([0, *ends], ends, strict=False)]
+    parts: list[Tokens] = []
+    for number, places in enumerate(episodes, start=1):
+        path = folder / f"vision-{_key(tower, examples, places, mirrored=mirrored)}.npy"
+        if not path.exists():
+            seen = [_look(loaded, examples, places, mirror) for mirror in (False, True)[: 1 + mirrored]]
+            with written_whole(path) as temporary, temporary.open("wb") as file:
+                np.save(file, np.stack(seen))
+            if on_done is not None:
+                on_done(number, len(episodes))
+        parts.append(np.load(path, mmap_mode="r"))
+    return VisionCache(parts)
 
 
 @torch.inference_mode()
-def _look(loaded: Loaded, patches: npt.NDArray[np.uint8], scenes: int) -> Tokens:
-    settings = loaded.settings
-    grid = torch.tensor([settings.grid] * (scenes * len(settings.cameras)))
-    device = loaded.model.device
-    with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16_is_fast(device.type)):
-        tokens = loaded.model.vision(torch.from_numpy(patches).to(device), grid)
-    return tokens.view(scenes, settings.vision_tokens, -1).half().cpu().numpy()
+def _look(loaded: Loaded, examples: Examples, places: range, mirror: bool) -> Tokens:
+    """Tokens [n, v, hidden] of examples, or of their mirror images."""
+    settings, device = loaded.settings, loaded.model.device
+    found = []
+    for start in range(places.start, places.stop, _BATCH):
+        batch = range(start, min(start + _BATCH, places.stop))
+        patches = np.concatenate(
+            [patchify(example_frames(examples, place, mirror, loaded.inputs), settings) for place in batch]
+        )
+        grid = torch.tensor([settings.grid] * (len(batch) * len(settings.cameras)))
+        with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16_is_fast(device.type)):
+            tokens = loaded.model.vision(torch.from_numpy(patches).to(device), grid)
+        found.append(tokens.view(len(batch), settings.vision_tokens, -1).half().cpu().numpy())
+    return np.concatenate(found)
 
 
-def _key(loaded: Loaded, examples: Examples, sides: int) -> str:
+def _tower(loaded: Loaded) -> str:
     weights: dict[str, Any] = loaded.model.model.visual.state_dict()
     tower = [weights[name].float().cpu().numpy().tobytes() for name in sorted(weights)]
-    settings = (loaded.settings.cameras, loaded.settings.grid)
+    return hash_of(loaded.settings.cameras, loaded.settings.grid, *tower)
+
+
+def _key(tower: str, examples: Examples, places: range, *, mirrored: bool) -> str:
     # Not by the names of scenes: two folders may have scenes of one name, with other pictures.
-    pictures = hashlib.sha256(examples.pictures.data).digest()
-    return hash_of(_VERSION, sides, settings, *tower, pictures, examples.picture_spans.tobytes())
-
-
-def _write(path: Path, done: int) -> None:
-    with written_whole(path) as temporary:
-        temporary.write_text(json.dumps({"done": done}))
+    spans = examples.picture_spans[places.start : places.stop].reshape(-1, 2)
+    pictures = hashlib.sha256()
+    for first, last in spans.tolist():
+        pictures.update((last - first).to_bytes(8, "big") + examples.pictures[first:last].data)
+    return hash_of(_VERSION, mirrored, tower, pictures.digest())

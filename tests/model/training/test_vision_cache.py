@@ -17,7 +17,13 @@ from model.training.learner import ResponseLearner
 from model.training.vision_cache import VisionCache, open_vision
 from tests.model.training.scenes import training_scene
 
-EXAMPLES = Examples.from_scenes((training_scene(k) for k in range(20)), (FRONT_WIDE, FRONT_TELE))
+CAMERAS = (FRONT_WIDE, FRONT_TELE)
+EXAMPLES = replace(
+    Examples.from_scenes((training_scene(k) for k in range(20)), CAMERAS), episode=np.repeat(np.arange(4), 5)
+)
+OTHERS = replace(
+    Examples.from_scenes((training_scene(k) for k in range(20, 23)), CAMERAS), episode=np.full(3, 9)
+)
 
 
 @pytest.fixture(scope="module")
@@ -45,15 +51,23 @@ def test_a_killed_cache_goes_on_where_it_was(loaded: Loaded, tmp_path: Path) -> 
 
     def killed(so_far: int, total: int) -> None:
         done.append(so_far)
-        if so_far >= 16:
+        if so_far == 2:
             raise KeyboardInterrupt
+
+    def open_examples(examples: Examples) -> VisionCache:
+        return open_vision(
+            loaded, examples, tmp_path, mirrored=False, on_done=lambda so_far, total: done.append(so_far)
+        )
 
     with pytest.raises(KeyboardInterrupt):
         open_vision(loaded, EXAMPLES, tmp_path, mirrored=False, on_done=killed)
-    open_vision(loaded, EXAMPLES, tmp_path, mirrored=False, on_done=lambda so_far, total: done.append(so_far))
-    assert done == [16, 20]
-    open_vision(loaded, EXAMPLES, tmp_path, mirrored=False, on_done=lambda so_far, total: done.append(so_far))
-    assert done == [16, 20], "what is there is not worked out again"
+    whole = open_examples(EXAMPLES)
+    assert done == [1, 2, 3, 4], "an episode that is there is not worked out again"
+    more = Examples.concatenate([OTHERS, EXAMPLES])
+    joined = open_examples(more)
+    assert done == [1, 2, 3, 4, 1], "others that are added cost what they add"
+    for index in range(len(EXAMPLES)):
+        np.testing.assert_array_equal(joined.tokens(len(OTHERS) + index, False), whole.tokens(index, False))
 
 
 def test_another_tower_has_another_cache(loaded: Loaded, resampling_checkpoint: Path, tmp_path: Path) -> None:
@@ -99,4 +113,4 @@ def test_learning_from_the_cache_is_learning_from_the_pictures(loaded: Loaded) -
         with torch.no_grad():
             return float(learner(**collate([data[item] for item in items]))["loss"])
 
-    assert loss(VisionCache(tokens.astype(np.float16))) == pytest.approx(loss(None), rel=1e-3)
+    assert loss(VisionCache([tokens.astype(np.float16)])) == pytest.approx(loss(None), rel=1e-3)
