@@ -12,6 +12,8 @@ from model.driving.plan import Plan
 
 MOST_WORDS: Final = 80
 """CF-VLA section 8: one short paragraph."""
+MOST_CHARACTERS: Final = 2000
+"""Far more than so many words have. The time of the checks grows with the square of a text's length."""
 
 Check = Literal["answer", "form", "length", "leak", "anchor", "direction"]
 
@@ -49,6 +51,8 @@ def check_reflection(text: str, predicted: Plan, expert: Plan) -> list[FailedChe
         predicted: the model's own plan, which the text looks at.
         expert: the plan that comes behind the text.
     """
+    if len(text) > MOST_CHARACTERS:
+        return [FailedCheck("length", f"write at most {MOST_WORDS} words")]
     if (facts := facts_of(text)) is not None:
         return _check_facts(facts, predicted, expert)
     failed: list[FailedCheck] = []

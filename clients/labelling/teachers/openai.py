@@ -29,6 +29,8 @@ _BUSY: Final = (408, 409, 425, 429, 500, 502, 503, 504, 529)
 _CLOSED: Final = (401, 402, 403, 404, 405)
 MAX_ANSWER_BYTES: Final = 1_000_000
 """A paragraph has some kB with everything around it; reasoning that an endpoint tells beside it, tens."""
+_MOST_TOKENS: Final = 10_000_000
+"""That one answer can have taken: beyond any context there is."""
 _SHOWN: Final = 300
 """Characters of an error's body that are told."""
 
@@ -74,8 +76,8 @@ class _Choice(BaseModel):
 
 class _Usage(BaseModel):
     model_config = ConfigDict(extra="ignore")
-    prompt_tokens: int = Field(default=0, ge=0)
-    completion_tokens: int = Field(default=0, ge=0)
+    prompt_tokens: int = Field(default=0, ge=0, le=_MOST_TOKENS)
+    completion_tokens: int = Field(default=0, ge=0, le=_MOST_TOKENS)
 
 
 class _Completion(BaseModel):
@@ -89,7 +91,10 @@ class OpenAiTeacher:
 
     def __init__(self, settings: OpenAiSettings) -> None:
         self._settings = settings
-        headers = {} if settings.api_key is None else {"Authorization": f"Bearer {settings.api_key}"}
+        # Packed answers would be measured only once they are unpacked.
+        headers = {"Accept-Encoding": "identity"}
+        if settings.api_key is not None:
+            headers["Authorization"] = f"Bearer {settings.api_key}"
         self._http = httpx.AsyncClient(
             base_url=settings.base_url.rstrip("/") + "/", timeout=settings.timeout_s, headers=headers
         )
@@ -131,7 +136,7 @@ class OpenAiTeacher:
         """The response with its whole body; raises `TeacherError` for one that no completion needs."""
         async with self._http.stream("POST", "chat/completions", json=body) as response:
             content = bytearray()
-            async for part in response.aiter_bytes():
+            async for part in response.aiter_raw():
                 content += part
                 if len(content) > MAX_ANSWER_BYTES:
                     raise TeacherError(f"the answer has more than {MAX_ANSWER_BYTES} bytes")

@@ -3,14 +3,17 @@ from __future__ import annotations
 import asyncio
 import base64
 import email.utils
+import gzip
 import json
 import time
 from collections.abc import AsyncIterator
+from typing import Any
 
 import pytest
 from fastapi import FastAPI
 from hypothesis import given
 from starlette.responses import StreamingResponse
+from starlette.types import ASGIApp
 
 from clients.labelling.checks import FailedCheck, check_reflection
 from clients.labelling.teachers.facts import phrases_of
@@ -170,16 +173,16 @@ def slow_app(part: bytes, pause_s: float, parts: int) -> FastAPI:
     return app
 
 
-def asked_of(app: FastAPI, timeout_s: float) -> None:
-    async def asking(url: str) -> None:
+def asked_of(app: ASGIApp, timeout_s: float) -> Answer:
+    async def asking(url: str) -> Answer:
         teacher = OpenAiTeacher(OpenAiSettings(f"{url}/v1", "some-vlm", timeout_s=timeout_s))
         try:
-            await teacher.reflect(QUESTION)
+            return await teacher.reflect(QUESTION)
         finally:
             await teacher.close()
 
     with listening(app) as (url, _):
-        asyncio.run(asking(url))
+        return asyncio.run(asking(url))
 
 
 def test_an_answer_that_trickles_in_is_given_up() -> None:
@@ -194,10 +197,22 @@ def test_an_answer_without_end_is_given_up() -> None:
     assert not isinstance(refused.value, TeacherBusy)
 
 
-def test_counts_that_cannot_be_make_no_answer() -> None:
+def test_a_packed_answer_is_not_unpacked() -> None:
+    """A few kB can unpack to gigabytes."""
+
+    async def bomb(scope: Any, receive: Any, send: Any) -> None:
+        headers = [(b"content-encoding", b"gzip")]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body", "body": gzip.compress(bytes(50_000_000))})
+
+    assert "chat completion" in asked_of(bomb, timeout_s=30.0).unusable
+
+
+@pytest.mark.parametrize("count", [-5, 10**400])
+def test_counts_that_cannot_be_make_no_answer(count: int) -> None:
     told = completion(GOOD)
-    told["usage"]["completion_tokens"] = -5
-    found = answer(ChatServer([json.dumps(told).encode()]))
+    told["usage"]["completion_tokens"] = count
+    found = answer(ChatServer([json.dumps(told).encode()]), output_price_usd=10.0)
     assert found.unusable
     assert (found.input_tokens, found.output_tokens) == (0, 0)
 
