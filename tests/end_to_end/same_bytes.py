@@ -1,6 +1,6 @@
 """The same plan request, asked over HTTP in several ways: how many draws differ in a byte.
 
-Run by hand over more scenes: ``python -m tests.end_to_end.same_bytes SCENES COUNT``.
+Run by hand over more scenes: ``python -m tests.end_to_end.same_bytes SCENES COUNT [FIRST]``, in pieces.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ def compare(http: httpx.Client, scene: Scene) -> Counter[str]:
 
 
 def main() -> None:
-    path, count = Path(sys.argv[1]), int(sys.argv[2])
+    path, count, first = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]) if len(sys.argv) > 3 else 0
     differing = Counter(dict.fromkeys(WAYS, 0))
     with serve(TorchEngine(CHECKPOINT), Settings()) as served:
-        for done, labelled in enumerate(islice(read_scenes(path, dense=False), count), 1):
+        for done, labelled in enumerate(islice(read_scenes(path, dense=False), first, first + count), 1):
             differing.update(compare(served.http, labelled.scene))
             if done in (1, count) or done % 10 == 0:
                 print(f"draws of {done} scenes that differ: {dict(differing)}", flush=True)
