@@ -33,6 +33,7 @@ from service.planning import Limits, Planning
 from service.pulse import Pulse
 from service.rates import Rates
 from service.routes import make_router
+from service.scorer import Scorer
 from service.settings import Settings
 from service.traces import Traces, traces_from_environment
 
@@ -72,7 +73,7 @@ def create_app(
     metrics.watch(lambda: lifecycle.load, admission)
     limits = Limits(settings.queue_timeout_s, settings.decode_timeout_s)
     planning = Planning(lifecycle, admission, Rates(settings.rate_limit), metrics, traces, limits)
-    pulse = Pulse()
+    pulse, scorer = Pulse(), Scorer(settings.bundled_scenes)
     idempotency = Idempotency(settings.idempotency_s, time.monotonic)
 
     @asynccontextmanager
@@ -84,6 +85,7 @@ def create_app(
         finally:
             pulse.end()
             await lifecycle.end()
+            await scorer.close()
             await teacher.close()
 
     app = FastAPIOffline(
@@ -115,7 +117,8 @@ def create_app(
         )
     app.add_middleware(Around, metrics=metrics, traces=traces, stopping=lambda: lifecycle.stopping)
     install_error_handlers(app, metrics)
-    parts = Parts(settings, metrics, lifecycle, planning, idempotency, teacher, load, int(time.time()), pulse)
+    began_s = int(time.time())
+    parts = Parts(settings, metrics, lifecycle, planning, idempotency, teacher, load, began_s, pulse, scorer)
     app.include_router(make_router(parts))
     add_inspector(app)
     describe(app, keys=bool(keys))

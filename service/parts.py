@@ -13,6 +13,7 @@ from service.lifecycle import Lifecycle
 from service.metrics import Metrics
 from service.planning import Planning
 from service.pulse import Pulse
+from service.scorer import Scorer
 from service.settings import Settings
 
 
@@ -35,3 +36,4 @@ class Parts:
     load: Callable[[Path], Engine] | None
     began_s: int
     pulse: Pulse
+    scorer: Scorer

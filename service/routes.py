@@ -78,7 +78,7 @@ def make_router(parts: Parts) -> APIRouter:
     router.include_router(openai_router(parts))
     _add_labelling(router, parts)
     bundled = BundledScenes(parts.settings.bundled_scenes)
-    router.include_router(scoring_router(parts, bundled))
+    router.include_router(scoring_router(parts))
     _add_models(router, parts)
     _add_probes(router, parts)
     _add_scenes(router, parts, bundled)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from typing import Annotated, Any, Final
 
@@ -39,13 +38,9 @@ from service.problems import (
     ProblemError,
     unforeseen,
 )
-from service.scoring import scored
-from service.views import BundledScenes
 
 log = structlog.stdlib.get_logger()
 
-_AT_ONCE: Final = 1
-"""Scenes that are scored; each is work for one core, and planning needs the others."""
 EXAMPLES: Final[dict[str, Example]] = {"straight on behind a car": {"value": example_score()}}
 _REFUSALS: Final = (
     *(INVALID_JSON, INVALID_BODY, UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE),
@@ -54,24 +49,21 @@ _REFUSALS: Final = (
 )
 
 
-def scoring_router(parts: Parts, bundled: BundledScenes) -> APIRouter:
+def scoring_router(parts: Parts) -> APIRouter:
     """The endpoints of the scorer."""
     admission = Admission(parts.settings.max_scenes, parts.settings.max_scenes, time.monotonic)
-    working = asyncio.Semaphore(_AT_ONCE)
 
     def check_open(_: Request) -> None:
         parts.lifecycle.check_accepting()
         with full_as_problem():
             admission.check_open()
 
-    async def one(asked: wire_scores.ScoreRequest, arrival: Arrival) -> wire_scores.ScoreResponse:
-        async with working:
-            return await asyncio.to_thread(scored, asked, bundled, arrival.request_id)
-
     async def result(given: Any, arrival: Arrival) -> wire_scores.ScoreResult:
         try:
             asked = validated(wire_scores.ScoreRequest, given)
-            return wire_scores.ScoreResult(status=200, response=await one(asked, arrival))
+            return wire_scores.ScoreResult(
+                status=200, response=await parts.scorer.score(asked, arrival.request_id)
+            )
         except ProblemError as error:
             failure = error
         except Exception:  # one scene must not end the others
@@ -97,7 +89,8 @@ def scoring_router(parts: Parts, bundled: BundledScenes) -> APIRouter:
         arrival = arrival_of(request)
         with parts.lifecycle.accepted(), let_in(admission.place(1)):
             await parts.planning.spend(arrival.owner, 1)
-            return respond(request, await while_connected(request, one(asked, arrival)))
+            scoring = parts.scorer.score(asked, arrival.request_id)
+            return respond(request, await while_connected(request, scoring))
 
     @router.post(
         "/v1/score/batch",

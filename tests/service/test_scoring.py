@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import msgpack
+import psutil
 import pytest
 
 from clients.planner import PlannerClient
@@ -16,6 +18,7 @@ from service.examples import example_score
 from service.no_model import NoModel
 from service.settings import Settings
 from tests.service.serving import Served, body, serve
+from tests.service.test_errors import problem
 from tests.waiting import until
 
 SUB_SCORES = {
@@ -166,3 +169,36 @@ def test_without_a_model_nothing_is_planned(scorer: Served[NoModel]) -> None:
     answer = scorer.http.post("/v1/plan", json=body())
     assert answer.status_code == 422
     assert "without a model" in answer.json()["detail"]
+
+
+def comb(sides: int, offset_m: float) -> list[list[float]]:
+    """An outline whose sides all run beside each other, past every plan."""
+    teeth = [
+        [[offset_m + 0.4 * tooth, -50.0], [offset_m + 0.4 * tooth + 0.1, 50.0]] for tooth in range(sides // 2)
+    ]
+    way = [point for tooth, pair in enumerate(teeth) for point in (pair if tooth % 2 == 0 else pair[::-1])]
+    return [*way[:-1], [offset_m + 0.2 * sides + 0.5, -60.0], [offset_m - 0.5, -60.0]]
+
+
+def test_a_small_request_that_takes_gigabytes_to_score_harms_nobody(scorer: Served[NoModel]) -> None:
+    lanes = [
+        {"lane_id": str(lane), "ring": comb(120, 0.001 * lane - 20), "on_route": True} for lane in range(300)
+    ]
+    plans = example_score()["trajectories"] * 128
+    refused = scorer.http.post("/v1/score", json={**with_labels(lanes=lanes), "trajectories": plans})
+    assert "send fewer trajectories" in problem(refused, "invalid-labels").detail
+    assert len(scorer.http.post("/v1/score", json=asked()).json()["scores"]) == 2
+
+
+def test_who_leaves_ends_the_scoring(scorer: Served[NoModel]) -> None:
+    """Nobody waits for a queue of scores that nobody wants."""
+    lanes = [
+        {"lane_id": str(lane), "ring": comb(60, 0.001 * lane - 6), "on_route": True} for lane in range(100)
+    ]
+    long = {**with_labels(lanes=lanes), "trajectories": example_score()["trajectories"] * 1000}
+    assert scorer.http.post("/v1/score", json=asked()).status_code == 200
+    for _ in range(3):
+        with pytest.raises(httpx.ReadTimeout):
+            scorer.http.post("/v1/score", json=long, timeout=0.5)
+    assert len(scorer.http.post("/v1/score", json=asked()).json()["scores"]) == 2
+    assert len(psutil.Process().children()) == 1
