@@ -87,6 +87,7 @@ class PlannedDraw:
         cut: what the deadline did to the second look: skipped, shortened, replaced; else None.
         consistent: whether the parts of the draw agree; None where nothing can be said.
         disagreements: which do not: ``plan_trajectory``, ``reason_change``.
+        logprobs: its tokens and how likely each decision was; None unless asked for.
     """
 
     index: int
@@ -101,6 +102,7 @@ class PlannedDraw:
     cut: wire.Cut | None = None
     consistent: bool | None = None
     disagreements: tuple[str, ...] = ()
+    logprobs: wire.Logprobs | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +133,7 @@ class LookedAt:
         changes: the stretches in which they differ.
         trajectory: float32 [64, 4]: x, y, z in m and heading in rad at 10 Hz, ego frame, first row at +0.1 s.
         tokens: tokens per section.
-        consistent, disagreements: as of a `PlannedDraw`.
+        consistent, disagreements, logprobs: as of a `PlannedDraw`.
     """
 
     index: int
@@ -144,6 +146,7 @@ class LookedAt:
     tokens: dict[str, int]
     consistent: bool | None = None
     disagreements: tuple[str, ...] = ()
+    logprobs: wire.Logprobs | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,6 +315,7 @@ def _looked_at(draw: wire.Reflection) -> LookedAt:
         tokens=draw.tokens,
         consistent=draw.consistent,
         disagreements=tuple(draw.disagreements),
+        logprobs=draw.logprobs,
     )
 
 
@@ -331,4 +335,5 @@ def _draw(draw: wire.Draw) -> PlannedDraw:
         cut=draw.cut,
         consistent=draw.consistent,
         disagreements=tuple(draw.disagreements),
+        logprobs=draw.logprobs,
     )

@@ -203,6 +203,9 @@ class ReflectControls(Asked):
         default=False,
         description="Begin only trajectories that do what the plan says, as our labeller reads them.",
     )
+    logprobs: bool = Field(
+        default=False, description="Tell each draw's tokens, and how likely each of its decisions was."
+    )
 
 
 class Controls(ReflectControls):
@@ -234,6 +237,17 @@ class Plan(Answered):
     tracks: Tracks
 
 
+class Logprobs(Answered):
+    """A draw token by token; both lists have as many entries as it has tokens."""
+
+    token_ids: list[int] = Field(description="In the checkpoint's own vocabulary.")
+    logprobs: list[Annotated[float, Field(le=0, allow_inf_nan=False)] | None] = Field(
+        description="Natural logarithm of a token's probability among those that the format allows there, at "
+        "the request's temperature (0 counts as 1), however it was chosen: least_error, top_p, thinking, "
+        "bind and deadlines change nothing. null where the format forces the token."
+    )
+
+
 class Draw(Answered):
     """One of the n responses of a scene."""
 
@@ -262,6 +276,7 @@ class Draw(Answered):
         "it follows), reason_change (the revised plan does not change as the reasoning asks for).",
     )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
+    logprobs: Logprobs | None = Field(default=None, description="Null unless asked for.")
 
 
 class ModelName(Answered):
@@ -361,6 +376,7 @@ class Reflection(Answered):
         "it follows), reason_change (the revised plan does not change as the reasoning asks for).",
     )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
+    logprobs: Logprobs | None = Field(default=None, description="Null unless asked for.")
 
 
 class ReflectResponse(Answered):

@@ -107,7 +107,15 @@ def _draw(draw: Draw, agreement: Agreement, draft: Draw | None) -> wire.Draw:
         consistent=agreement.consistent,
         disagreements=list(agreement.disagreements),
         tokens=dict(draw.tokens),
+        logprobs=_logprobs(draw),
     )
+
+
+def _logprobs(draw: Draw) -> wire.Logprobs | None:
+    """Where they were asked for; below 0 by rounding alone where a token is certain."""
+    if not draw.logprobs:
+        return None
+    return wire.Logprobs(token_ids=list(draw.ids), logprobs=list(draw.logprobs))
 
 
 def _reflection(given: Plan, draw: Draw, agreement: Agreement) -> wire.Reflection:
@@ -134,4 +142,5 @@ def _reflection(given: Plan, draw: Draw, agreement: Agreement) -> wire.Reflectio
         consistent=agreement.consistent,
         disagreements=list(agreement.disagreements),
         tokens=dict(draw.tokens),
+        logprobs=_logprobs(draw),
     )

@@ -103,6 +103,7 @@ class Extras(wire.Asked):
     numbers: wire.Decision = "least_error"
     codes: wire.Decision = "least_error"
     bind: bool = False
+    logprobs: bool = False
     format: str = Field(default="cf_vla", max_length=40)
 
 
@@ -147,9 +148,7 @@ def plan_document(chat: ChatRequest, card: ModelCard) -> dict[str, Any]:
         {"camera": camera, "images": images[CLIP_FRAMES * number :][:CLIP_FRAMES]}
         for number, camera in enumerate(card.cameras)
     ]
-    controls = extras.model_dump(
-        include={"thinking", "think_threshold", "prefill", "deadline_ms", "numbers", "codes", "bind"}
-    )
+    controls = extras.model_dump(exclude={"history", "route", "tracks", "format"})
     controls |= chat.model_dump(include={"n", "temperature", "top_p", "seed"})
     scene = {"clips": clips, "history": extras.history or _STANDING, "route": extras.route}
     if extras.tracks is not None:

@@ -58,6 +58,7 @@ class Controls:
             words are.
         codes: how trajectory codes are chosen, likewise.
         bind: only trajectories may be begun that do what the plan says (`model.engines.binding`).
+        logprobs: draws tell how likely each of their decisions was.
     """
 
     thinking: Thinking = "adaptive"
@@ -71,6 +72,7 @@ class Controls:
     numbers: Decision = "least_error"
     codes: Decision = "least_error"
     bind: bool = False
+    logprobs: bool = False
 
     def __post_init__(self) -> None:
         if self.thinking not in ("adaptive", "always", "never"):
@@ -137,6 +139,9 @@ class Draw:
         passes: how often the network was run for it, its prompt apart.
         chosen: tokens at which the format left more than one; all others are forced.
         cut: what the deadline did to its second look; None where it did nothing.
+        ids: of its tokens.
+        logprobs: of each token's choice, see `model.engines.logprobs`; None where the token is forced. Empty
+            where `Controls.logprobs` does not ask for them.
     """
 
     index: int
@@ -152,6 +157,8 @@ class Draw:
     passes: int = 0
     chosen: int = 0
     cut: Cut | None = None
+    ids: tuple[int, ...] = ()
+    logprobs: tuple[float | None, ...] = ()
 
     @property
     def looked_twice(self) -> bool:

@@ -72,7 +72,8 @@ def read(
     Raises:
         FormatError: the text is no response of the format.
     """
-    text = vocabulary.decode([token.id for token in response.tokens])
+    ids = tuple(token.id for token in response.tokens)
+    text = vocabulary.decode(ids)
     values = parse(response.cursor.compiled, text, given_plans(request, family))
     reading = family.read(values, lambda codes: codec.decode(request.scene.history[None], [codes])[0])
     counts = dict(Counter(token.section for token in response.tokens))
@@ -91,6 +92,8 @@ def read(
             passes=passes,
             chosen=response.chosen,
             cut=response.cut,
+            ids=ids,
+            logprobs=tuple(response.logprobs) if request.controls.logprobs else (),
         )
         for index in draws
     ]

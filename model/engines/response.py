@@ -26,6 +26,7 @@ class Response:
     Attributes:
         cursor: where the response stands, behind everything in ``tokens``.
         tokens: the response so far.
+        logprobs: of the tokens; None where they are forced, or nobody asks.
         think_probability: at the branch, once that is decided.
         chosen: how many tokens were chosen where the format left more than one.
         cut: what a deadline did to the second look.
@@ -34,13 +35,14 @@ class Response:
 
     cursor: Cursor
     tokens: list[Token] = field(default_factory=list, kw_only=True)
+    logprobs: list[float | None] = field(default_factory=list, kw_only=True)
     think_probability: float | None = field(default=None, kw_only=True)
     chosen: int = field(default=0, kw_only=True)
     cut: Cut | None = field(default=None, kw_only=True)
     streamed: int = field(default=0, kw_only=True)
 
-    def append(self, token: int, vocabulary: Vocabulary) -> list[SectionText]:
-        """Write one token; returns the section that it finishes, if any.
+    def append(self, token: int, vocabulary: Vocabulary, logprob: float | None = None) -> list[SectionText]:
+        """Write one token, chosen with a log-probability; returns the section that it finishes, if any.
 
         Raises:
             FormatError: the format does not allow it here.
@@ -48,6 +50,7 @@ class Response:
         self.chosen += len(self.cursor.allowed().ids) > 1
         before, self.cursor = self.cursor.section, self.cursor.advance(token)
         self.tokens.append(Token(token, before))
+        self.logprobs.append(logprob)
         return self._finished(before, self.cursor.section, vocabulary)
 
     def append_forced(self, vocabulary: Vocabulary) -> list[SectionText]:
@@ -57,6 +60,7 @@ class Response:
         sections = [*(token.section for token in run[1:]), self.cursor.section]
         for token, then in zip(run, sections[: len(run)], strict=True):
             self.tokens.append(token)
+            self.logprobs.append(None)
             finished += self._finished(token.section, then, vocabulary)
         return finished
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.engines.logprobs import log_probability
+from model.formats.replay import Decision
 from model.network.codec import TrajectoryCodec
 from model.network.intent import present_speeds
 from model.network.trajectory_head import TrajectoryHead
 from model.network.vla import LookTwiceVla
 from model.network.vocabulary import FUTURE_START, Vocabulary
+from model.training.batches import Batch
 from model.training.loss import response_loss
 
 _PLACES_STEP: Final = 256
@@ -109,26 +113,13 @@ class ResponseLearner(nn.Module):
         patches: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """The loss of a batch from `collate`, and its parts: `ResponseLoss` and the head's ADE."""
-        vla = self.vla
-        vision_tokens = None if seen is None else seen.float().flatten(0, 1)
-        if patches is not None:
-            grid = vla.settings.grid
-            clips = len(patches) // (grid[0] * grid[1] * grid[2])
-            vision_tokens = vla.vision(patches, torch.tensor([grid] * clips))
-        embeddings = vla.embed(input_ids, vision_tokens, history, route, tracks)
         lie = _Lie.of(parts)
-        outputs = self._decoder[0](
-            inputs_embeds=embeddings,
-            attention_mask=lie.mask,
-            position_ids=vla.position_ids(input_ids, parts >= 0) - lie.moved,
-            use_cache=False,
-        )
-        hidden = outputs.last_hidden_state
+        hidden = self._hidden(lie, input_ids, parts, history, route, tracks, seen, patches)
         labels, weights = input_ids.flatten(), loss_weights.flatten()
         # Logits only where a token is predicted that counts: a third of the positions.
         places = weights.nonzero()[:, 0]
         filling = -len(places) % _PLACES_STEP
-        logits = vla.lm_head(hidden.flatten(0, 1)[F.pad(lie.before[places], (0, filling))])
+        logits = self.vla.lm_head(hidden.flatten(0, 1)[F.pad(lie.before[places], (0, filling))])
         labels, weights = F.pad(labels[places], (0, filling)), F.pad(weights[places], (0, filling))
         # The start of each response's trajectory, and which of them are to be learned.
         row, place = ((input_ids == self._future_start_id) & (parts > 0)).nonzero(as_tuple=True)
@@ -154,3 +145,60 @@ class ResponseLearner(nn.Module):
             losses["loss"] = losses["loss"] + self._head_weight * drawn["loss"]
             losses["head_ade_m"] = drawn["ade_m"]
         return losses
+
+    def log_probabilities(
+        self, batch: Batch, responses: Sequence[Sequence[Decision]], temperature: float
+    ) -> list[Tensor]:
+        """How likely the decisions of a batch's responses are: [decisions] for each response, with gradients.
+
+        Args:
+            batch: from `collate`.
+            responses: their decisions, row by row.
+            temperature: that they were drawn at.
+        """
+        parts = batch["parts"]
+        lie = _Lie.of(parts)
+        given = {name: batch.get(name) for name in ("history", "route", "tracks", "seen", "patches")}
+        hidden = self._hidden(lie, batch["input_ids"], parts, **given).flatten(0, 1)
+        starts = [
+            int((row == part).nonzero()[0]) + number * parts.shape[1]
+            for number, row in enumerate(parts)
+            for part in range(1, int(row.max()) + 1)
+        ]
+        found = []
+        for start, decisions in zip(starts, responses, strict=True):
+            logits = self.vla.lm_head(hidden[lie.before[[start + each.position for each in decisions]]])
+            each = [
+                log_probability(
+                    row[torch.from_numpy(decision.ids).to(row.device)], decision.place, temperature
+                )
+                for row, decision in zip(logits, decisions, strict=True)
+            ]
+            found.append(torch.stack(each))
+        return found
+
+    def _hidden(
+        self,
+        lie: _Lie,
+        input_ids: Tensor,
+        parts: Tensor,
+        history: Tensor | None,
+        route: Tensor | None,
+        tracks: Tensor | None,
+        seen: Tensor | None,
+        patches: Tensor | None,
+    ) -> Tensor:
+        """The last states [b, t, hidden] of a batch from `collate`."""
+        vla = self.vla
+        vision_tokens = None if seen is None else seen.float().flatten(0, 1)
+        if patches is not None:
+            grid = vla.settings.grid
+            clips = len(patches) // (grid[0] * grid[1] * grid[2])
+            vision_tokens = vla.vision(patches, torch.tensor([grid] * clips))
+        states: Tensor = self._decoder[0](
+            inputs_embeds=vla.embed(input_ids, vision_tokens, history, route, tracks),
+            attention_mask=lie.mask,
+            position_ids=vla.position_ids(input_ids, parts >= 0) - lie.moved,
+            use_cache=False,
+        ).last_hidden_state
+        return states

@@ -171,6 +171,8 @@ def _draw(request: PlanRequest, index: int) -> Draw:
         tokens=tokens,
         passes=30,
         chosen=20,
+        ids=(11, 12, 13 + index),
+        logprobs=(None, -0.25, -1.5) if controls.logprobs else (),
     )
     return replace(direct, thinking=REASONING, revised_plan=SLOW_DOWN) if think else direct
 

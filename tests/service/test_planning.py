@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+import clients.wire as wire
+from clients.planner import PlannerClient, PlanResult, plan_request
 from clients.wire import PlanResponse
 from model.driving.images import ImageError
 from model.driving.plan import parse_plan
@@ -84,6 +86,21 @@ def test_the_engine_gets_what_was_asked(served: Served, engine: ScriptedEngine) 
     # It counts from arrival, so some of it is gone.
     assert controls.deadline_ms is not None
     assert 1 <= controls.deadline_ms < 900
+
+
+def test_log_probabilities_are_told_where_they_are_asked_for(served: Served) -> None:
+    asked, given = wire.Controls(n=1, logprobs=True), wire.ReflectControls(n=1, logprobs=True)
+    with PlannerClient(served.url) as planner:
+        silent = planner.plan(scene(), wire.Controls(n=1))
+        alone = planner.plan(scene(), asked)
+        [batch] = planner.plan_batch([plan_request(scene(), asked)])
+        events = dict(planner.stream(plan_request(scene(), asked)))
+        looked = planner.reflect(scene(), KEEP_ON, given)
+    assert silent.draws[0].logprobs is None
+    assert isinstance(batch, PlanResult)
+    assert isinstance(events["done"], PlanResult)
+    for result in (alone, batch, events["done"], looked):
+        assert result.draws[0].logprobs == wire.Logprobs(token_ids=[11, 12, 13], logprobs=[None, -0.25, -1.5])
 
 
 def test_the_route_may_be_left_out(served: Served, engine: ScriptedEngine) -> None:

@@ -23,6 +23,7 @@ from model.engines.engine import (
     Started,
 )
 from model.engines.least_error import LeastError
+from model.engines.logprobs import reported
 from model.engines.requests import begin, read
 from model.engines.torch.batch import Batch, Feed
 from model.engines.torch.deadlines import LatencyModel, drafts_of
@@ -263,7 +264,7 @@ class Decoder:
             tree.start()
             for row in tree.rows:
                 if not row.tokens:
-                    events += [(tree.request.id, event) for event in row.write((), self._vocabulary)]
+                    events += [(tree.request.id, event) for event in row.write(None, self._vocabulary)]
         return events
 
     def _open(self, trees: Sequence[Tree]) -> list[StepEvent]:
@@ -350,9 +351,10 @@ class Decoder:
             for token, draws in some
         ]
         token, row.draws = chosen[0]
-        events = row.write((token,), self._vocabulary)
-        for part, token in parts:
-            events += part.write((token,), self._vocabulary)
+        events = list[Event]()
+        for writing, written in ((row, token), *parts):
+            logprob = reported(row.request.controls, writing.cursor, logits, written)
+            events += writing.write(written, self._vocabulary, logprob)
         return events
 
     def _finish(self, row: Row) -> list[Event]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -69,6 +68,7 @@ class Row(Response):
             draws=draws,
             pending=list(self.pending),
             tokens=list(self.tokens),
+            logprobs=list(self.logprobs),
             draft=self.draft or draft,
         )
 
@@ -100,12 +100,12 @@ class Row(Response):
             chosen.setdefault(int(ids[place]), []).append(draw)
         return [(token, tuple(draws)) for token, draws in chosen.items()]
 
-    def write(self, ids: Sequence[int], vocabulary: Vocabulary) -> list[Event]:
-        """Append tokens and the forced run behind them; returns the sections that they finish."""
+    def write(self, token: int | None, vocabulary: Vocabulary, logprob: float | None = None) -> list[Event]:
+        """Append a token that was chosen, if any, and the forced run behind it; returns what they finish."""
         written, finished = len(self.tokens), list[SectionText]()
         was_text = self.cursor.stop_id is not None
-        for token in ids:
-            finished += self.append(token, vocabulary)
+        if token is not None:
+            finished += self.append(token, vocabulary, logprob)
         if was_text and self.cursor.stop_id is None:
             self.passes_before_ending = self.passes
         finished += self.append_forced(vocabulary)

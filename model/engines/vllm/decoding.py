@@ -23,6 +23,7 @@ from model.engines.engine import (
     TextWritten,
 )
 from model.engines.least_error import Expected, LeastError, least_error
+from model.engines.logprobs import reported
 from model.engines.requests import leads_to_reflection, read
 from model.engines.response import Response, SectionText
 from model.families.family import Branch, Family
@@ -172,8 +173,8 @@ class Decoding:
 
         controls, first = self._request.controls, draws[0]
         named = self._branch_ids(first)
-        if weighs:
-            named = allowed.ids.tolist() if len(allowed.ids) <= _MOST_NAMED else None
+        if weighs or controls.logprobs:
+            named = allowed.ids.tolist() if alone and len(allowed.ids) <= _MOST_NAMED else None
         grammar = None if alone else StructuredOutputsParams(grammar=self._grammar(first.cursor))
         return SamplingParams(
             n=1 if weighs else len(draws),
@@ -181,7 +182,7 @@ class Decoding:
             top_p=controls.top_p,
             seed=seed_of(controls.seed, first.index, len(first.tokens)),
             max_tokens=1 if alone else first.cursor.compiled.longest(),
-            logprobs=-1 if weighs and named is None else None,
+            logprobs=-1 if (weighs or controls.logprobs) and named is None else None,
             logprob_token_ids=named,
             allowed_token_ids=allowed.ids.tolist() if alone else None,
             structured_outputs=grammar,
@@ -223,13 +224,17 @@ class Decoding:
             if branch is not None and allowed.choice == branch.name and len(allowed.ids) > 1:
                 assert weighed is not None
                 wanted = self._decide(branch, draw, token, weighed)
-            if expected is not None:
+            logprob = None
+            if expected is not None or self._request.controls.logprobs:
                 assert weighed is not None
+                # vLLM tells them before temperature and grammar: logits up to a constant.
                 logits = np.array([weighed[int(id)].logprob for id in allowed.ids])
-                wanted = int(allowed.ids[least_error(logits, expected)])
+                if expected is not None:
+                    wanted = int(allowed.ids[least_error(logits, expected)])
+                logprob = reported(self._request.controls, draw.cursor, logits, wanted)
             fits = wanted in allowed.ids
             if fits:
-                self._tell(draw, draw.append(wanted, self._parts.vocabulary))
+                self._tell(draw, draw.append(wanted, self._parts.vocabulary, logprob))
                 if self._request.live and (new := draw.new_text(self._parts.vocabulary)):
                     self._happened.put_nowait(TextWritten(draw.index, *new))
             if not alone and fits and wanted == token and not draw.cursor.ending:

@@ -71,5 +71,5 @@ def beginning(loaded: Loaded, **controls: Any) -> Row:
         (0,),
     )
     row.start(0)
-    row.write((), loaded.vocabulary)
+    row.write(None, loaded.vocabulary)
     return row

@@ -28,7 +28,7 @@ def whole(loaded: Loaded) -> Row:
     """A row that has written a response of its last choices."""
     row = beginning(loaded, seed=1)
     while not row.cursor.done:
-        row.write((int(row.cursor.allowed().ids[-1]),), loaded.vocabulary)
+        row.write(int(row.cursor.allowed().ids[-1]), loaded.vocabulary)
     return row
 
 
@@ -70,14 +70,14 @@ def test_a_revised_plan_is_fed_as_the_first_went_on_while_it_repeats_it(loaded: 
         ids, stop_id = row.cursor.allowed().ids, row.cursor.stop_id
         if row.cursor.allowed().choice == BRANCH:
             ids = ids[[_reflects(row, int(id)) for id in ids]]
-        row.write((int(ids[0]) if stop_id is None or stop_id not in ids else stop_id,), loaded.vocabulary)
+        row.write(int(ids[0]) if stop_id is None or stop_id not in ids else stop_id, loaded.vocabulary)
     first = [token.id for token in row.tokens if token.section == "plan"]
     already = sum(token.section == "revised_plan" for token in row.tokens)
     tokens, decisions = Drafter().propose(row, rows=1)
     assert tokens[len(row.pending) :][: len(first) - already] == first[already:]
     assert len(decisions) > 3, "all decisions of the plan are checked in one pass"
     other = next(int(id) for id in row.cursor.allowed().ids if int(id) != first[already])
-    row.write((other,), loaded.vocabulary)
+    row.write(other, loaded.vocabulary)
     assert Drafter().propose(row, rows=1)[0] == row.pending
 
 
@@ -104,7 +104,7 @@ def test_texts_are_guessed_though_any_word_may_follow(loaded: Loaded) -> None:
         token = int(allowed.ids[-1])
         if allowed.choice == BRANCH:
             token = next(int(id) for id in allowed.ids if _reflects(row, int(id)))
-        row.write((token,), loaded.vocabulary)
+        row.write(token, loaded.vocabulary)
     ids = row.cursor.allowed().ids
     assert len(ids) > 64
     drafter.observe(row, len(ids), [(int(ids[5]), (0,))])
@@ -129,7 +129,7 @@ def test_a_response_that_goes_another_way_than_the_last_one_is_guessed_from_what
     drafter, first = Drafter(), whole(loaded)
     drafter.finished(first)
     row = beginning(loaded, seed=1)
-    row.write((int(row.cursor.allowed().ids[0]),), loaded.vocabulary)
+    row.write(int(row.cursor.allowed().ids[0]), loaded.vocabulary)
     assert drafter.propose(row, rows=1)[0] == row.pending
     ids = row.cursor.allowed().ids
     drafter.observe(row, len(ids), [(int(ids[1]), (0,))])

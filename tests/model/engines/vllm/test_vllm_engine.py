@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 import pytest
+import torch
 
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.images import ImageError
@@ -34,10 +35,15 @@ from model.engines.engine import (
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.vllm.engine import VllmEngine, VllmSettings
 from model.families.cf_vla import CF_VLA
+from model.families.registry import families_of
 from model.formats.cursor import CompiledFormat
+from model.formats.replay import decisions
 from model.formats.text import parse
-from model.network.checkpoint import read_parts
+from model.network.checkpoint import load, read_parts
 from model.network.settings import NANO_SETTINGS
+from model.training.batches import collate
+from model.training.learner import ResponseLearner
+from model.training.rollouts import rollout
 from tests.checkpoints import write_untrained
 
 T = TypeVar("T")
@@ -230,6 +236,28 @@ def test_draws_are_valid_and_repeat_with_their_seed(
     compiled = CompiledFormat(CF_VLA.format, read_parts(CHECKPOINT).vocabulary)
     for draw in first + other:
         assert parse(compiled, draw.text)["trajectory"] == draw.codes
+
+
+@pytest.mark.parametrize("decision", ["least_error", "drawn"])
+def test_decisions_are_as_likely_as_training_says(
+    loop: asyncio.AbstractEventLoop, vllm: VllmEngine, decision: Decision
+) -> None:
+    controls = Controls(n=2, temperature=1.2, numbers=decision, codes=decision, logprobs=True)
+    draws = loop.run_until_complete(
+        plan(vllm, PlanRequest(f"likely {decision}", BUNDLED[0], controls=controls))
+    )
+    loaded = load(CHECKPOINT)
+    families = families_of(loaded.card.formats, loaded.settings.reflection)
+    start = CompiledFormat(families["cf_vla"].format, loaded.vocabulary).start()
+    replayed = [decisions(start, draw.ids) for draw in draws]
+    learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec)
+    batch = collate([rollout(BUNDLED[0], "cf_vla", draws, loaded.inputs)])
+    with torch.no_grad():
+        found = learner.log_probabilities(batch, replayed, controls.temperature)
+    for draw, made, logprobs in zip(draws, replayed, found, strict=True):
+        assert sum(told is not None for told in draw.logprobs) == len(made)
+        told = [draw.logprobs[each.position] for each in made]
+        np.testing.assert_allclose(np.array(told, float), logprobs.numpy(), atol=1e-4)
 
 
 def test_sections_come_before_their_draw(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:

@@ -1,0 +1,39 @@
+"""An engine's draws as a sample, for learning from what they came to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from model.driving.scene import Scene
+from model.driving.trajectory import FUTURE_STEPS, ROUTE_POINTS
+from model.engines.engine import Draw
+from model.network.inputs import InputBuilder
+from model.network.track_features import track_features
+from model.training.batches import Sample
+from model.training.targets import Target
+
+
+def rollout(scene: Scene, format: str, draws: Sequence[Draw], inputs: InputBuilder) -> Sample:
+    """The prompt that an engine read and what it wrote behind it; all tokens weigh 1.
+
+    `ResponseLearner.log_probabilities` of it are those that the draws tell. It has no expert's future.
+
+    Raises:
+        ImageError: a picture cannot be decoded.
+    """
+    built = inputs.build(scene, format)
+    empty = np.zeros((len(draws), 0, 0), np.float32)
+    return Sample(
+        prompt=built.prompt.ids.tolist(),
+        responses=[Target(draw.ids, (1.0,) * len(draw.ids)) for draw in draws],
+        seen=None,
+        patches=built.patches,
+        history=built.history,
+        route=np.zeros((ROUTE_POINTS, 2), np.float32) if built.route is None else built.route,
+        tracks=track_features((), None) if built.tracks is None else built.tracks,
+        future=np.zeros((FUTURE_STEPS, 4), np.float32),
+        code_shares=empty,
+        code_errors_m=empty,
+    )
