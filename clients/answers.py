@@ -11,13 +11,19 @@ from email.utils import parsedate_to_datetime
 from typing import Final, TypeVar
 
 import httpx
-import numpy as np
 from httpx_sse import ServerSentEvent
 from pydantic import BaseModel, ValidationError
 
 from clients import wire
 from model.driving.plan import Plan, PlanError, parse_plan
-from model.driving.trajectory import FloatArray, GeometryError, check_trajectory
+from model.driving.trajectory import (
+    TEN_HZ_S,
+    FloatArray,
+    GeometryError,
+    at_10_hz,
+    check_times,
+    check_trajectory,
+)
 
 BUSY_STATUSES: Final = (429, 503)
 _Answer = TypeVar("_Answer", bound=BaseModel)
@@ -81,8 +87,9 @@ class PlannedDraw:
         branch: ``Action:`` or ``Thinking:``.
         think_probability: of a second look, 0..1.
         thinking, revised_plan: the second look; None where none was taken.
-        trajectory: float32 [64, 4]: x, y, z in m and heading in rad at 10 Hz, ego frame, first row at +0.1 s.
+        trajectory: float32 [t, 4]: x, y, z in m and heading in rad, ego frame, at ``times_s``.
         draft_trajectory: where the first plan would have led; None without a second look or a deadline.
+        times_s: of the poses, in s from now; 64 at 10 Hz, the first at 0.1 s, unless the format has its own.
         tokens: tokens per section.
         cut: what the deadline did to the second look: skipped, shortened, replaced; else None.
         consistent: whether the parts of the draw agree; None where nothing can be said.
@@ -103,6 +110,12 @@ class PlannedDraw:
     consistent: bool | None = None
     disagreements: tuple[str, ...] = ()
     logprobs: wire.Logprobs | None = None
+    times_s: tuple[float, ...] = TEN_HZ_S
+
+    @property
+    def at_10_hz(self) -> FloatArray:
+        """The trajectory at 10 Hz, up to its last pose or to 6.4 s: float32 [k, 4]."""
+        return at_10_hz(self.trajectory, self.times_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +144,7 @@ class LookedAt:
         thinking, revised_plan: the second look; None where none was taken.
         plan_iou: of the given and the revised plan; 1 where it is kept.
         changes: the stretches in which they differ.
-        trajectory: float32 [64, 4]: x, y, z in m and heading in rad at 10 Hz, ego frame, first row at +0.1 s.
+        trajectory, times_s: as of a `PlannedDraw`.
         tokens: tokens per section.
         consistent, disagreements, logprobs: as of a `PlannedDraw`.
     """
@@ -147,6 +160,7 @@ class LookedAt:
     consistent: bool | None = None
     disagreements: tuple[str, ...] = ()
     logprobs: wire.Logprobs | None = None
+    times_s: tuple[float, ...] = TEN_HZ_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,6 +317,14 @@ def _contract(response: httpx.Response) -> Iterator[None]:
         raise BadAnswer(f"{response.url} answered with something else than a plan: {error}") from error
 
 
+def _times_s(draw: wire.Draw | wire.Reflection) -> tuple[float, ...]:
+    """Raises `GeometryError` where they do not ascend."""
+    if draw.times_s is None:
+        return TEN_HZ_S
+    check_times(draw.times_s)
+    return tuple(draw.times_s)
+
+
 def _looked_at(draw: wire.Reflection) -> LookedAt:
     return LookedAt(
         index=draw.index,
@@ -311,7 +333,8 @@ def _looked_at(draw: wire.Reflection) -> LookedAt:
         revised_plan=None if draw.revised_plan is None else parse_plan(draw.revised_plan.text),
         plan_iou=draw.plan_iou,
         changes=tuple(draw.changes),
-        trajectory=check_trajectory(np.asarray(draw.trajectory, np.float32)),
+        trajectory=check_trajectory(draw.trajectory, _times_s(draw)),
+        times_s=_times_s(draw),
         tokens=draw.tokens,
         consistent=draw.consistent,
         disagreements=tuple(draw.disagreements),
@@ -327,10 +350,11 @@ def _draw(draw: wire.Draw) -> PlannedDraw:
         think_probability=draw.think_probability,
         thinking=draw.thinking,
         revised_plan=None if draw.revised_plan is None else parse_plan(draw.revised_plan.text),
-        trajectory=check_trajectory(np.asarray(draw.trajectory, np.float32)),
+        trajectory=check_trajectory(draw.trajectory, _times_s(draw)),
+        times_s=_times_s(draw),
         draft_trajectory=None
         if draw.draft_trajectory is None
-        else check_trajectory(np.asarray(draw.draft_trajectory, np.float32)),
+        else check_trajectory(draw.draft_trajectory, _times_s(draw)),
         tokens=draw.tokens,
         cut=draw.cut,
         consistent=draw.consistent,

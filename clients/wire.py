@@ -6,9 +6,18 @@ positive. Requests refuse fields they do not know; answers may grow fields, so r
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Protocol, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, SkipValidation, Tag, WithJsonSchema
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    SkipValidation,
+    Tag,
+    WithJsonSchema,
+    model_validator,
+)
 
 Camera = Literal[
     "front_wide_120",
@@ -66,6 +75,35 @@ Trajectory = Annotated[
     list[Pose],
     Field(min_length=64, max_length=64, description="64 future poses at 10 Hz; the first lies 0.1 s ahead."),
 ]
+
+
+Poses = Annotated[
+    list[Pose],
+    Field(
+        min_length=1,
+        max_length=600,
+        description="Future poses: 64 at 10 Hz, the first 0.1 s ahead, or one for each of times_s.",
+    ),
+]
+TimesS = Annotated[
+    list[Annotated[float, Field(gt=0, le=60)]] | None,
+    Field(description="When the poses of the trajectory are, in s from now; null for 64 at 10 Hz."),
+]
+
+
+class _Timed(Protocol):
+    trajectory: Poses
+    times_s: TimesS
+
+
+_TimedAnswer = TypeVar("_TimedAnswer", bound=_Timed)
+
+
+def _check_times(answer: _TimedAnswer) -> _TimedAnswer:
+    poses = 64 if answer.times_s is None else len(answer.times_s)
+    if len(answer.trajectory) != poses:
+        raise ValueError(f"a trajectory of {poses} poses is told, and {len(answer.trajectory)} are there")
+    return answer
 
 
 class Asked(BaseModel):
@@ -257,8 +295,9 @@ class Draw(Answered):
     think_probability: Probability | None = Field(description="Probability of Thinking: at the branch.")
     thinking: str | None = Field(description="The reasoning; null without a second look.")
     revised_plan: Plan | None = Field(description="The plan after reasoning; null without a second look.")
-    trajectory: Trajectory
-    draft_trajectory: Trajectory | None = Field(
+    trajectory: Poses
+    times_s: TimesS = None
+    draft_trajectory: Poses | None = Field(
         default=None,
         description="Where the first plan would have led; made beside a second look under a deadline.",
     )
@@ -277,6 +316,8 @@ class Draw(Answered):
     )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
     logprobs: Logprobs | None = Field(default=None, description="Null unless asked for.")
+
+    _timed = model_validator(mode="after")(_check_times)
 
 
 class ModelName(Answered):
@@ -361,7 +402,8 @@ class Reflection(Answered):
         ge=0, le=1, description="Intersection over union of given and revised plan, in bins of 0.1 s."
     )
     changes: list[PlanChange] = Field(description="Where they do not, track by track; empty when kept.")
-    trajectory: Trajectory
+    trajectory: Poses
+    times_s: TimesS = None
     cut: Cut | None = Field(
         default=None,
         description="What the deadline did to the second look: skipped, shortened, or replaced by the draft.",
@@ -377,6 +419,8 @@ class Reflection(Answered):
     )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
     logprobs: Logprobs | None = Field(default=None, description="Null unless asked for.")
+
+    _timed = model_validator(mode="after")(_check_times)
 
 
 class ReflectResponse(Answered):
@@ -625,9 +669,12 @@ class TrajectoryWritten(Answered):
     """Data of the events `draft_trajectory` and `trajectory`; whether parts agree is not said of a draft."""
 
     index: int
-    trajectory: Trajectory
+    trajectory: Poses
+    times_s: TimesS = None
     consistent: bool | None = Field(default=None, description="As in the finished draw.")
     disagreements: list[str] = Field(default_factory=list, description="As in the finished draw.")
+
+    _timed = model_validator(mode="after")(_check_times)
 
 
 Event = PlanWritten | BranchTaken | TrajectoryWritten | ThinkingWritten | Problem

@@ -9,7 +9,7 @@ import numpy as np
 import clients.wire as wire
 from model.driving.agreement import Agreement
 from model.driving.plan import Plan, plan_changes, plan_iou
-from model.driving.trajectory import agreed
+from model.driving.trajectory import TEN_HZ_S, agreed
 from model.engines.engine import Draw, ModelCard
 from service.planning import Planned
 from service.problems import REFUSED, ProblemError
@@ -89,6 +89,11 @@ def wire_trajectory(draw: Draw) -> list[list[float]]:
     return rows
 
 
+def wire_times(draw: Draw) -> list[float] | None:
+    """When its poses are, where that is not at 10 Hz."""
+    return None if draw.times_s == TEN_HZ_S else list(draw.times_s)
+
+
 def _model(card: ModelCard) -> wire.ModelName:
     return wire.ModelName(name=card.name, revision=card.revision)
 
@@ -102,6 +107,7 @@ def _draw(draw: Draw, agreement: Agreement, draft: Draw | None) -> wire.Draw:
         thinking=draw.thinking,
         revised_plan=None if draw.revised_plan is None else wire_plan(draw.revised_plan),
         trajectory=wire_trajectory(draw),
+        times_s=wire_times(draw),
         draft_trajectory=None if draft is None or not draw.looked_twice else wire_trajectory(draft),
         cut=draw.cut,
         consistent=agreement.consistent,
@@ -138,6 +144,7 @@ def _reflection(given: Plan, draw: Draw, agreement: Agreement) -> wire.Reflectio
         plan_iou=plan_iou(given, revised),
         changes=changes,
         trajectory=wire_trajectory(draw),
+        times_s=wire_times(draw),
         cut=draw.cut,
         consistent=agreement.consistent,
         disagreements=list(agreement.disagreements),

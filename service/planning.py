@@ -279,7 +279,7 @@ def let_in(place: AbstractContextManager[_Held]) -> Generator[_Held]:
 
 
 def _judged(draw: Draw, request: PlanRequest) -> Agreement:
-    return agreement(draw.plan, draw.thinking, draw.revised_plan, draw.trajectory, request.scene.history)
+    return agreement(draw.plan, draw.thinking, draw.revised_plan, draw.at_10_hz, request.scene.history)
 
 
 def _met(deadline_ms: int | None, arrival: Arrival) -> bool | None:

@@ -21,7 +21,7 @@ from model.engines.engine import (
 )
 from model.families.family import Family
 from model.families.registry import family_named
-from service.answers import wire_branch, wire_plan, wire_trajectory
+from service.answers import wire_branch, wire_plan, wire_times, wire_trajectory
 from service.callers import CallerLeft, while_connected
 from service.errors import problem_document
 from service.metrics import Metrics
@@ -128,12 +128,15 @@ def _data(event: Happened, family: Family, told: dict[int, str]) -> list[tuple[s
             name = "plan" if section == family.first_plan else "revised_plan"
             return [(name, wire.PlanWritten(index=index, plan=wire_plan(plan)))]
         case DraftFinished(draw):
-            trajectory = wire.TrajectoryWritten(index=draw.index, trajectory=wire_trajectory(draw))
+            trajectory = wire.TrajectoryWritten(
+                index=draw.index, trajectory=wire_trajectory(draw), times_s=wire_times(draw)
+            )
             return [("draft_trajectory", trajectory)]
         case Judged(draw, agreement):
             trajectory = wire.TrajectoryWritten(
                 index=draw.index,
                 trajectory=wire_trajectory(draw),
+                times_s=wire_times(draw),
                 consistent=agreement.consistent,
                 disagreements=list(agreement.disagreements),
             )

@@ -174,7 +174,7 @@ class Egodriver:
         if not self._config.route:
             scene = Scene(scene.scene_id, scene.clips, scene.history)
         result = await self._planner.plan(scene, controls)
-        trajectories = np.stack([draw.trajectory for draw in result.draws])
+        trajectories = np.stack([draw.at_10_hz for draw in result.draws])
         chosen = result.agreed
         debug = _debug(result, chosen, controls, 1000 * (time.perf_counter() - began_s))
         return Driven(moment, trajectories, chosen, debug | {"seen": session.counts()})

@@ -104,12 +104,12 @@ class ServicePilot:
         began_s = time.perf_counter()
         result = self._planner.plan(asked, controls)
         milliseconds = 1000 * (time.perf_counter() - began_s)
-        trajectories = np.stack([draw.trajectory for draw in result.draws])
+        trajectories = np.stack([draw.at_10_hz for draw in result.draws])
         chosen = result.agreed
         draw = result.draws[chosen]
         plan = draw.revised_plan or draw.plan
         return Planned(
-            trajectory=draw.trajectory,
+            trajectory=trajectories[chosen],
             others=np.delete(trajectories, chosen, axis=0),
             words="" if plan is None else str(plan),
             thinking=draw.thinking or "",

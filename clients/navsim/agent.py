@@ -52,13 +52,15 @@ class NavsimPlanner:
         Of the draws it is the one that is nearest to all others.
 
         Raises:
-            InputError: instants, cameras or calibrations are missing.
+            InputError: instants, cameras or calibrations are missing, or the model does not plan far enough.
             PlannerError: the service gave no plan.
         """
         scene = self.scene(agent_input)
         seed = (self._controls.seed + int(scene_hash(scene)[:_SEED_DIGITS], 16)) % (wire.MAX_SEED + 1)
         result = self._planner.plan(scene, self._controls.model_copy(update={"seed": seed}))
-        rows = result.draws[result.agreed].trajectory[_EVERY - 1 : _EVERY * POSES : _EVERY]
+        rows = result.draws[result.agreed].at_10_hz[_EVERY - 1 : _EVERY * POSES : _EVERY]
+        if len(rows) < POSES:
+            raise InputError(f"its trajectories end after {len(rows)} of the {POSES} poses that NAVSIM wants")
         return np.ascontiguousarray(rows[:, [0, 1, 3]])
 
     def scene(self, agent_input: AgentInput) -> Scene:

@@ -15,7 +15,7 @@ from model.driving.phrases import agrees as changes_as_stated
 from model.driving.phrases import facts_of
 from model.driving.plan import Plan, plan_iou
 from model.driving.seen import all_shown
-from model.driving.trajectory import FloatArray
+from model.driving.trajectory import FUTURE_STEPS, FloatArray
 from model.driving.view import View
 
 Parts = Literal["plan_trajectory", "reason_change"]
@@ -66,7 +66,7 @@ def agreement(
     Args:
         plan: the first plan, where there is one.
         thinking, revised: reasoning and the plan behind it; None without a second look.
-        trajectory: float32 [64, 4].
+        trajectory: float32 [t, 4] at 10 Hz.
         history: float32 [16, 4] of the scene.
     """
     verdicts: dict[Parts, bool | None] = {}
@@ -85,9 +85,9 @@ def trajectory_iou(plan: Plan | None, trajectory: FloatArray, history: FloatArra
     """IOU of a plan with what a trajectory carries out, over the tracks that both tell.
 
     The labeller cannot tell lanes from a trajectory alone, so the lane track does not count. None for a
-    plan without a longitudinal and a lateral track.
+    plan without a longitudinal and a lateral track, and for a trajectory that ends before its plan.
     """
-    if plan is None:
+    if plan is None or len(trajectory) < FUTURE_STEPS:
         return None
     carried_out = label_plan(trajectory, history, None)
     said, done = (

@@ -1,6 +1,6 @@
 """Open-loop measures of trajectories (CF-VLA section 4.1), vectorised over draws.
 
-Draws are float32 [n, 64, 4]; the expert is float32 [64, 4]; distances in metres.
+Draws are float32 [n, t, 4] and the expert is float32 [t, 4], at the same times; distances in metres.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, Agent
-from model.driving.trajectory import STEP_S, FloatArray
+from model.driving.trajectory import STEP_S, TEN_HZ_S, FloatArray, at_times, shared_times
 
 Array = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -36,7 +36,7 @@ class DisplacementErrors:
 
 
 def displacement_errors(draws: FloatArray, expert: FloatArray) -> DisplacementErrors:
-    """All displacement measures of draws [n, 64, 4] against the expert [64, 4].
+    """All displacement measures of draws [n, t, 4] against the expert [t, 4], see `common`.
 
     Minima are taken apart: the draw of the smallest ADE need not have the smallest FDE. The corner
     distance is the smallest over the draws, as minADE is.
@@ -50,6 +50,17 @@ def displacement_errors(draws: FloatArray, expert: FloatArray) -> DisplacementEr
         avg_fde_m=float(fde.mean()),
         corner_distance_m=float(corner_distances(draws, expert).min()),
     )
+
+
+def common(
+    draws: FloatArray, expert: FloatArray, times_s: Sequence[float] = TEN_HZ_S
+) -> tuple[FloatArray, FloatArray]:
+    """Draws [n, t, 4] with poses at ``times_s`` and the expert [64, 4], both at the draws' times.
+
+    What lies behind the expert's 6.4 s is left out.
+    """
+    times_s = shared_times(TEN_HZ_S, times_s)
+    return draws[:, : len(times_s)], at_times(expert, TEN_HZ_S, times_s)
 
 
 def box_corners(poses: npt.NDArray[np.floating], length_m: float, width_m: float) -> Array:
@@ -82,11 +93,11 @@ def corner_distances(draws: FloatArray, expert: FloatArray) -> Array:
 def collides(
     trajectories: FloatArray, agents: Sequence[Agent], within_s: float = COLLISION_WITHIN_S
 ) -> BoolArray:
-    """Whether each of the trajectories [n, 64, 4] meets another agent's box within ``within_s`` seconds.
+    """Whether each of the trajectories [n, t, 4] meets another agent's box within ``within_s`` seconds.
 
-    Boxes are oriented rectangles at equal times, tested by separating axes.
+    Boxes are oriented rectangles at equal times (10 Hz), tested by separating axes.
     """
-    steps = round(within_s / STEP_S)
+    steps = min(round(within_s / STEP_S), trajectories.shape[1])
     hit = np.zeros(len(trajectories), dtype=np.bool_)
     ego = ego_corners(trajectories[:, :steps])
     ego_axes = _axes(np.asarray(trajectories[:, :steps, 3], dtype=np.float64))
@@ -110,7 +121,7 @@ def collides(
 
 
 def leaves_road(trajectories: FloatArray, drivable: Sequence[FloatArray]) -> BoolArray:
-    """Whether a corner of the ego's box ever leaves the drivable area, for trajectories [n, 64, 4].
+    """Whether a corner of the ego's box ever leaves the drivable area, for trajectories [n, t, 4].
 
     ``drivable`` are closed rings; a point is inside when an odd number of rings contains it.
     """

@@ -1,11 +1,13 @@
 """Trajectories and ego history in the ego frame at the scene's instant.
 
 Ego frame: x forward, y left, z up, metres; heading in radians, counter-clockwise positive.
-Rows are poses ``(x, y, z, heading)`` at 10 Hz.
+Rows are poses ``(x, y, z, heading)``, at 10 Hz unless times come with them.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -19,12 +21,16 @@ HISTORY_STEPS: Final = 16
 FUTURE_STEPS: Final = 64
 """Rows of a trajectory; the first row lies 0.1 s ahead (CF-VLA section 7)."""
 HORIZON_S: Final = 6.4
+TEN_HZ_S: Final = tuple(round(STEP_S * step, 1) for step in range(1, FUTURE_STEPS + 1))
+"""Times of the poses of a trajectory, unless a model family has its own."""
+MAX_TIME_S: Final = 60.0
 ROUTE_POINTS: Final = 20
 ROUTE_SPACING_M: Final = 4.0
 
 MAX_POSITION_M: Final = 1000.0
 """No pose within 6.4 s is farther away than this: 156 m/s would be needed."""
 _PRESENT_TOLERANCE: Final = 1e-3
+_SAME_TIME_S: Final = 1e-6
 
 
 class GeometryError(ValueError):
@@ -59,9 +65,42 @@ def check_history(array: npt.ArrayLike) -> FloatArray:
     return history
 
 
-def check_trajectory(array: npt.ArrayLike) -> FloatArray:
-    """A trajectory as read-only float32 [64, 4]; raises `GeometryError`."""
-    return _checked(array, (FUTURE_STEPS, 4), "trajectory")
+def check_trajectory(array: npt.ArrayLike, times_s: Sequence[float] = TEN_HZ_S) -> FloatArray:
+    """A trajectory as read-only float32 [64, 4], or [t, 4] at t times; raises `GeometryError`."""
+    return _checked(array, (len(times_s), 4), "trajectory")
+
+
+def check_times(times_s: Sequence[float]) -> None:
+    """Raise `GeometryError` unless times ascend from above 0 to at most `MAX_TIME_S`."""
+    ascend = all(before < after for before, after in itertools.pairwise((0.0, *times_s)))
+    if not times_s or not ascend or times_s[-1] > MAX_TIME_S:
+        raise GeometryError(f"times must ascend from above 0 s to at most {MAX_TIME_S:g} s, got {times_s}")
+
+
+def at_times(trajectory: FloatArray, times_s: Sequence[float], wanted_s: Sequence[float]) -> FloatArray:
+    """Where a trajectory [t, 4] with poses at ``times_s`` is at other times: float32 [k, 4].
+
+    Straight lines lead from the present through its poses, and headings turn the short way round.
+
+    Args:
+        wanted_s: at most the last of ``times_s``.
+    """
+    if tuple(wanted_s) == tuple(times_s):
+        return trajectory
+    poses = np.concatenate([np.zeros((1, 4)), trajectory])
+    poses[:, 3] = np.unwrap(poses[:, 3])
+    columns = [np.interp(wanted_s, (0.0, *times_s), column) for column in poses.T]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def at_10_hz(trajectory: FloatArray, times_s: Sequence[float]) -> FloatArray:
+    """A trajectory [t, 4] at 10 Hz, up to its last pose or to 6.4 s: float32 [k, 4]."""
+    return at_times(trajectory, times_s, shared_times(times_s, TEN_HZ_S))
+
+
+def shared_times(times_s: Sequence[float], others_s: Sequence[float]) -> tuple[float, ...]:
+    """Those of ``others_s`` that do not lie behind ``times_s``."""
+    return tuple(time_s for time_s in others_s if time_s <= times_s[-1] + _SAME_TIME_S)
 
 
 def check_route(array: npt.ArrayLike) -> FloatArray:
@@ -161,12 +200,12 @@ def constant_turn_rate(history: FloatArray) -> FloatArray:
 
 
 def path_length(trajectory: FloatArray) -> float:
-    """Metres that a trajectory [64, 4] covers, from the present on."""
+    """Metres that a trajectory [t, 4] covers, from the present on."""
     points = np.concatenate([np.zeros((1, 2)), trajectory[:, :2].astype(np.float64)])
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
 def agreed(trajectories: FloatArray) -> int:
-    """The place of the trajectory [n, 64, 4] that is nearest to all others on average: the draw to drive."""
+    """The place of the trajectory [n, t, 4] that is nearest to all others on average: the draw to drive."""
     apart = np.linalg.norm(trajectories[:, None, :, :2] - trajectories[None, :, :, :2], axis=-1)
     return int(apart.mean(axis=(1, 2)).argmin())

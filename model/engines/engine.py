@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol
 
 from model.driving.plan import Plan
 from model.driving.scene import Scene
-from model.driving.trajectory import FloatArray
+from model.driving.trajectory import TEN_HZ_S, FloatArray, at_10_hz
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
@@ -133,12 +133,13 @@ class Draw:
             ``branch`` is the option as the format writes it, ``thinking`` the reflection.
         think_probability: probability of a second look at the branch, at temperature 1, over its options;
             None where the format has no branch.
-        trajectory: float32 [64, 4] in the ego frame.
+        trajectory: float32 [t, 4] in the ego frame.
         codes: the trajectory codes it was decoded from.
         tokens: tokens per section, forced ones included.
         passes: how often the network was run for it, its prompt apart.
         chosen: tokens at which the format left more than one; all others are forced.
         cut: what the deadline did to its second look; None where it did nothing.
+        times_s: of the poses of the trajectory, its family's.
         ids: of its tokens.
         logprobs: of each token's choice, see `model.engines.logprobs`; None where the token is forced. Empty
             where `Controls.logprobs` does not ask for them.
@@ -157,8 +158,14 @@ class Draw:
     passes: int = 0
     chosen: int = 0
     cut: Cut | None = None
+    times_s: tuple[float, ...] = TEN_HZ_S
     ids: tuple[int, ...] = ()
     logprobs: tuple[float | None, ...] = ()
+
+    @property
+    def at_10_hz(self) -> FloatArray:
+        """The trajectory at 10 Hz, up to its last pose or to 6.4 s: float32 [k, 4]."""
+        return at_10_hz(self.trajectory, self.times_s)
 
     @property
     def looked_twice(self) -> bool:

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 
 from model.driving.plan import Plan
+from model.driving.trajectory import check_trajectory
 from model.engines.engine import Draw, ModelCard, PlanRequest, RequestError
 from model.engines.response import Response
 from model.families.family import Branch, Family
@@ -71,6 +72,7 @@ def read(
 
     Raises:
         FormatError: the text is no response of the format.
+        GeometryError: its family makes something else of it than a trajectory.
     """
     ids = tuple(token.id for token in response.tokens)
     text = vocabulary.decode(ids)
@@ -86,12 +88,13 @@ def read(
             think_probability=response.think_probability,
             thinking=reading.reflection,
             revised_plan=reading.revised_plan,
-            trajectory=reading.trajectory,
+            trajectory=check_trajectory(reading.trajectory, family.times_s),
             codes=reading.codes,
             tokens=counts,
             passes=passes,
             chosen=response.chosen,
             cut=response.cut,
+            times_s=family.times_s,
             ids=ids,
             logprobs=tuple(response.logprobs) if request.controls.logprobs else (),
         )

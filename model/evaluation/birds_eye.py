@@ -131,7 +131,7 @@ def _draw_agent(axes: Axes, agent: Agent) -> None:
 
 def _draw_trajectory(axes: Axes, draw: Draw, *, bold: bool) -> None:
     colour = REFLECTED_COLOUR if draw.looked_twice else DIRECT_COLOUR
-    points = _up(_from_origin(draw.trajectory))
+    points = _up(_from_origin(draw.at_10_hz))
     axes.plot(
         *points.T,
         color=colour,

@@ -17,7 +17,7 @@ from model.driving.hashing import hash_of, scene_hash
 from model.driving.plan import Plan, parse_plan
 from model.engines.engine import Draw, DrawFinished, Engine, Event, Load, ModelCard, PlanRequest, Started
 
-_SCHEMA_VERSION: Final = 1
+_SCHEMA_VERSION: Final = 2
 """Part of every key, so that a draw that is kept otherwise is none that is known."""
 
 
@@ -128,7 +128,7 @@ def _unpacked(packed: bytes) -> list[Draw]:
                 "plan": _plan(record["plan"]),
                 "revised_plan": _plan(record["revised_plan"]),
                 "trajectory": np.frombuffer(record["trajectory"], "<f4").reshape(-1, 4),
-                "codes": tuple(record["codes"]),
+                **{name: tuple(record[name]) for name in ("codes", "times_s", "ids", "logprobs")},
             }
         )
         for record in records

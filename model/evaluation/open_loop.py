@@ -1,6 +1,7 @@
 """Open-loop results of single scenes: what n draws, or a kinematic baseline, make of a labelled scene.
 
-The measures are those of CF-VLA's table 1; `model.evaluation.table` averages them over scenes.
+The measures are those of CF-VLA's table 1; `model.evaluation.table` averages them over scenes. Trajectories
+with times of their own are compared with the expert at these times.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ import numpy as np
 from model.driving.agreement import reason_and_change, reason_and_view, trajectory_iou
 from model.driving.labeller import expert_plan
 from model.driving.lead import lead_within
-from model.driving.metrics import collides, displacement_errors, leaves_road
+from model.driving.metrics import collides, common, displacement_errors, leaves_road
 from model.driving.plan import Plan, plan_iou
 from model.driving.scene import LabelledScene, Tag
 from model.driving.trajectory import (
+    TEN_HZ_S,
     FloatArray,
     agreed,
+    at_10_hz,
     constant_turn_rate,
     constant_velocity,
     path_length,
@@ -126,11 +129,17 @@ class SceneResult:
     thought_iou_revised: float | None = None
 
 
-def evaluate_trajectories(labelled: LabelledScene, trajectories: FloatArray) -> SceneResult:
-    """The result of bare trajectories [n, 64, 4]."""
-    errors = displacement_errors(trajectories, labelled.future)
-    driven = trajectories[agreed(trajectories)]
-    path_m = path_length(driven)
+def evaluate_trajectories(
+    labelled: LabelledScene, trajectories: FloatArray, times_s: Sequence[float] = TEN_HZ_S
+) -> SceneResult:
+    """The result of bare trajectories [n, t, 4] with poses at ``times_s``.
+
+    Errors are taken at these times, everything else at 10 Hz, both up to the last pose.
+    """
+    errors = displacement_errors(*common(trajectories, labelled.future, times_s))
+    chosen = agreed(trajectories)
+    dense = np.stack([at_10_hz(trajectory, times_s) for trajectory in trajectories])
+    path_m = path_length(dense[chosen])
     soon_m = LEAD_WITHIN_S * max(0.0, present_speed(labelled.scene.history))
     return SceneResult(
         scene_id=labelled.scene.scene_id,
@@ -138,19 +147,21 @@ def evaluate_trajectories(labelled: LabelledScene, trajectories: FloatArray) -> 
         tags=labelled.tags,
         lead_close=lead_within(labelled),
         lead_soon=lead_within(labelled, soon_m),
-        agreed_ade_m=displacement_errors(driven[None], labelled.future).min_ade_m,
+        agreed_ade_m=_ade_m(labelled, trajectories[chosen], times_s),
         avg_ade_m=errors.avg_ade_m,
         min_ade_m=errors.min_ade_m,
         path_m=path_m,
-        path_error_m=path_m - path_length(labelled.future),
+        path_error_m=path_m - path_length(labelled.future[: dense.shape[1]]),
         min_fde_m=errors.min_fde_m,
         avg_fde_m=errors.avg_fde_m,
         corner_distance_m=errors.corner_distance_m,
-        collision_rate=float(collides(trajectories, labelled.agents).mean()),
-        off_road_rate=float(leaves_road(trajectories, labelled.drivable).mean())
-        if labelled.drivable
-        else None,
+        collision_rate=float(collides(dense, labelled.agents).mean()),
+        off_road_rate=float(leaves_road(dense, labelled.drivable).mean()) if labelled.drivable else None,
     )
+
+
+def _ade_m(labelled: LabelledScene, trajectory: FloatArray, times_s: Sequence[float]) -> float:
+    return displacement_errors(*common(trajectory[None], labelled.future, times_s)).min_ade_m
 
 
 def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw], greedy: Draw | None = None) -> SceneResult:
@@ -177,16 +188,14 @@ def evaluate_draws(labelled: LabelledScene, draws: Sequence[Draw], greedy: Draw 
         if draw.plan is not None and draw.revised_plan is not None
     ]
     followed = [
-        trajectory_iou(draw.revised_plan or draw.plan, draw.trajectory, labelled.scene.history)
+        trajectory_iou(draw.revised_plan or draw.plan, draw.at_10_hz, labelled.scene.history)
         for draw in draws
     ]
     branching = [draw for draw in draws if draw.branch is not None]
     change, seen, unknown = _words(labelled, draws)
     return replace(
-        evaluate_trajectories(labelled, np.stack([draw.trajectory for draw in draws])),
-        greedy_ade_m=None
-        if greedy is None
-        else displacement_errors(greedy.trajectory[None], labelled.future).min_ade_m,
+        evaluate_trajectories(labelled, np.stack([draw.trajectory for draw in draws]), draws[0].times_s),
+        greedy_ade_m=None if greedy is None else _ade_m(labelled, greedy.trajectory, greedy.times_s),
         agreement_plan_trajectory=_mean([iou for iou in followed if iou is not None]),
         agreement_reason_change=change,
         agreement_reason_view=seen,

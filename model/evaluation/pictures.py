@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from model.driving.images import decode_image
 from model.driving.labeller import expert_plan
-from model.driving.metrics import displacement_errors
+from model.driving.metrics import common, displacement_errors
 from model.driving.plan import Plan
 from model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, Clip, LabelledScene, Scene
 from model.driving.trajectory import present_speed
@@ -91,7 +91,8 @@ def _draw_title(
     if draws:
         facts.append("1 draw" if len(draws) == 1 else f"{len(draws)} draws")
     if labelled is not None and draws:
-        errors = displacement_errors(np.stack([draw.trajectory for draw in draws]), labelled.future)
+        trajectories = np.stack([draw.trajectory for draw in draws])
+        errors = displacement_errors(*common(trajectories, labelled.future, draws[0].times_s))
         facts.append(f"minADE {errors.min_ade_m:.2f} m")
     headline, colour = "Planned without a plan in words", DIRECT_COLOUR
     if chosen is None:

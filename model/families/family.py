@@ -8,7 +8,7 @@ from functools import cached_property
 
 from model.driving.phrases import ReflectionLanguage
 from model.driving.plan import Plan
-from model.driving.trajectory import FloatArray
+from model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, check_times
 from model.formats.pieces import Format, Values, choices
 
 
@@ -40,7 +40,7 @@ class Reading:
     """What a response says. What it does not say is None.
 
     Attributes:
-        trajectory: float32 [64, 4] in the ego frame.
+        trajectory: float32 [t, 4] in the ego frame, at the family's times.
         codes: the trajectory codes that it was decoded from, if any.
         plan: the first one, or the one that the caller gave.
         branch: the option that was taken.
@@ -71,12 +71,20 @@ class Reflection:
     judged: bool = True
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lesson:
-    """What a labelled scene has to teach: the expert's plan and trajectory codes, perhaps a reflection."""
+    """What a labelled scene has to teach.
+
+    Attributes:
+        plan: the expert's.
+        codes: the expert's trajectory codes.
+        future: float32 [64, 4], the expert's trajectory at 10 Hz.
+        reflection: on a plan of the model's own, if any.
+    """
 
     plan: Plan
     codes: tuple[int, ...]
+    future: FloatArray
     reflection: Reflection | None = None
 
 
@@ -89,6 +97,7 @@ class Family:
         task: what its prompt asks for.
         trajectory: the section that holds the trajectory.
         read: what the values of a response say.
+        times_s: of the poses of its trajectories, 64 at 10 Hz unless it says otherwise.
         first_plan: the section of the plan that it writes first, and that callers may give.
         branch: where it may take a second look, which is a reflection, a revised plan, or both.
         reflection: the section where it says what is wrong with its first plan.
@@ -97,13 +106,14 @@ class Family:
         dialects: other formats of the same name, for checkpoints whose reflections are written otherwise.
 
     Raises:
-        FamilyError: the format lacks a section or the branch that is declared.
+        FamilyError: the format lacks a section or the branch that is declared, or times do not ascend.
     """
 
     format: Format
     task: str
     trajectory: str
     read: Callable[[Values, Decode], Reading]
+    times_s: tuple[float, ...] = TEN_HZ_S
     first_plan: str | None = None
     branch: Branch | None = None
     reflection: str | None = None
@@ -119,6 +129,10 @@ class Family:
         lacking = {section for section in declared if section is not None} - set(self.format.sections())
         if lacking:
             raise FamilyError(f"family {self.name!r}: its format has no section {min(lacking)!r}")
+        try:
+            check_times(self.times_s)
+        except GeometryError as error:
+            raise FamilyError(f"family {self.name!r}: {error}") from None
         if self.branch is not None:
             if self.reflection is None and self.revised_plan is None:
                 raise FamilyError(f"family {self.name!r}: a second look writes a reflection or a plan")

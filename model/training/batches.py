@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
-from model.driving.plan import Plan
-from model.driving.trajectory import HISTORY_STEPS, STEP_S, present_speed
-from model.families.family import Reflection
+from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, present_speed
+from model.families.family import Lesson, Reflection
 from model.families.registry import families_of
 from model.families.trajectory_codes import CODES
 from model.formats.cursor import CompiledFormat
@@ -132,9 +131,9 @@ class ResponseDataset(Dataset[Sample]):
         }
         for reflection in reflections:
             # Before hours of training: the format must be able to say it.
-            no_codes = [0] * CODES
             plan = reflection.revised_plan or reflection.first_plan
-            self._target("cf_vla", plan, no_codes, reflection)
+            nowhere = np.zeros((FUTURE_STEPS, 4), np.float32)
+            self._target("cf_vla", Lesson(plan, (0,) * CODES, nowhere, reflection))
 
     def __len__(self) -> int:
         return len(self._examples)
@@ -160,7 +159,7 @@ class ResponseDataset(Dataset[Sample]):
         return Sample(
             prompt=self._prompt(item),
             responses=[
-                self._target(item.task, plan, drawn.codes.tolist(), reflection)
+                self._target(item.task, Lesson(plan, tuple(drawn.codes.tolist()), future, reflection))
                 for drawn, reflection in zip(soft, reflections, strict=True)
             ],
             seen=self._vision.tokens(index, item.mirror) if self._vision is not None else None,
@@ -173,9 +172,8 @@ class ResponseDataset(Dataset[Sample]):
             code_errors_m=np.stack([drawn.errors_m for drawn in soft]),
         )
 
-    def _target(self, task: str, plan: Plan, codes: Sequence[int], reflection: Reflection | None) -> Target:
-        family, compiled = self._families[task], self._formats[task]
-        return make_target(family, compiled, plan, codes, self._weights, reflection)
+    def _target(self, task: str, lesson: Lesson) -> Target:
+        return make_target(self._families[task], self._formats[task], lesson, self._weights)
 
     def _prompt(self, item: Item) -> list[int]:
         if self._pictures:

@@ -123,7 +123,8 @@ def _told(scene_id: str, draws: list[Draw], chosen: int) -> list[str]:
         branch = "thinks" if draw.looked_twice else "acts  "
         share = "" if draw.think_probability is None else f", think probability {draw.think_probability:.3f}"
         mark = "*" if draw.index == chosen else " "
-        lines.append(f"{mark} draw {draw.index} {branch} in 6.4 s at x {x_m:.1f} m, y {y_m:.1f} m{share}")
+        end = f"in {draw.times_s[-1]:g} s at x {x_m:.1f} m, y {y_m:.1f} m"
+        lines.append(f"{mark} draw {draw.index} {branch} {end}{share}")
     draw = draws[chosen]
     lines += ["", f"Draw {chosen} (*) lies nearest to the others: the one to drive by. It says:", ""]
     if draw.plan is not None:
@@ -151,6 +152,7 @@ def _as_json(scene_id: str, draws: list[Any], chosen: int, picture: Path) -> dic
                 "branch": draw.branch,
                 "think_probability": draw.think_probability,
                 "trajectory": draw.trajectory.tolist(),
+                "times_s": list(draw.times_s),
                 "tokens": dict(draw.tokens),
             }
             for draw in draws

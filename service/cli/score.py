@@ -75,7 +75,7 @@ def _agreed_draws(
     route: bool,
     quiet: bool,
 ) -> dict[str, FloatArray]:
-    """The trajectory [64, 4] of the draw to drive, by scene id."""
+    """The trajectory of the draw to drive at 10 Hz, [64, 4] or as far as it goes, by scene id."""
     from functools import partial
 
     import numpy as np
@@ -87,7 +87,7 @@ def _agreed_draws(
     found: dict[str, FloatArray] = {}
 
     def keep(_: Variant, labelled: LabelledScene, draws: Sequence[Draw]) -> None:
-        trajectories = np.stack([draw.trajectory for draw in draws])
+        trajectories = np.stack([draw.at_10_hz for draw in draws])
         found[labelled.scene.scene_id] = trajectories[agreed(trajectories)]
 
     formats = engine.card.formats

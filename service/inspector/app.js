@@ -5,6 +5,7 @@ import { drawBirdseye } from "./birdseye.js";
 import { showCameras } from "./cameras.js";
 import { byId, element } from "./dom.js";
 import { showDraw } from "./timeline.js";
+import { averageError } from "./times.js";
 
 const state = { view: null, draws: [], chosen: 0, running: null, opened: new Map(), inputs: [] };
 
@@ -175,11 +176,9 @@ async function showDraft(draw) {
   redraw();
 }
 
-function averageError(trajectory, expert) {
-  if (!expert) return "–";
-  const sum = trajectory.reduce((total, row, index) =>
-    total + Math.hypot(row[0] - expert[index][0], row[1] - expert[index][1]), 0);
-  return `${(sum / trajectory.length).toFixed(2)} m`;
+function errorOf(draw) {
+  const metres = state.view.future && averageError(draw, state.view.future);
+  return typeof metres === "number" ? `${metres.toFixed(2)} m` : "–";
 }
 
 const DISAGREES = {
@@ -210,7 +209,7 @@ function drawRow(draw, index) {
       ...draw.disagreements.map((parts) => element("span", { className: "disagrees", textContent: DISAGREES[parts]?.[0] ?? parts, title: DISAGREES[parts]?.[1] ?? "" }))),
     element("td", {}, draw.think_probability === null ? "–" : probability(draw.think_probability)),
     element("td", { className: "number", textContent: tokens }),
-    element("td", { className: "number", textContent: averageError(draw.trajectory, state.view.future) }));
+    element("td", { className: "number", textContent: errorOf(draw) }));
   row.addEventListener("click", () => choose(index));
   return row;
 }

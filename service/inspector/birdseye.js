@@ -1,6 +1,7 @@
 // The scene from above: x forward is up, y left is left, metres.
 
 import { byId } from "./dom.js";
+import { timesOf } from "./times.js";
 
 const EGO = { length_m: 4.51, width_m: 1.85 };
 const BEHIND_M = 14;
@@ -35,7 +36,7 @@ export function drawBirdseye(view, draws, chosen) {
   if (view.future) line(map, start(view.future), "expert", 2.5, [7, 5]);
   const draft = draws[chosen]?.draft_trajectory;
   if (draft) line(map, start(draft), "draft", 3, [9, 5]);
-  if (draws[chosen]) chosenDraw(map, draws[chosen].trajectory);
+  if (draws[chosen]) chosenDraw(map, draws[chosen]);
   box(map, [0, 0, 0], EGO, "ego", 1);
   canvas.setAttribute("aria-label", describe(view, draws, chosen));
 }
@@ -107,16 +108,18 @@ function agentFuture(map, agent) {
   }
 }
 
-function chosenDraw(map, rows) {
+// With a dot at every whole second at which it has a pose.
+function chosenDraw(map, draw) {
   const { pen, at, color } = map;
-  line(map, start(rows), "chosen", 3.5);
-  for (let row = SECOND - 1; row < rows.length; row += SECOND) {
+  line(map, start(draw.trajectory), "chosen", 3.5);
+  timesOf(draw).forEach((seconds, row) => {
+    if (Math.abs(seconds - Math.round(seconds)) > 1e-6) return;
     pen.beginPath();
-    pen.arc(...at(rows[row]), 3.5, 0, 2 * Math.PI);
+    pen.arc(...at(draw.trajectory[row]), 3.5, 0, 2 * Math.PI);
     Object.assign(pen, { fillStyle: color("panel"), strokeStyle: color("chosen"), lineWidth: 2 });
     pen.fill();
     pen.stroke();
-  }
+  });
 }
 
 function describe(view, draws, chosen) {

@@ -4,7 +4,6 @@ import { byId, element } from "./dom.js";
 
 const HORIZON_S = 6.4;
 const GROUPS = ["longitudinal", "lateral", "lane"];
-const SECTIONS = ["plan", "branch", "thinking", "revised_plan", "trajectory"];
 const LOOK = {
   "Accelerate": "go", "Decelerate": "slow", "Wait": "stop", "Reverse": "back",
   "Left Turn": "left", "Left Lane Change": "left", "Right Turn": "right", "Right Lane Change": "right",
@@ -21,8 +20,8 @@ export function showDraw(draw) {
     parts.push(element("h3", { textContent: "Revised plan" }), tracks(draw.revised_plan, draw.plan));
   }
   const text = element("pre", { textContent: (draw.revised_plan || draw.plan || { text: "" }).text, tabIndex: 0 });
-  const chips = SECTIONS.filter((section) => section in draw.tokens).map((section) =>
-    element("li", { textContent: `${section.replaceAll("_", " ")} ${draw.tokens[section]}` }));
+  const chips = Object.entries(draw.tokens).map(([section, count]) =>
+    element("li", { textContent: `${section.replaceAll("_", " ")} ${count}` }));
   parts.push(
     element("h3", { textContent: "Tokens per section" }),
     element("ul", { className: "chips", id: "tokens" }, ...chips),

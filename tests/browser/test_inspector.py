@@ -15,6 +15,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from model.driving.scene_store import write_scenes
+from model.driving.trajectory import TEN_HZ_S
 from model.engines.engine import EngineError
 from service.keys import new_line
 from service.settings import Settings
@@ -198,6 +199,27 @@ def test_a_draft_is_shown_beside_what_came_of_the_second_look(
     expect(inspector.locator("#birdseye")).not_to_have_attribute("aria-label", re.compile("draft"))
     assert engine.submitted[-1].controls.deadline_ms is None
     assert not near(pixels(inspector, "#birdseye"), DRAFT_RGB).any()
+
+
+def test_poses_at_other_times_are_compared_with_the_expert_at_these(
+    inspector: Page, engine: ScriptedEngine
+) -> None:
+    def errors(draws: int) -> list[float]:
+        inspector.get_by_role("spinbutton", name="Draws").fill(str(draws))
+        plan(inspector)
+        expect(inspector.locator("#draws tbody tr")).to_have_count(draws)
+        texts = inspector.locator("#draws td:last-child").all_inner_texts()
+        return [float(text.removesuffix(" m")) for text in texts]
+
+    usual = errors(6)
+    engine.times_s = tuple(round(0.2 * place, 1) for place in range(1, 33))
+    try:
+        found = errors(5)
+    finally:
+        engine.times_s = TEN_HZ_S
+    # Every other pose of the same trajectories.
+    assert found == pytest.approx(usual[:5], rel=0.1)
+    assert found != usual[:5]
 
 
 def test_draws_are_chosen_by_keyboard(inspector: Page) -> None:

@@ -36,7 +36,7 @@ def test_shapes_are_those_of_the_model() -> None:
     track = tracks.Track(**told, kind="cone", lights=frozenset({"left", "right"}))
     [sent] = wire_tracks([track])
     assert tracks.Track(**sent.model_dump(exclude={"lights"}), lights=frozenset(sent.lights)) == track
-    future = wire.Draw.model_json_schema()["properties"]["trajectory"]
+    future = wire.LabelledScene.model_json_schema()["properties"]["future"]
     assert future["minItems"] == future["maxItems"] == trajectory.FUTURE_STEPS
 
 
@@ -95,3 +95,18 @@ def test_an_older_service_does_not_say_whether_parts_agree() -> None:
     trajectory = [[0.1 * step, 0.0, 0.0, 0.0] for step in range(64)]
     written = wire.TrajectoryWritten.model_validate({"index": 0, "trajectory": trajectory})
     assert (written.consistent, written.disagreements) == (None, [])
+
+
+@pytest.mark.parametrize(
+    ("poses", "times_s", "fits"),
+    [(64, None, True), (8, None, False), (2, [0.5, 1.0], True), (64, [0.5], False)],
+)
+def test_a_trajectory_has_64_poses_or_its_own_times(
+    poses: int, times_s: list[float] | None, fits: bool
+) -> None:
+    told = {"index": 0, "trajectory": [[0.0] * 4] * poses, "times_s": times_s}
+    if fits:
+        wire.TrajectoryWritten.model_validate(told)
+        return
+    with pytest.raises(ValidationError, match="poses"):
+        wire.TrajectoryWritten.model_validate(told)

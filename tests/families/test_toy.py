@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,15 @@ import torch
 from prometheus_client import CollectorRegistry
 
 import clients.wire as wire
+from clients.planner import PlannerClient, plan_request
 from model.driving.agreement import agreement
-from model.driving.plan import parse_plan
+from model.driving.labeller import expert_plan
 from model.engines.engine import Controls, Draw, PlanRequest, SectionFinished, TextWritten
 from model.engines.torch.decoder import Decoder
+from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.torch.runner import Runner
+from model.evaluation.open_loop import evaluate_draws
+from model.families.family import Lesson
 from model.families.registry import GROUP, family_named
 from model.formats.cursor import CompiledFormat
 from model.formats.text import parse
@@ -27,27 +32,35 @@ from model.training.targets import make_target
 from service.metrics import Metrics
 from service.planning import Judged
 from service.planning import Told as Happened
+from service.settings import Settings
 from service.streaming import told_events
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.families.toy import TOY, drive
+from tests.model.driving.drives import MIDDLES_S, labelled_scene
 from tests.model.engines.decoding import decode
 from tests.model.engines.reference import exactly, reference_draws
+from tests.model.evaluation.fakes import draw_of
+from tests.service.serving import serve
 
 
 @pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loaded]:
-    """A checkpoint of the family, which an installed package declares."""
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Of the family, which an installed package declares."""
     installed = tmp_path_factory.mktemp("installed")
     about = installed / "toy-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: toy\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text(f"[{GROUP}]\ntoy = tests.families.toy:TOY\n")
-    with pytest.MonkeyPatch.context() as patch, torch.inference_mode():
+    with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(installed)
         folder = Path(tmp_path_factory.mktemp("toy") / "checkpoint")
-        write_untrained(folder, narrow=True, settings=VlaSettings(name="toy", formats=("toy",)))
-        yield exactly(load(folder, torch.float64))
+        yield write_untrained(folder, narrow=True, settings=VlaSettings(name="toy", formats=("toy",)))
     family_named.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def toy(checkpoint: Path) -> Loaded:
+    return exactly(load(checkpoint, torch.float64))
 
 
 def planned(toy: Loaded, **controls: Any) -> list[Draw]:
@@ -67,7 +80,7 @@ def test_it_plans_in_its_own_words(toy: Loaded) -> None:
         assert set(draw.tokens) in ({"mood", "speeds"}, {"mood", "why", "speeds"})
         speeds = [float(word) for word in draw.text.split(" at ")[-1].split(" m/s")[0].split(" ")]
         np.testing.assert_array_equal(draw.trajectory, drive(tuple(speeds)))
-        assert (draw.plan, draw.codes) == (None, ())
+        assert (draw.plan, draw.codes, draw.times_s) == (None, (), (1.0, 2.0, 3.0, 4.0))
 
 
 @pytest.mark.parametrize(("thinking", "word"), [("never", "Sure,"), ("always", "Hmm,")])
@@ -85,6 +98,28 @@ def test_a_deadline_makes_drafts_of_its_direct_option(toy: Loaded) -> None:
         draws = decode(Decoder(Runner(toy, 4), clock=lambda: float(next(late))), asked)
     assert {draw.branch for draw in draws.values()} == {"Sure,"}
     assert {draw.cut for draw in draws.values()} <= {"skipped", "replaced"}
+
+
+def test_it_plans_over_http_and_is_evaluated(checkpoint: Path) -> None:
+    labelled = labelled_scene(12.0, pictures=1)
+    engine = TorchEngine(checkpoint, TorchSettings(rows=4, products=None))
+    with serve(engine, Settings()) as served, PlannerClient(served.url) as planner:
+        result = planner.plan(labelled.scene, wire.Controls(n=2, logprobs=True), format="toy")
+        asked = plan_request(labelled.scene, wire.Controls(n=2, thinking="always"), format="toy")
+        events = list(planner.stream(asked))
+    draws = []
+    for planned in result.draws:
+        assert planned.times_s == (1.0, 2.0, 3.0, 4.0)
+        assert planned.trajectory.shape == (4, 4)
+        assert planned.logprobs is not None
+        assert len(planned.logprobs.token_ids) == sum(planned.tokens.values())
+        draws.append(replace(draw_of(planned.trajectory), times_s=planned.times_s))
+    assert {name for name, _ in events} == {"branch", "thinking", "trajectory", "done"}
+    expert = labelled.future[[9, 19, 29, 39], :2]
+    apart = np.linalg.norm([draw.trajectory[:, :2] - expert for draw in draws], axis=-1)
+    measured = evaluate_draws(labelled, draws)
+    assert measured.avg_ade_m == pytest.approx(apart.mean(), rel=1e-4)
+    assert measured.min_fde_m == pytest.approx(apart[:, -1].min(), rel=1e-4)
 
 
 def test_it_is_streamed_in_the_words_of_the_wire(toy: Loaded) -> None:
@@ -113,8 +148,9 @@ def test_it_is_streamed_in_the_words_of_the_wire(toy: Loaded) -> None:
 
 def test_a_labelled_scene_teaches_it(toy: Loaded) -> None:
     compiled = CompiledFormat(TOY.format, toy.vocabulary)
-    plan = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
-    target = make_target(TOY, compiled, plan, [0] * 6, {"mood": 2.0, "why": 1.0, "speeds": 5.0})
+    labelled = labelled_scene(np.maximum(0, 12 - 4 * np.maximum(MIDDLES_S, 0)))
+    lesson = Lesson(expert_plan(labelled), (0,) * 6, labelled.future)
+    target = make_target(TOY, compiled, lesson, {"mood": 2.0, "why": 1.0, "speeds": 5.0})
     text = toy.vocabulary.decode(target.ids)
     assert text == "Sure, at 10 5 0 0 m/s<|im_end|>"
     assert parse(compiled, text)["speeds"] == (10.0, 5.0, 0.0, 0.0)

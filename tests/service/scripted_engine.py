@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from model.driving.plan import GROUPS, Plan, parse_plan
-from model.driving.trajectory import FUTURE_STEPS, STEP_S, FloatArray, present_speed
+from model.driving.trajectory import FUTURE_STEPS, STEP_S, TEN_HZ_S, FloatArray, at_times, present_speed
 from model.engines.engine import (
     DraftFinished,
     Draw,
@@ -64,6 +64,7 @@ class ScriptedEngine:
         may_begin: requests wait for it in the queue, after they were noted.
         may_finish: requests wait for it behind their first plan.
         breaks: what is put into it ends the engine.
+        times_s: of the poses of its trajectories.
         starts: how often it was started.
         submitted, cancelled: what was asked, in order.
     """
@@ -79,6 +80,7 @@ class ScriptedEngine:
         self.may_begin = asyncio.Event()
         self.may_begin.set()
         self.breaks: asyncio.Queue[EngineError] = asyncio.Queue()
+        self.times_s = TEN_HZ_S
         self.starts = 0
         self.submitted: list[PlanRequest] = []
         self.cancelled: list[str] = []
@@ -113,7 +115,7 @@ class ScriptedEngine:
         try:
             await self.may_begin.wait()
             yield Started()
-            draws = [_draw(request, index) for index in range(request.controls.n)]
+            draws = [self._timed(_draw(request, index)) for index in range(request.controls.n)]
             for draw in draws:
                 yield SectionFinished(draw.index, "plan", str(draw.plan))
             await self.may_finish.wait()
@@ -124,7 +126,7 @@ class ScriptedEngine:
                 yield SectionFinished(draw.index, "branch", draw.branch or "")
                 if draw.thinking is not None:
                     if request.controls.deadline_ms is not None:
-                        yield DraftFinished(_draft(request, draw))
+                        yield DraftFinished(self._timed(_draft(request, draw)))
                     for word in draw.thinking.split(" ")[:-1] if request.live else ():
                         yield TextWritten(draw.index, "thinking", f" {word}")
                     yield SectionFinished(draw.index, "thinking", f" {draw.thinking}\n")
@@ -138,6 +140,10 @@ class ScriptedEngine:
 
     def cancel(self, request_id: str) -> None:
         self.cancelled.append(request_id)
+
+    def _timed(self, draw: Draw) -> Draw:
+        trajectory = at_times(draw.trajectory, TEN_HZ_S, self.times_s)
+        return replace(draw, trajectory=trajectory, times_s=self.times_s)
 
 
 def _draw(request: PlanRequest, index: int) -> Draw:

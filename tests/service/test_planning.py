@@ -13,6 +13,7 @@ from clients.wire import PlanResponse
 from model.driving.images import ImageError
 from model.driving.plan import parse_plan
 from model.driving.scene import SceneError
+from model.driving.trajectory import TEN_HZ_S
 from model.engines.engine import EngineError, RequestError
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
@@ -101,6 +102,33 @@ def test_log_probabilities_are_told_where_they_are_asked_for(served: Served) -> 
     assert isinstance(events["done"], PlanResult)
     for result in (alone, batch, events["done"], looked):
         assert result.draws[0].logprobs == wire.Logprobs(token_ids=[11, 12, 13], logprobs=[None, -0.25, -1.5])
+
+
+def test_trajectories_are_told_with_times_of_their_own(served: Served, engine: ScriptedEngine) -> None:
+    usual = plan(served, n=2, thinking="always").draws
+    assert {draw.times_s for draw in usual} == {None}
+    engine.times_s = (0.5, 1.0, 1.5, 2.0)
+    try:
+        with PlannerClient(served.url) as planner:
+            asked = wire.Controls(n=2, seed=1, thinking="always", deadline_ms=60_000)
+            result = planner.plan(scene(), asked)
+            events = list(planner.stream(plan_request(scene(), asked)))
+            looked = planner.reflect(scene(), KEEP_ON, wire.ReflectControls(n=2, seed=1))
+    finally:
+        engine.times_s = TEN_HZ_S
+    for draw, other in zip(result.draws, usual, strict=True):
+        assert draw.times_s == (0.5, 1.0, 1.5, 2.0)
+        expected = np.array(other.trajectory)[[4, 9, 14, 19]]
+        np.testing.assert_allclose(draw.trajectory, expected, atol=1e-3)
+        assert draw.at_10_hz.shape == (20, 4)
+        assert draw.draft_trajectory is not None
+        assert draw.draft_trajectory.shape == (4, 4)
+        # Nobody knows whether it follows a plan that goes on behind it.
+        assert "plan_trajectory" not in draw.disagreements
+    told = [event for name, event in events if isinstance(event, wire.TrajectoryWritten)]
+    assert len(told) == 4
+    assert all(event.times_s == [0.5, 1.0, 1.5, 2.0] for event in told)
+    assert looked.draws[0].times_s == (0.5, 1.0, 1.5, 2.0)
 
 
 def test_the_route_may_be_left_out(served: Served, engine: ScriptedEngine) -> None:

@@ -1,30 +1,28 @@
-"""A family of its own words: four speeds, one for every 1.6 s, straight on; in doubt it says why first."""
+"""A family of its own words: four speeds, one a second, straight on; in doubt it says why first."""
 
 from typing import Final
 
 import numpy as np
 
-from model.driving.plan import Plan
-from model.driving.trajectory import FUTURE_STEPS, STEP_S, FloatArray
+from model.driving.trajectory import FloatArray
 from model.families.family import Branch, Decode, Family, Lesson, Reading
 from model.formats.compounds import Number, Repeat
 from model.formats.pieces import Choice, Format, FreeText, Literal, Option, Section, Sequence, Values
 
-_SPEEDS: Final = 4
-_HELD_STEPS: Final = FUTURE_STEPS // _SPEEDS
+_TIMES_S: Final = (1.0, 2.0, 3.0, 4.0)
 _TOP_SPEED_MS: Final = 30
 _STEP_MS: Final = 5
 
-_GRID: Final = Repeat(Number(0, _TOP_SPEED_MS, _STEP_MS), _SPEEDS, _SPEEDS, between=" ")
+_GRID: Final = Repeat(Number(0, _TOP_SPEED_MS, _STEP_MS), len(_TIMES_S), len(_TIMES_S), between=" ")
 _DRIVE: Final = Section("speeds", Sequence((Literal(" at "), _GRID, Literal(" m/s<|im_end|>"))))
 _WHY: Final = Section("why", Sequence((Literal(" "), FreeText("\n", 12))))
 _MOOD: Final = Choice((Option("Sure,", _DRIVE), Option("Hmm,", Sequence((_WHY, _DRIVE)))), name="mood")
 
 
 def drive(speeds_ms: tuple[float, ...]) -> FloatArray:
-    """Straight on at each of the speeds in turn: float32 [64, 4]."""
-    trajectory = np.zeros((FUTURE_STEPS, 4), np.float32)
-    trajectory[:, 0] = np.cumsum(np.repeat(speeds_ms, _HELD_STEPS) * STEP_S)
+    """Straight on at each of the speeds in turn, where that leads at `_TIMES_S`: float32 [4, 4]."""
+    trajectory = np.zeros((len(_TIMES_S), 4), np.float32)
+    trajectory[:, 0] = np.cumsum(speeds_ms)
     return trajectory
 
 
@@ -40,13 +38,10 @@ def read(values: Values, decode: Decode) -> Reading:
 
 
 def teach(lesson: Lesson) -> Values:
-    """Slower where the expert's plan says so."""
-    speeds = (10.0, 10.0, 10.0, 10.0) if _keeps(lesson.plan) else (10.0, 5.0, 0.0, 0.0)
-    return Values.of({"mood": "Sure,", "speeds": speeds})
-
-
-def _keeps(plan: Plan) -> bool:
-    return plan.word_at("longitudinal", 0) == "Keep Speed"
+    """The expert's speeds, as near as they can be said."""
+    metres = lesson.future[[round(10 * time_s) - 1 for time_s in _TIMES_S], 0]
+    wanted = np.diff(metres, prepend=0.0).clip(0, _TOP_SPEED_MS)
+    return Values.of({"mood": "Sure,", "speeds": tuple((_STEP_MS * np.rint(wanted / _STEP_MS)).tolist())})
 
 
 TOY: Final = Family(
@@ -54,6 +49,7 @@ TOY: Final = Family(
     task="Say how fast to drive.",
     trajectory="speeds",
     read=read,
+    times_s=_TIMES_S,
     branch=Branch("mood", direct="Sure,", reflecting="Hmm,"),
     reflection="why",
     teach=teach,

@@ -8,8 +8,11 @@ from hypothesis import strategies as st
 from model.driving.trajectory import (
     GeometryError,
     agreed,
+    at_10_hz,
+    at_times,
     check_history,
     check_route,
+    check_times,
     check_trajectory,
     constant_turn_rate,
     constant_velocity,
@@ -96,6 +99,37 @@ def test_the_draw_that_the_others_agree_with_is_followed() -> None:
     draws[:, :, 1] = np.array([0.0, 1.0, 1.2, 9.0])[:, None]
     assert agreed(draws) == 1
     assert agreed(draws[:1]) == 0
+
+
+@given(st.integers(0, 2**31), st.integers(1, 8), st.floats(0.3, 1.0))
+def test_a_trajectory_is_where_it_says_and_between_in_a_straight_line(
+    seed: int, count: int, step_s: float
+) -> None:
+    times_s = [step_s * (place + 1) for place in range(count)]
+    poses = np.random.default_rng(seed).normal(0, 20, (count, 4)).astype(np.float32)
+    poses[:, 3] %= 1.0
+    np.testing.assert_allclose(at_times(poses, times_s, times_s[::-1]), poses[::-1], atol=1e-5)
+    halfway = [time_s - step_s / 2 for time_s in times_s]
+    before = np.concatenate([np.zeros((1, 4)), poses[:-1]])
+    np.testing.assert_allclose(at_times(poses, times_s, halfway), (before + poses) / 2, atol=1e-4)
+
+
+def test_headings_turn_the_short_way_round() -> None:
+    poses = np.array([[0, 0, 0, 3.0], [0, 0, 0, -3.0]], np.float32)
+    assert at_times(poses, (1.0, 2.0), (1.5,))[0, 3] == pytest.approx(np.pi, abs=1e-5)
+
+
+@pytest.mark.parametrize(("times_s", "rows"), [((0.5, 1.0), 10), ((0.25,), 2), ((4.0, 8.0), 64)])
+def test_ten_poses_a_second_end_with_the_last_pose_or_after_6_4_s(
+    times_s: tuple[float, ...], rows: int
+) -> None:
+    assert at_10_hz(np.ones((len(times_s), 4), np.float32), times_s).shape == (rows, 4)
+
+
+@pytest.mark.parametrize("times_s", [(), (0.0, 1.0), (1.0, 1.0), (2.0, 1.0), (61.0,), (float("nan"),)])
+def test_times_ascend_from_the_present(times_s: tuple[float, ...]) -> None:
+    with pytest.raises(GeometryError, match="times must ascend"):
+        check_times(times_s)
 
 
 def test_a_route_that_leads_nowhere_is_refused() -> None:

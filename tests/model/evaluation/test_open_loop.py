@@ -36,6 +36,21 @@ def test_the_measures_of_three_draws_by_hand() -> None:
     assert result.tags == {"lead_vehicle"}
 
 
+def test_trajectories_with_times_of_their_own_are_measured_at_these() -> None:
+    labelled = labelled_scene(10.0, agents=(agent(30, 3.5),))
+    times_s = (0.5, 1.0, 1.5, 2.0)
+    expert = labelled.future[[4, 9, 14, 19]]
+    draws = [replace(draw_of(offset(expert, metres)), times_s=times_s) for metres in (0.0, 3.0, 6.0)]
+    result = evaluate_draws(labelled, draws, greedy=draws[1])
+    assert (result.min_ade_m, result.corner_distance_m) == (0.0, 0.0)
+    assert result.avg_ade_m == result.avg_fde_m == result.greedy_ade_m == result.agreed_ade_m
+    assert result.avg_ade_m == pytest.approx(3.0)
+    # The car stands 30 m ahead, which is 3 s away; the paths end after 2 s.
+    assert result.collision_rate == 0.0
+    assert result.off_road_rate == pytest.approx(1 / 3)
+    assert result.path_error_m == pytest.approx(34**0.5 - 5, abs=1e-3)  # 3 m aside in the first half second
+
+
 def test_without_a_known_road_nobody_leaves_it() -> None:
     labelled = replace(labelled_scene(), drivable=())
     assert evaluate_trajectories(labelled, labelled.future[None]).off_road_rate is None

@@ -2,14 +2,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from model.driving.phrases import Statement, Thing
 from model.driving.plan import Plan, parse_plan
+from model.driving.trajectory import HISTORY_STEPS, constant_velocity
 from model.families.cf_vla import CF_VLA
 from model.families.cf_vla.format import PHRASES
 from model.families.cf_vla.targets import PAPER_WEIGHTS
-from model.families.family import Reflection
+from model.families.family import Lesson, Reflection
 from model.families.traj_only import TRAJ_ONLY
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import FormatError, Values
@@ -23,9 +25,13 @@ PLAN = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
 WRONG = parse_plan("- longitudinal\n  - 0.0s-6.4s: Accelerate\n")
 
 
+def lesson(plan: Plan, reflection: Reflection | None = None) -> Lesson:
+    return Lesson(plan, CODES, constant_velocity(np.zeros((HISTORY_STEPS, 4), np.float32)), reflection)
+
+
 def test_a_direct_target_says_plan_and_codes_with_the_papers_weights() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
-    target = make_target(CF_VLA, compiled, PLAN, CODES, PAPER_WEIGHTS)
+    target = make_target(CF_VLA, compiled, lesson(PLAN), PAPER_WEIGHTS)
     values = parse(compiled, VOCABULARY.decode(target.ids), {"plan": PLAN})
     assert values == Values.of({"plan": PLAN, "branch": "Action:", "trajectory": CODES})
     tokens = compiled.render(values, {"plan": PLAN})
@@ -34,20 +40,20 @@ def test_a_direct_target_says_plan_and_codes_with_the_papers_weights() -> None:
 
 def test_traj_only_has_no_plan() -> None:
     compiled = CompiledFormat(TRAJ_ONLY.format, VOCABULARY)
-    target = make_target(TRAJ_ONLY, compiled, PLAN, CODES, PAPER_WEIGHTS)
+    target = make_target(TRAJ_ONLY, compiled, lesson(PLAN), PAPER_WEIGHTS)
     assert parse(compiled, VOCABULARY.decode(target.ids)) == Values.of({"trajectory": CODES})
 
 
 def test_a_family_that_teaches_nothing_is_refused() -> None:
     family, compiled = replace(CF_VLA, teach=None), CompiledFormat(CF_VLA.format, VOCABULARY)
     with pytest.raises(ValueError, match="no targets for format 'cf_vla'"):
-        make_target(family, compiled, PLAN, CODES, PAPER_WEIGHTS)
+        make_target(family, compiled, lesson(PLAN), PAPER_WEIGHTS)
 
 
 def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
     reflection = Reflection(WRONG, "The car ahead stands still.")
-    target = make_target(CF_VLA, compiled, PLAN, CODES, PAPER_WEIGHTS, reflection)
+    target = make_target(CF_VLA, compiled, lesson(PLAN, reflection), PAPER_WEIGHTS)
     plans = {"plan": WRONG, "revised_plan": PLAN}
     values = parse(compiled, VOCABULARY.decode(target.ids), plans)
     assert (values["plan"], values["revised_plan"]) == (WRONG, PLAN)
@@ -89,7 +95,7 @@ def test_a_plan_that_nobody_judged_teaches_no_branch() -> None:
 
 def test_a_right_plan_of_its_own_is_acted_on_and_not_taught() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
-    target = make_target(CF_VLA, compiled, PLAN, CODES, PAPER_WEIGHTS, Reflection(WRONG, ""))
+    target = make_target(CF_VLA, compiled, lesson(PLAN, Reflection(WRONG, "")), PAPER_WEIGHTS)
     values = parse(compiled, VOCABULARY.decode(target.ids), {"plan": WRONG})
     assert values == Values.of({"plan": WRONG, "branch": "Action:", "trajectory": CODES})
     taught = [id for id, weight in zip(target.ids, target.weights, strict=True) if weight > 0]
@@ -101,7 +107,7 @@ def test_a_reflection_in_phrases_leads_to_its_own_plan() -> None:
     first, slower = three_tracks("Keep Speed", "Keep Lane"), three_tracks("Wait", "Keep Lane")
     text = str(Statement(Thing("barrier", "my lane", 20), "too close", "slower"))
     expert = three_tracks("Wait", "Left Lane Change")
-    target = make_target(CF_VLA, compiled, expert, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
+    target = make_target(CF_VLA, compiled, lesson(expert, Reflection(first, text, slower)), PAPER_WEIGHTS)
     values = parse(compiled, VOCABULARY.decode(target.ids))
     assert (values["thinking"], values["revised_plan"]) == (text, slower)
     # The expert goes to the left, of which nothing is stated: its trajectory is not what was planned.
@@ -110,7 +116,7 @@ def test_a_reflection_in_phrases_leads_to_its_own_plan() -> None:
         token.section: weight for token, weight in zip(tokens, target.weights, strict=True) if weight != 10
     }
     assert weights == {"plan": 0.0, "trajectory": 0.0}
-    same = make_target(CF_VLA, compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
+    same = make_target(CF_VLA, compiled, lesson(slower, Reflection(first, text, slower)), PAPER_WEIGHTS)
     assert same.ids == target.ids
     assert set(same.weights) == {0.0, 1.0, 10.0}
 
@@ -120,10 +126,10 @@ def test_a_plan_that_phrases_do_not_lead_to_is_refused() -> None:
     first, slower = three_tracks("Keep Speed", "Keep Lane"), three_tracks("Wait", "Left Lane Change")
     text = str(Statement(Thing("barrier", "my lane", 20), "too close", "slower"))
     with pytest.raises(FormatError, match="changes otherwise"):
-        make_target(CF_VLA, compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, text, slower))
+        make_target(CF_VLA, compiled, lesson(slower, Reflection(first, text, slower)), PAPER_WEIGHTS)
     with pytest.raises(FormatError, match="no reflection in phrases"):
         make_target(
-            CF_VLA, compiled, slower, CODES, PAPER_WEIGHTS, Reflection(first, "I should slow down.", slower)
+            CF_VLA, compiled, lesson(slower, Reflection(first, "I should slow down.", slower)), PAPER_WEIGHTS
         )
 
 
@@ -134,4 +140,4 @@ def three_tracks(longitudinal: str, lane: str) -> Plan:
 
 def test_every_section_needs_a_weight() -> None:
     with pytest.raises(KeyError):
-        make_target(CF_VLA, CompiledFormat(CF_VLA.format, VOCABULARY), PLAN, CODES, {"plan": 1.0})
+        make_target(CF_VLA, CompiledFormat(CF_VLA.format, VOCABULARY), lesson(PLAN), {"plan": 1.0})
