@@ -31,6 +31,32 @@ class Branch:
     reflecting: str
 
 
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """What text inputs are made of: what a scene and an example of training both know.
+
+    Attributes:
+        history: float32 [16, 4].
+        route: float32 [20, 2]; None where the prompt has none.
+    """
+
+    history: FloatArray
+    route: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TextInputs:
+    """What a prompt says of a scene in words and numbers, such as the present speed or a command.
+
+    Attributes:
+        format: of the text, which stands at the end of the prompt; tokenised by pieces, as responses are.
+        values: of the format's sections; numbers must lie on their grid.
+    """
+
+    format: Format
+    values: Callable[[Situation], Values]
+
+
 Decode = Callable[[Sequence[int]], FloatArray]
 """Makes a trajectory float32 [64, 4] of codes, with the checkpoint's codec and the scene's history."""
 
@@ -95,6 +121,7 @@ class Family:
     Attributes:
         format: of its responses; requests and checkpoints name the family by the format's name.
         task: what its prompt asks for.
+        inputs: what its prompt says of a scene beside pictures, history, route and tracks.
         trajectory: the section that holds the trajectory.
         read: what the values of a response say.
         times_s: of the poses of its trajectories, 64 at 10 Hz unless it says otherwise.
@@ -114,6 +141,7 @@ class Family:
     trajectory: str
     read: Callable[[Values, Decode], Reading]
     times_s: tuple[float, ...] = TEN_HZ_S
+    inputs: TextInputs | None = None
     first_plan: str | None = None
     branch: Branch | None = None
     reflection: str | None = None

@@ -163,9 +163,11 @@ def read_parts(folder: Path) -> Parts:
             image_size=(settings.image_width, settings.image_height),
             parameters=card["parameters"],
             inputs=settings.inputs,
-            prompt_tokens=inputs.prompt_tokens(settings.inputs),
+            prompt_tokens=inputs.longest_prompt(settings.formats[0]),
             input_tokens={
-                name: inputs.prompt_tokens((name,)) - inputs.prompt_tokens(()) for name in settings.inputs
+                name: inputs.longest_prompt(settings.formats[0], (name,))
+                - inputs.longest_prompt(settings.formats[0], ())
+                for name in settings.inputs
             },
             details=card["details"],
         ),

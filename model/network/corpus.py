@@ -299,4 +299,4 @@ def nano_corpus() -> Iterator[str]:
             # Often enough that the prompt's own words become single tokens.
             for tokens in (0, LEAST_SCENE_TOKENS):
                 settings = VlaSettings(cameras=CAMERAS, scene_tokens=tokens)
-                yield from [prompt_text(format, settings, route=route, tracks=route)] * 20
+                yield from ["".join(prompt_text(format, settings, route=route, tracks=route))] * 20

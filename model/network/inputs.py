@@ -11,6 +11,9 @@ import numpy.typing as npt
 from model.driving.images import decode_image
 from model.driving.scene import Scene
 from model.driving.trajectory import FloatArray
+from model.families.family import Situation, TextInputs
+from model.families.registry import family_named
+from model.formats.cursor import CompiledFormat
 from model.network.patches import normalise, patchify, resize
 from model.network.prompts import prompt_text
 from model.network.settings import VlaSettings
@@ -22,7 +25,7 @@ IntArray = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
-    """What all scenes with the same format, cameras and presence of a route share.
+    """Tokens and positions; without text inputs the same for all scenes of a format that bring the same.
 
     Attributes:
         ids: int64 [t] tokens.
@@ -69,6 +72,7 @@ class InputBuilder:
         self._vocabulary = vocabulary
         self.settings = settings
         self._prompts: dict[tuple[str, bool, bool], Prompt] = {}
+        self._texts: dict[str, CompiledFormat] = {}
 
     @property
     def video_grid_thw(self) -> IntArray:
@@ -82,10 +86,11 @@ class InputBuilder:
             SceneError: a camera is missing.
             ImageError: a picture cannot be decoded.
             FamilyError: an unknown format.
+            FormatError: its family says of the scene what its prompt cannot say.
         """
         route, tracks = self.way(scene), self.tracks(scene)
         return ModelInputs(
-            prompt=self.prompt(format, route=route is not None, tracks=tracks is not None),
+            prompt=self.prompt(format, Situation(scene.history, route), tracks=tracks is not None),
             patches=np.concatenate([self.patches(pictures) for pictures in self.slices(scene)]),
             video_grid_thw=self.video_grid_thw,
             history=scene.history,
@@ -128,25 +133,46 @@ class InputBuilder:
         """The patches of the `frame`s of one slice, uint8 [p, 1176]."""
         return patchify(np.stack(frames), self.settings)
 
-    def prompt(self, format: str, *, route: bool, tracks: bool = False) -> Prompt:
-        """The prompt of a format; raises `FamilyError` for an unknown one."""
-        key = (format, route, tracks)
+    def prompt(self, format: str, situation: Situation, *, tracks: bool = False) -> Prompt:
+        """The prompt of a format in a situation, with its route if it has one.
+
+        Raises:
+            FamilyError: an unknown format.
+            FormatError: its family says what its prompt cannot say.
+        """
+        key = (format, situation.route is not None, tracks)
+        if text := self.text(format, situation):
+            return self._prompt(*key, text)
         if key not in self._prompts:
-            settings = self.settings
-            text = prompt_text(format, settings, route=route, tracks=tracks)
-            ids = np.array(self._vocabulary.encode(text), np.int64)
-            positions = rotary_positions(ids == self._vocabulary.id_of(VIDEO_PAD), settings)
-            self._prompts[key] = Prompt(ids, positions, int(positions.max()) + 1 - len(ids))
+            self._prompts[key] = self._prompt(*key, text)
         return self._prompts[key]
 
-    def longest_prompt(self, format: str) -> Prompt:
-        """The prompt of a scene that has all that the network can be given."""
-        return self.prompt(format, route=self.settings.with_route, tracks=self.settings.with_tracks)
+    def text(self, format: str, situation: Situation) -> list[int]:
+        """The tokens of a family's own text inputs; raises as `prompt` does."""
+        inputs = family_named(format).inputs
+        if inputs is None:
+            return []
+        return [token.id for token in self._text(format, inputs).render(inputs.values(situation))]
 
-    def prompt_tokens(self, inputs: Sequence[str]) -> int:
-        """Length of the first format's prompt for a scene that brings ``inputs``: ``route``, ``tracks``."""
-        prompt = self.prompt(self.settings.formats[0], route="route" in inputs, tracks="tracks" in inputs)
-        return len(prompt.ids)
+    def longest_prompt(self, format: str, inputs: Sequence[str] | None = None) -> int:
+        """Tokens of the longest prompt of scenes that bring ``inputs`` (``route``, ``tracks``), or both."""
+        inputs = self.settings.inputs if inputs is None else inputs
+        prompt = self._prompt(format, "route" in inputs, "tracks" in inputs, [])
+        texts = family_named(format).inputs
+        return len(prompt.ids) + (0 if texts is None else self._text(format, texts).longest())
+
+    def _prompt(self, format: str, route: bool, tracks: bool, text: Sequence[int]) -> Prompt:
+        before, behind = prompt_text(format, self.settings, route=route, tracks=tracks)
+        # Nothing is merged over the seam: the second part begins with a special token.
+        encode = self._vocabulary.encode
+        ids = np.array([*encode(before), *text, *encode(behind)], np.int64)
+        positions = rotary_positions(ids == self._vocabulary.id_of(VIDEO_PAD), self.settings)
+        return Prompt(ids, positions, int(positions.max()) + 1 - len(ids))
+
+    def _text(self, format: str, inputs: TextInputs) -> CompiledFormat:
+        if format not in self._texts:
+            self._texts[format] = CompiledFormat(inputs.format, self._vocabulary)
+        return self._texts[format]
 
 
 def rotary_positions(is_video: npt.NDArray[np.bool_], settings: VlaSettings) -> IntArray:

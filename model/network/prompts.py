@@ -28,11 +28,11 @@ SYSTEM: Final = "You plan how this car drives."
 """What the model is told it is."""
 
 
-def prompt_text(format: str, settings: VlaSettings, *, route: bool, tracks: bool = False) -> str:
-    """The whole prompt, placeholders included, up to where the response begins.
+def prompt_text(format: str, settings: VlaSettings, *, route: bool, tracks: bool = False) -> tuple[str, str]:
+    """The whole prompt, placeholders included, up to where the response begins: in two parts.
 
     What all scenes share comes first and the history after the pictures, so that caches of common
-    beginnings hold as long as possible.
+    beginnings hold as long as possible. A family's own text inputs stand between the parts.
 
     Args:
         format: the response format's name; its family decides the task.
@@ -47,8 +47,8 @@ def prompt_text(format: str, settings: VlaSettings, *, route: bool, tracks: bool
         f"{IM_START}system\n{SYSTEM}{IM_END}\n"
         f"{IM_START}user\n{family_named(format).task}\n"
         f"{_seen(settings)}"
-        f"{motion_text(route=route, tracks=tracks)}"
-        f"{IM_END}\n{IM_START}assistant\n"
+        f"{motion_text(route=route, tracks=tracks)}",
+        f"{IM_END}\n{IM_START}assistant\n",
     )
 
 

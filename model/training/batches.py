@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
 from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, present_speed
-from model.families.family import Lesson, Reflection
+from model.families.family import Lesson, Reflection, Situation
 from model.families.registry import families_of
 from model.families.trajectory_codes import CODES
 from model.formats.cursor import CompiledFormat
@@ -157,7 +157,7 @@ class ResponseDataset(Dataset[Sample]):
         reflections: Sequence[Reflection | None] = found or [None]
         soft = [self._soft.draw(vector, self._random) for _ in reflections]
         return Sample(
-            prompt=self._prompt(item),
+            prompt=self._prompt(item, Situation(history, route if item.route else None)),
             responses=[
                 self._target(item.task, Lesson(plan, tuple(drawn.codes.tolist()), future, reflection))
                 for drawn, reflection in zip(soft, reflections, strict=True)
@@ -175,12 +175,13 @@ class ResponseDataset(Dataset[Sample]):
     def _target(self, task: str, lesson: Lesson) -> Target:
         return make_target(self._families[task], self._formats[task], lesson, self._weights)
 
-    def _prompt(self, item: Item) -> list[int]:
+    def _prompt(self, item: Item, situation: Situation) -> list[int]:
         if self._pictures:
-            prompt = self._inputs.prompt(item.task, route=item.route, tracks=item.tracks)
+            prompt = self._inputs.prompt(item.task, situation, tracks=item.tracks)
             return cast("list[int]", prompt.ids.tolist())
         # Without pictures nothing but speed counts, and a trajectory's whole example has thirty tokens.
-        return list(self._vocabulary.encode(motion_text(route=item.route, tracks=item.tracks)))
+        motion = self._vocabulary.encode(motion_text(route=item.route, tracks=item.tracks))
+        return [*motion, *self._inputs.text(item.task, situation)]
 
     def _patches(self, item: Item) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
         return patchify(

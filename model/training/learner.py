@@ -121,17 +121,19 @@ class ResponseLearner(nn.Module):
         filling = -len(places) % _PLACES_STEP
         logits = self.vla.lm_head(hidden.flatten(0, 1)[F.pad(lie.before[places], (0, filling))])
         labels, weights = F.pad(labels[places], (0, filling)), F.pad(weights[places], (0, filling))
-        # The start of each response's trajectory, and which of them are to be learned.
+        # The start of each trajectory in codes, which of them are to be learned, and whose they are.
         row, place = ((input_ids == self._future_start_id) & (parts > 0)).nonzero(as_tuple=True)
         learned = loss_weights[row, place + 1] > 0
+        responses = parts.amax(dim=1).clamp_min(0)
+        which = (responses.cumsum(0) - responses)[row] + parts[row, place] - 1
         losses = response_loss(
             logits,
             labels,
             weights,
             self._first_code_id,
-            code_shares[learned],
-            code_errors_m[learned],
-            len(row),
+            code_shares[which[learned]],
+            code_errors_m[which[learned]],
+            int(responses.sum()),
             self._error_weight,
         )._asdict()
         if self.head is not None:

@@ -267,7 +267,7 @@ def _rooflines(rows: list[Row], checkpoint: Path, device: str) -> list[Roofline]
 
     dtype = fast_dtype(device)
     machine, parts, config = measure(device, dtype), read_parts(checkpoint), read_config(checkpoint)
-    prompt = len(parts.inputs.longest_prompt("cf_vla").ids)
+    prompt = parts.inputs.longest_prompt("cf_vla")
     slices, grid_rows, columns = parts.settings.grid
     patches = len(parts.settings.cameras) * slices * grid_rows * columns
     found = []

@@ -17,6 +17,7 @@ import clients.wire as wire
 from clients.planner import PlannerClient, plan_request
 from model.driving.agreement import agreement
 from model.driving.labeller import expert_plan
+from model.driving.trajectory import present_speed
 from model.engines.engine import Controls, Draw, PlanRequest, SectionFinished, TextWritten
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.engine import TorchEngine, TorchSettings
@@ -28,6 +29,9 @@ from model.formats.cursor import CompiledFormat
 from model.formats.text import parse
 from model.network.checkpoint import Loaded, load
 from model.network.settings import VlaSettings
+from model.training.batches import Item, ResponseDataset, collate
+from model.training.examples import Examples
+from model.training.learner import ResponseLearner
 from model.training.targets import make_target
 from service.metrics import Metrics
 from service.planning import Judged
@@ -40,6 +44,7 @@ from tests.model.driving.drives import MIDDLES_S, labelled_scene
 from tests.model.engines.decoding import decode
 from tests.model.engines.reference import exactly, reference_draws
 from tests.model.evaluation.fakes import draw_of
+from tests.model.training.scenes import training_scene
 from tests.service.serving import serve
 
 
@@ -144,6 +149,38 @@ def test_it_is_streamed_in_the_words_of_the_wire(toy: Loaded) -> None:
         ("thinking", wire.ThinkingWritten(index=0, text=text)) for text in ("It", " rains.")
     ]
     assert trajectory[0] == "trajectory"
+
+
+def test_training_reads_the_prompts_that_the_engine_reads(toy: Loaded) -> None:
+    scenes = [training_scene(number) for number in range(4)]
+    examples = Examples.from_scenes(scenes, toy.settings.cameras)
+    weights = {"mood": 2.0, "speeds": 5.0}
+    data = ResponseDataset(examples, toy.codec, toy.inputs, toy.vocabulary, weights, pictures=True)
+    for number, labelled in enumerate(scenes):
+        built = toy.inputs.build(labelled.scene, "toy")
+        route = labelled.scene.route is not None
+        assert data[Item(number, "toy", route)].prompt == built.prompt.ids.tolist()
+        assert len(built.prompt.ids) <= toy.inputs.longest_prompt("toy")
+        told = f"now at {present_speed(labelled.scene.history):.0f} m/s, goal {'' if route else 'unknown'}"
+        assert told in toy.vocabulary.decode(built.prompt.ids)
+
+
+def test_a_step_of_training_brings_it_nearer_to_the_expert(checkpoint: Path) -> None:
+    toy = load(checkpoint)
+    examples = Examples.from_scenes([training_scene(1)], toy.settings.cameras)
+    weights = {"mood": 2.0, "speeds": 5.0}
+    data = ResponseDataset(examples, toy.codec, toy.inputs, toy.vocabulary, weights, pictures=False)
+    batch = collate([data[Item(0, "toy", True)]])
+    learner = ResponseLearner(toy.model, toy.vocabulary, toy.codec)
+    optimiser = torch.optim.SGD(learner.parameters(), lr=0.1)
+    losses = []
+    for _ in range(2):
+        optimiser.zero_grad()
+        loss = learner(**batch)["loss"]
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[1] < losses[0]
 
 
 def test_a_labelled_scene_teaches_it(toy: Loaded) -> None:

@@ -41,7 +41,7 @@ from model.engines.torch.layout import (
 from model.engines.torch.memory import IntArray, Memory, SlotMapping
 from model.engines.torch.packed import Attention, PackedDecoder, Rotation
 from model.engines.torch.vision import Encoded, VisionEncoder
-from model.families.family import Family
+from model.families.family import Family, Situation
 from model.families.registry import families_of
 from model.formats.cursor import CompiledFormat
 from model.network.checkpoint import Loaded
@@ -154,7 +154,7 @@ class Runner:
             products=products,
             one_by_one=reproducible,
         )
-        kept = [len(loaded.inputs.longest_prompt(format).ids) - 1 for format in loaded.card.formats]
+        kept = [loaded.inputs.longest_prompt(format) - 1 for format in loaded.card.formats]
         sizes = {
             "layers": text.num_hidden_layers,
             "heads": text.num_key_value_heads,
@@ -323,7 +323,7 @@ class Runner:
     def _begin_prompt(self, scene: Scene, format: str, kv_row: int, encoded: Encoded) -> Prompt:
         loaded = self.loaded
         route, tracks = loaded.inputs.way(scene), loaded.inputs.tracks(scene)
-        prompt = loaded.inputs.prompt(format, route=route is not None, tracks=tracks is not None)
+        prompt = loaded.inputs.prompt(format, Situation(scene.history, route), tracks=tracks is not None)
         embedded = loaded.model.embed_prompt(prompt, encoded.tokens, scene.history, route, tracks)
         shown = format.encode() + encoded.digest
         rotation = self._decoder.rotation(embedded.position_ids)

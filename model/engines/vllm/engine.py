@@ -191,7 +191,7 @@ class VllmEngine:
         from vllm.v1.engine.async_llm import AsyncLLM
 
         settings = self._parts.settings
-        prompts = [len(self._parts.inputs.longest_prompt(format).ids) for format in self._card.formats]
+        prompts = [self._parts.inputs.longest_prompt(format) for format in self._card.formats]
         limits = {name: kind.items for name, kind in kinds_of(settings).items()}
         arguments = {
             "model": str(self._checkpoint),

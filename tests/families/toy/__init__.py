@@ -4,8 +4,8 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.trajectory import FloatArray
-from model.families.family import Branch, Decode, Family, Lesson, Reading
+from model.driving.trajectory import FloatArray, present_speed
+from model.families.family import Branch, Decode, Family, Lesson, Reading, Situation, TextInputs
 from model.formats.compounds import Number, Repeat
 from model.formats.pieces import Choice, Format, FreeText, Literal, Option, Section, Sequence, Values
 
@@ -44,12 +44,26 @@ def teach(lesson: Lesson) -> Values:
     return Values.of({"mood": "Sure,", "speeds": tuple((_STEP_MS * np.rint(wanted / _STEP_MS)).tolist())})
 
 
+def describe(situation: Situation) -> Values:
+    """How fast the ego is, and where the route leads at its end."""
+    route = situation.route
+    side = "unknown" if route is None else "left" if route[-1, 1] > 0 else "right"
+    speed_ms = round(min(max(0.0, present_speed(situation.history)), _TOP_SPEED_MS))
+    return Values.of({"speed": float(speed_ms), "goal": side})
+
+
+_NOW: Final = Sequence((Literal("now at "), Number(0, _TOP_SPEED_MS, 1), Literal(" m/s,")))
+_SIDE: Final = Choice((Option("left"), Option("right"), Option("unknown")))
+_GOAL: Final = Sequence((Literal(" goal "), _SIDE, Literal("\n")))
+_INPUTS: Final = Format("toy inputs", Sequence((Section("speed", _NOW), Section("goal", _GOAL))))
+
 TOY: Final = Family(
     format=Format("toy", Section("mood", _MOOD)),
     task="Say how fast to drive.",
     trajectory="speeds",
     read=read,
     times_s=_TIMES_S,
+    inputs=TextInputs(_INPUTS, describe),
     branch=Branch("mood", direct="Sure,", reflecting="Hmm,"),
     reflection="why",
     teach=teach,

@@ -17,6 +17,7 @@ from transformers import (
     Qwen2_5_VLForConditionalGeneration,
 )
 
+from model.families.family import Situation
 from model.network.card import CARD_FILE, CheckpointError, weights_revision
 from model.network.checkpoint import Loaded, create_nano, expand_stock, load, save
 from model.network.codec import CODEC_FILE, TrajectoryCodec
@@ -90,7 +91,7 @@ def test_near_codes_begin_near(nano: Loaded) -> None:
 def test_transformers_loads_the_backbone(nano: Loaded, nano_folder: Path) -> None:
     stock: Any = AutoModelForImageTextToText.from_pretrained(nano_folder)
     assert type(stock) is Qwen2_5_VLForConditionalGeneration
-    ids = torch.from_numpy(nano.inputs.prompt("cf_vla", route=False).ids[:10])[None]
+    ids = torch.from_numpy(nano.inputs.prompt("cf_vla", Situation(made_up_scene(1).history)).ids[:10])[None]
     ours: Any = nano.model
     torch.testing.assert_close(stock(input_ids=ids).logits, ours(input_ids=ids).logits)
 

@@ -8,6 +8,7 @@ import pytest
 from model.driving.scene import FRONT_TELE, FRONT_WIDE, Scene, SceneError
 from model.families.family import FamilyError
 from model.network.inputs import InputBuilder, rotary_positions
+from model.network.prompts import prompt_text
 from model.network.settings import NANO_SETTINGS, SettingsError, VlaSettings
 from model.network.vocabulary import HISTORY, ROUTE, VIDEO_PAD, Vocabulary
 from tests.model.network.conftest import made_up_scene
@@ -40,11 +41,16 @@ def test_cameras_in_the_order_of_the_checkpoint(vocabulary: Vocabulary, scene: S
 
 def test_prompts_share_their_beginning(vocabulary: Vocabulary) -> None:
     builder = InputBuilder(vocabulary, SETTINGS)
-    with_route, without = builder.prompt("cf_vla", route=True), builder.prompt("cf_vla", route=False)
+    scenes = made_up_scene(1), made_up_scene(1, route=False)
+    with_route, without = (builder.build(scene, "cf_vla").prompt for scene in scenes)
+    whole = "".join(prompt_text("cf_vla", SETTINGS, route=False))
+    assert without.ids.tolist() == list(vocabulary.encode(whole))
     history = int(np.flatnonzero(without.ids == vocabulary.id_of(HISTORY))[0])
     np.testing.assert_array_equal(with_route.ids[: history + 1], without.ids[: history + 1])
     assert vocabulary.decode(without.ids).endswith("<|im_end|>\n<|im_start|>assistant\n")
-    assert builder.prompt("traj_only", route=False).ids.shape != without.ids.shape
+    assert builder.build(scenes[1], "traj_only").prompt.ids.shape != without.ids.shape
+    assert builder.longest_prompt("cf_vla") == len(with_route.ids)
+    assert builder.longest_prompt("cf_vla", ()) == len(without.ids)
 
 
 def test_without_route(vocabulary: Vocabulary) -> None:

@@ -88,7 +88,7 @@ def test_the_chat_template_writes_our_prompts(tmp_path: Path, scene_tokens: int)
             add_generation_prompt=True,
             tokenize=False,
         )
-        assert written == prompt_text(task, settings, route=route, tracks=tracks)
+        assert written == "".join(prompt_text(task, settings, route=route, tracks=tracks))
 
 
 def test_a_new_checkpoint_has_a_card_that_tells_what_it_is(tmp_path: Path) -> None:

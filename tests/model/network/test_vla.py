@@ -70,7 +70,7 @@ def test_positions_equal_those_of_transformers(nano64: Loaded, batch: dict[str, 
         second_per_grid_ts=[nano64.settings.seconds_per_slice] * 4,
     )
     torch.testing.assert_close(model.position_ids(ids), theirs)
-    assert offset[0] == nano64.inputs.prompt("cf_vla", route=True).position_offset
+    assert offset[0] == nano64.inputs.build(made_up_scene(1), "cf_vla").prompt.position_offset
 
 
 @torch.no_grad()

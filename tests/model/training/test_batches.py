@@ -13,7 +13,7 @@ from model.driving.plan import parse_plan
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.driving.trajectory import present_speed
 from model.families.cf_vla.targets import PAPER_WEIGHTS
-from model.families.family import Reflection
+from model.families.family import Reflection, Situation
 from model.formats.pieces import FormatError
 from model.network.checkpoint import Loaded, load
 from model.network.vocabulary import FUTURE_START
@@ -86,7 +86,8 @@ def test_processes_get_batches_of_one_kind_at_a_time() -> None:
 
 def test_only_the_response_weighs(loaded: Loaded) -> None:
     sample = dataset(loaded)[Item(1, "cf_vla", True)]
-    prompt = loaded.inputs.prompt("cf_vla", route=True).ids.tolist()
+    situation = Situation(EXAMPLES.history[1], EXAMPLES.route[1])
+    prompt = loaded.inputs.prompt("cf_vla", situation).ids.tolist()
     assert sample.prompt == prompt
     batch = collate([sample])
     (response,) = sample.responses
