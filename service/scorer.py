@@ -82,7 +82,8 @@ class Scorer:
     async def _ask(self, content: bytes) -> tuple[bytes, bytes]:
         if self._process is None or self._process.returncode is not None:
             self._process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-c", _RUN, str(self._bundled)),
+                # Not from where the service was started: that may hold modules of the same names.
+                *(sys.executable, "-P", "-c", _RUN, str(self._bundled)),
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=asyncio.subprocess.DEVNULL,

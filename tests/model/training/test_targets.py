@@ -75,7 +75,7 @@ def test_a_plan_that_nobody_judged_teaches_no_branch() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
     told = Reflection(WRONG, "The car ahead stands still.")
     judged, unjudged = (
-        make_target(CF_VLA, compiled, PLAN, CODES, PAPER_WEIGHTS, replace(told, judged=judged))
+        make_target(CF_VLA, compiled, lesson(PLAN, replace(told, judged=judged)), PAPER_WEIGHTS)
         for judged in (True, False)
     )
     assert judged.ids == unjudged.ids
