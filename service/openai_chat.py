@@ -17,11 +17,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 import clients.wire as wire
 from model.driving.scene import CLIP_FRAMES
 from model.engines.engine import ModelCard
-from service.answers import plan_answer
+from service.answers import plan_answer, wire_branch
 from service.planning import Planned
 from service.problems import INVALID_CLIP, INVALID_IMAGE, INVALID_REQUEST, UNKNOWN_MODEL, ProblemError, at
 
-THINKING: Final = "Thinking: "
+THINKING: Final = f"{wire_branch(looked_twice=True)} "
 _EVERY: Final = 5
 """Poses of a trajectory between those that are told in a message: every half second."""
 _DATA: Final = "data:"

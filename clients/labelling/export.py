@@ -6,8 +6,9 @@ import json
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
+from clients import wire
 from clients.labelling.ledger import Entry, Ledger, LedgerError, Run
 from clients.labelling.outcomes import followed_plans, plans_that_hold
 from clients.labelling.teachers.prompt import camera_line
@@ -22,6 +23,8 @@ from model.driving.trajectory import present_speed
 MESSAGES_FILE: Final = "messages.jsonl"
 PARTS_FILE: Final = "trl.jsonl"
 _IMAGE: Final = "<image>"
+_, _REFLECTS = get_args(wire.Branch)
+"""What a second look begins with."""
 DATASET: Final = "looktwice"
 
 
@@ -173,7 +176,7 @@ def _row(scene: Scene, labelled: LabelledReflection, images: list[str]) -> dict[
         f"Your plan for the next 6.4 seconds:\n{labelled.predicted_plan}"
         "Reflect on it, then correct it."
     )
-    answered = f"Thinking:\n{labelled.reflection}\nMeta Actions:\n{labelled.expert_plan}"
+    answered = f"{_REFLECTS}\n{labelled.reflection}\nMeta Actions:\n{labelled.expert_plan}"
     return {
         "messages": [
             {"role": "user", "content": asked},

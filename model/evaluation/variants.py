@@ -22,6 +22,7 @@ from model.engines.engine import (
     PlanRequest,
 )
 from model.evaluation.open_loop import SceneResult, evaluate_draws
+from model.families.registry import family_named
 
 SPEED_FACTORS: Final = (0.5, 1.5)
 """A planner that copies its speed goes as much slower or faster as its history; the expert does not."""
@@ -59,21 +60,26 @@ def standard_variants(
 ) -> list[Variant]:
     """The open-loop table's rows for a checkpoint that writes ``formats`` and takes ``inputs``."""
     no_branch = replace(controls, thinking="adaptive", think_threshold=None)
+    families = sorted(map(family_named, formats), key=lambda family: family.first_plan is not None)
     variants = []
     given = [("", False, False), (" + route", True, False), (" + route + tracks", True, True)]
     for suffix, route, tracks in given if "tracks" in inputs else given[:2]:
-        plain = Variant("", controls=controls, route=route, tracks=tracks)
-        if "traj_only" in formats:
-            variants.append(replace(plain, name=f"traj-only{suffix}", format="traj_only", controls=no_branch))
-        if "cf_vla" in formats:
+        for family in families:
+            title = f"{family.title or family.name}{suffix}"
+            plain = Variant(
+                title, family.name, controls if family.branch else no_branch, route=route, tracks=tracks
+            )
+            if family.first_plan is None:
+                variants.append(plain)
+                continue
             variants += [
-                replace(plain, name=f"meta-act{suffix}", greedy=True),
-                replace(plain, name=f"meta-act{suffix}, expert plan", expert_plan=True),
-                replace(plain, name=f"meta-act{suffix}, shuffled images", shuffled_images=True),
+                replace(plain, greedy=True),
+                replace(plain, name=f"{title}, expert plan", expert_plan=True),
+                replace(plain, name=f"{title}, shuffled images", shuffled_images=True),
             ]
             if route:
                 variants += [
-                    replace(plain, name=f"meta-act{suffix}, speed x {factor:g}", speed=factor)
+                    replace(plain, name=f"{title}, speed x {factor:g}", speed=factor)
                     for factor in SPEED_FACTORS
                 ]
     return variants

@@ -130,6 +130,7 @@ class Family:
         reflection: the section where it says what is wrong with its first plan.
         revised_plan: the section of the plan that takes the first one's place.
         teach: the values of the response that a labelled scene teaches; None where nothing is trained.
+        title: what tables of measures call it; its name without one.
         dialects: other formats of the same name, for checkpoints whose reflections are written otherwise.
 
     Raises:
@@ -147,6 +148,7 @@ class Family:
     reflection: str | None = None
     revised_plan: str | None = None
     teach: Callable[[Lesson], Values] | None = None
+    title: str | None = None
     dialects: Mapping[ReflectionLanguage, Format] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -175,6 +177,11 @@ class Family:
     def plans(self) -> tuple[str, ...]:
         """The sections of plans, the one that counts first where several are written."""
         return tuple(each for each in (self.revised_plan, self.first_plan) if each is not None)
+
+    @property
+    def looks_twice(self) -> bool:
+        """Whether it reflects upon a plan of its own, as counterfactual examples teach."""
+        return self.first_plan is not None and self.reflection is not None
 
     def in_dialect(self, reflection: ReflectionLanguage) -> Family:
         """The family of a checkpoint whose reflections are so written."""

@@ -95,6 +95,9 @@ class Sample:
 class ResponseDataset(Dataset[Sample]):
     """Renders `Item`s; the items of an epoch come from `TaskSampler`.
 
+    Attributes:
+        reflecting: the format of reflections, where the checkpoint writes any.
+
     Args:
         examples, codec, inputs, vocabulary: of the checkpoint.
         weights: of sections.
@@ -105,6 +108,7 @@ class ResponseDataset(Dataset[Sample]):
 
     Raises:
         FormatError: a reflection holds text that the checkpoint cannot write.
+        ValueError: there are reflections, and it writes none.
     """
 
     def __init__(
@@ -129,11 +133,14 @@ class ResponseDataset(Dataset[Sample]):
         self._formats = {
             name: CompiledFormat(family.format, vocabulary) for name, family in self._families.items()
         }
+        self.reflecting = next((name for name, family in self._families.items() if family.looks_twice), None)
         for reflection in reflections:
+            if self.reflecting is None:
+                raise ValueError(f"none of {', '.join(self._families)} reflects upon a plan")
             # Before hours of training: the format must be able to say it.
             plan = reflection.revised_plan or reflection.first_plan
             nowhere = np.zeros((FUTURE_STEPS, 4), np.float32)
-            self._target("cf_vla", Lesson(plan, (0,) * CODES, nowhere, reflection))
+            self._target(self.reflecting, Lesson(plan, (0,) * CODES, nowhere, reflection))
 
     def __len__(self) -> int:
         return len(self._examples)
@@ -213,6 +220,7 @@ class TaskSampler(BatchSampler):
         seed: of the order; every epoch has another one.
         processes: so many batches in a row are alike, as those who share the work wait for the slowest.
         reflected: int64 [r], the example that each reflection is on.
+        reflecting: the format of reflections and of examples that are learned once more; needed with them.
         reasoning: whether reflections are learned; otherwise their examples are learned once more without,
             the control "multi-round" of CF-VLA section 4.3.
     """
@@ -228,6 +236,7 @@ class TaskSampler(BatchSampler):
         reflected: npt.NDArray[np.int64] = np.zeros(0, np.int64),
         reasoning: bool = True,
         *,
+        reflecting: str | None = None,
         tracks_share: float = 0.0,
         mirror_share: float = 0.0,
         blur_share: float = 0.0,
@@ -236,6 +245,9 @@ class TaskSampler(BatchSampler):
         self._mirror_reflected = mirror_reflected
         self._shares = {"tracks": tracks_share, "mirror": mirror_share, "blur": blur_share}
         self._processes, self._has_route, self._tasks = processes, has_route, tasks
+        if len(reflected) and reflecting is None:
+            raise ValueError("reflections need a format that they are written in")
+        self._reflecting = reflecting or ""
         self._route_share, self._seed, self._epoch = route_share, seed, 0
         self._again = np.zeros(0, np.int64) if reasoning else reflected
         self._reflections: dict[int, list[int]] = {}
@@ -277,7 +289,7 @@ class TaskSampler(BatchSampler):
         return [
             Item(
                 int(example[place]),
-                names[drawn[place]] if place < count else "cf_vla",
+                names[drawn[place]] if place < count else self._reflecting,
                 bool(given[place]),
                 tracks=bool(tracks[place]),
                 mirror=bool(mirror[place]),
@@ -294,7 +306,7 @@ class TaskSampler(BatchSampler):
         return [
             Item(
                 index,
-                "cf_vla",
+                self._reflecting,
                 bool(given[place]),
                 tuple(self._reflections[index]),
                 tracks=bool(tracks[place]),

@@ -208,6 +208,7 @@ def _prepare(
         processes=int(os.environ.get("WORLD_SIZE", 1)),
         reflected=np.zeros(0, np.int64) if on_examples is None else on_examples.examples,
         reasoning=recipe.reflections == "learned",
+        reflecting=responses.reflecting,
         tracks_share=recipe.tracks_share if loaded.settings.with_tracks else 0.0,
         mirror_share=recipe.mirror_share,
         blur_share=recipe.blur_share,

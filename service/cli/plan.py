@@ -132,7 +132,7 @@ def _told(scene_id: str, draws: list[Draw], chosen: int) -> list[str]:
     if draw.thinking is not None:
         lines += [
             "",
-            f"Thinking: {draw.thinking}",
+            f"Second look: {draw.thinking}",
             "",
             "Revised meta actions:",
             str(draw.revised_plan).rstrip(),

@@ -90,9 +90,7 @@ def _agreed_draws(
         trajectories = np.stack([draw.at_10_hz for draw in draws])
         found[labelled.scene.scene_id] = trajectories[agreed(trajectories)]
 
-    formats = engine.card.formats
-    chosen = "cf_vla" if "cf_vla" in formats else formats[0]
-    variants = [Variant(engine.card.name, chosen, controls, route=route)]
+    variants = [Variant(engine.card.name, engine.card.formats[0], controls, route=route)]
     evaluate = partial(evaluate_variants, on_draws=keep)
     asyncio.run(run_started(evaluate, scenes, engine, variants, controls.n, rows, quiet=quiet))
     return found

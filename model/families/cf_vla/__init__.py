@@ -18,5 +18,6 @@ CF_VLA: Final = Family(
     teach=teach,
     trajectory=its.TRAJECTORY,
     read=read,
+    title="meta-act",
 )
 """plan, branch { act: trajectory | reflect: reflection, revised plan, trajectory }"""

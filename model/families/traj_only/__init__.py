@@ -24,6 +24,7 @@ TRAJ_ONLY: Final = Family(
     task="Give the trajectory.",
     trajectory=TRAJECTORY,
     read=read,
+    title="traj-only",
     teach=teach,
 )
 """trajectory"""

@@ -122,7 +122,9 @@ REFLECTED = np.array([3, 3, 5], np.int64)
 
 
 def test_reflections_are_examples_beside_all_others() -> None:
-    sampler = TaskSampler(np.ones(8, np.bool_), 1, {"cf_vla": 1.0}, 0.5, seed=0, reflected=REFLECTED)
+    sampler = TaskSampler(
+        np.ones(8, np.bool_), 1, {"cf_vla": 1.0}, 0.5, seed=0, reflected=REFLECTED, reflecting="cf_vla"
+    )
     items = [item for batch in sampler for item in batch]
     assert len(items) == len(sampler) == 10
     reflected = [item for item in items if item.reflections]
@@ -148,7 +150,14 @@ def test_only_reflections_in_phrases_are_mirrored(phrases: bool) -> None:
 def test_every_batch_reaches_a_process() -> None:
     reflected = np.arange(300).repeat(4)
     sampler = TaskSampler(
-        np.ones(2000, np.bool_), 16, {"cf_vla": 1.0}, 0.5, seed=0, processes=2, reflected=reflected
+        np.ones(2000, np.bool_),
+        16,
+        {"cf_vla": 1.0},
+        0.5,
+        seed=0,
+        processes=2,
+        reflected=reflected,
+        reflecting="cf_vla",
     )
     sampler.set_epoch(1)
     shards = [list(BatchSamplerShard(sampler, 2, process)) for process in range(2)]
@@ -163,7 +172,14 @@ def test_every_batch_reaches_a_process() -> None:
 def test_batches_of_reflections_lie_among_the_others(processes: int) -> None:
     reflected = np.repeat(np.arange(0, 4000, 4), 3)
     sampler = TaskSampler(
-        np.ones(4000, np.bool_), 16, {"cf_vla": 1.0}, 0.5, seed=0, processes=processes, reflected=reflected
+        np.ones(4000, np.bool_),
+        16,
+        {"cf_vla": 1.0},
+        0.5,
+        seed=0,
+        processes=processes,
+        reflected=reflected,
+        reflecting="cf_vla",
     )
     batches = list(sampler)
     assert len(batches) == len(sampler) == 250 + 200
@@ -208,7 +224,14 @@ def test_responses_that_share_a_prompt_do_not_see_each_other(loaded: Loaded) -> 
 
 def test_the_control_learns_the_same_scenes_without_reasoning() -> None:
     sampler = TaskSampler(
-        np.ones(8, np.bool_), 1, {"traj_only": 1.0}, 0.5, seed=0, reflected=REFLECTED, reasoning=False
+        np.ones(8, np.bool_),
+        1,
+        {"traj_only": 1.0},
+        0.5,
+        seed=0,
+        reflected=REFLECTED,
+        reflecting="cf_vla",
+        reasoning=False,
     )
     items = [item for batch in sampler for item in batch]
     assert {item.reflections for item in items} == {()}
@@ -238,6 +261,7 @@ def test_each_chance_is_taken_as_often_as_asked() -> None:
         0.8,
         seed=0,
         reflected=np.arange(0, 4000, 8),
+        reflecting="cf_vla",
         tracks_share=0.5,
         mirror_share=0.3,
         blur_share=0.1,
