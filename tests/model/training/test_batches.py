@@ -142,6 +142,7 @@ def test_only_reflections_in_phrases_are_mirrored(phrases: bool) -> None:
         seed=0,
         reflected=REFLECTED,
         mirror_share=1.0,
+        reflecting="cf_vla",
         mirror_reflected=phrases,
     )
     assert {item.mirror for batch in sampler for item in batch if item.reflections} == {phrases}
