@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import Field, SkipValidation, model_validator
+from pydantic import FailFast, Field, SkipValidation, model_validator
 
 from clients.wire import Answered, Asked, Length, Nearby, NearbyPoint, Problem
 
@@ -146,7 +146,8 @@ class ScoreRequest(Asked):
         description="A bundled scene instead of labels: its own vehicle, poses of the box's centre, and its "
         "expert as the reference where none is given.",
     )
-    trajectories: list[ScoreTrajectory] = Field(
+    # Of thousands of wrong ones the first is told: all the faults would take a second to gather.
+    trajectories: Annotated[list[ScoreTrajectory], FailFast()] = Field(
         min_length=1,
         max_length=MAX_TRAJECTORIES,
         description="All of one length. A body may hold 250,000 values: 4,096 of 8 poses or 1,000 of 64.",

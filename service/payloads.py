@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Coroutine
 from typing import Any, Final
 
@@ -25,6 +26,8 @@ from service.problems import INVALID_BODY, INVALID_IMAGE, INVALID_JSON, ProblemE
 _JSON: Final = b"application/json"
 _MAX_PARTS: Final = 2048
 """Pictures of a batch."""
+_LARGE_BYTES: Final = 1_000_000
+"""Larger bodies are read on a thread, beside the answers of others."""
 _MAX_JSON_BYTES: Final = 8_000_000
 """Of the JSON part of a multipart body."""
 
@@ -66,11 +69,11 @@ def payload_route(check_open: Callable[[Request], None]) -> type[APIRoute]:
                     raise
                 media_type = media_type_of(request.headers)
                 if media_type == MSGPACK_MEDIA_TYPE:
-                    request = _Decoded(request, read_msgpack(await request.body()))
+                    request = _Decoded(request, await _read(read_msgpack, await request.body()))
                 elif media_type == MULTIPART_MEDIA_TYPE:
                     request = _Decoded(request, await _multipart(request))
                 elif _is_json(media_type) and (body := await request.body()):
-                    request = _Decoded(request, read_json(body))
+                    request = _Decoded(request, await _read(read_json, body))
                 return await handle(request)
 
             return decoded
@@ -94,6 +97,10 @@ def packed(value: Any) -> bytes:
     return content
 
 
+async def _read(read: Callable[[bytes], Any], body: bytes) -> Any:
+    return await asyncio.to_thread(read, body) if len(body) > _LARGE_BYTES else read(body)
+
+
 async def _multipart(request: Request) -> Any:
     try:
         form = await request.form(max_files=_MAX_PARTS, max_fields=8, max_part_size=_MAX_JSON_BYTES)
@@ -109,7 +116,7 @@ async def _multipart(request: Request) -> Any:
         parts = {name: await part.read() for name, part in form.items() if isinstance(part, UploadFile)}
     finally:
         await form.close()
-    document = read_json(text.encode() if isinstance(text, str) else text)
+    document = await _read(read_json, text.encode() if isinstance(text, str) else text)
     try:
         return with_pictures(document, lambda picture: _part(picture, parts))
     except RecursionError:

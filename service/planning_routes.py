@@ -146,7 +146,8 @@ def planning_router(parts: Parts) -> APIRouter:
         request: Request, asked: wire.BatchRequest, idempotency_key: IdempotencyKey = None
     ) -> Any:
         """Many scenes at once: each gets its answer or its problem; those that do not fit yet wait."""
-        scenes = [_scene_of_batch(each) for each in asked.requests]
+        # On a thread: a scene may have thousands of faults, and there may be 64 of them.
+        scenes = await asyncio.to_thread(lambda: [_scene_of_batch(each) for each in asked.requests])
         for number, each in enumerate(scenes):
             if isinstance(each, wire.PlanRequest) and each.stream:
                 raise at(INVALID_CONTROLS, f"/requests/{number}/stream", "a batch cannot stream")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from typing import Annotated, Any, Final
 
@@ -60,7 +61,7 @@ def scoring_router(parts: Parts) -> APIRouter:
 
     async def result(given: Any, arrival: Arrival) -> wire_scores.ScoreResult:
         try:
-            asked = validated(wire_scores.ScoreRequest, given)
+            asked = await asyncio.to_thread(validated, wire_scores.ScoreRequest, given)
             return wire_scores.ScoreResult(
                 status=200, response=await parts.scorer.score(asked, arrival.request_id)
             )

@@ -171,6 +171,13 @@ def test_without_a_model_nothing_is_planned(scorer: Served[NoModel]) -> None:
     assert "without a model" in answer.json()["detail"]
 
 
+def test_of_thousands_of_wrong_trajectories_the_first_is_told(scorer: Served[NoModel]) -> None:
+    wrong = [[["a", 0.0, 0.0]] * 8] * 3000
+    refused = problem(scorer.http.post("/v1/score", json=asked(trajectories=wrong)), "invalid-trajectory")
+    assert len(refused.errors) == 8
+    assert "more)" not in refused.detail.replace("(and 7 more)", "")
+
+
 def comb(sides: int, offset_m: float) -> list[list[float]]:
     """An outline whose sides all run beside each other, past every plan."""
     teeth = [
