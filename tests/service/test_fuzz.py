@@ -7,16 +7,22 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from model.driving.scene import FRONT_WIDE
 from service.keys import new_line
 from service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
 
 ROOT = Path(__file__).parents[2]
+CHECKS = (
+    *("not_a_server_error", "status_code_conformance", "content_type_conformance"),
+    *("response_schema_conformance", "response_headers_conformance"),
+)
 WITH_SCENES = "^/v1/(plan|plan/batch|reflect|label|score|score/batch|chat/completions)$"
 CONFIG = """
 # That a picture is one, and that a history can be driven, no schema can say: such bodies get a 422.
@@ -55,7 +61,7 @@ def key_and_service(
     "options",
     [
         ("--exclude-path-regex", WITH_SCENES, "--max-examples", "20"),
-        # Covering every bound of lists of lists of poses one by one takes hours.
+        # Covering every bound of lists of lists of poses one by one takes hours: see fuzz_whole_scenes.py.
         (
             "--include-path-regex",
             WITH_SCENES,
@@ -71,19 +77,45 @@ def test_nothing_described_can_break_the_service(
     key_and_service: tuple[str, Served], options: tuple[str, ...], tmp_path: Path
 ) -> None:
     key, served = key_and_service
-    (tmp_path / "schemathesis.toml").write_text(CONFIG)
+    run(served, key, tmp_path, (*options, "--checks", "all"), "tests.service.fuzz_hooks", 300)
+
+
+@pytest.mark.skipif("LOOKTWICE_TEST_COVERAGE" not in os.environ, reason="8,000 requests take a while")
+def test_nothing_around_whole_scenes_can_break_the_service(tmp_path: Path, scene_file: Path) -> None:
+    """Its coverage phase, in JSON, msgpack and multipart.
+
+    The description is narrowed to scenes that can be planned for. So what is wrong by it may be right, and
+    its checks that wrong data is refused and right data served say nothing here.
+    """
+    key, line = new_line("fuzzer")
+    (tmp_path / "keys").write_text(line)
+    engine = ScriptedEngine()
+    engine.card_shown = replace(engine.card, cameras=(FRONT_WIDE,), inputs=("route", "tracks"))
+    settings = Settings(bundled_scenes=scene_file, api_keys_file=tmp_path / "keys")
+    options = ("--include-path-regex", WITH_SCENES, "--phases", "coverage", "--checks", ",".join(CHECKS))
+    with serve(engine, settings, headers={"Authorization": f"Bearer {key}"}) as served:
+        run(served, key, tmp_path, options, "tests.service.fuzz_whole_scenes", 3000)
+
+
+def run(
+    served: Served, key: str, folder: Path, options: tuple[str, ...], hooks: str, timeout_s: float
+) -> None:
+    """Run schemathesis; no check may fail, and no answer be the service's failure."""
+    (folder / "schemathesis.toml").write_text(CONFIG)
     command = [
         str(Path(sys.executable).with_name("schemathesis")),
         *("run", f"{served.url}/openapi.json", "--header", f"Authorization: Bearer {key}", *options),
-        *("--checks", "all", "--generation-deterministic"),
-        *("--suppress-health-check", "all", "--request-timeout", "20", "--no-color"),
+        *("--generation-deterministic", "--suppress-health-check", "all"),
+        *("--request-timeout", "20", "--no-color"),
     ]
     environment = os.environ | {
-        "SCHEMATHESIS_HOOKS": "tests.service.fuzz_hooks",
+        "SCHEMATHESIS_HOOKS": hooks,
         "PYTHONPATH": str(ROOT),
         "PYTHONWARNINGS": "default",
     }
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=300)
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=folder, env=environment, timeout=timeout_s
+    )
     assert done.returncode == 0, re.sub(r"[A-Za-z0-9+/=]{200,}", "…", done.stdout)
     assert served.http.post("/v1/plan", json=body()).status_code == 200
     for status in ("500", "502", "503", "504"):
