@@ -17,8 +17,9 @@ from model.formats.cursor import Cursor
 _WEIGHT: Final = 0.1
 """Weight of the latest observation in a running mean."""
 _FIRST_STEP_S: Final = 0.02
-_FIRST_ENDING_PASSES: Final = 40.0
-"""Passes from the end of thinking to the end of the response, before any was seen."""
+_FIRST_ENDING_PASSES: Final = 10.0
+"""Before any was seen. Rather too few: a look that is not taken tells nothing of its length, and one that
+does not end in time has a draft beside it."""
 _CALM: Final = 1.5
 """With less than so many times the necessary time left, a text ends at the next sentence."""
 _LATE_DEVIATIONS: Final = 4.0
@@ -42,7 +43,8 @@ class LatencyModel:
     Attributes:
         step_s: mean duration of a step, prefill included.
         deviation_s: mean absolute deviation of a step from it.
-        ending_passes: passes behind a text.
+        ending_passes: passes from where a second look can no longer be cut to the response's end: from the
+            end of its text, or from the branch where there is no text that could be ended.
     """
 
     def __init__(self) -> None:
@@ -55,7 +57,7 @@ class LatencyModel:
         self.step_s += _WEIGHT * (seconds - self.step_s)
 
     def saw_ending(self, passes: int) -> None:
-        """A response took so many passes behind its text."""
+        """A second look that could no longer be cut took so many passes."""
         self.ending_passes += _WEIGHT * (passes - self.ending_passes)
 
     def time_for(self, deadline_s: float, now_s: float) -> TimeFor:

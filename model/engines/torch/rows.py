@@ -33,7 +33,8 @@ class Row(Response):
         held: how many tokens are in memory behind the prompt.
         draft: whether it is a direct trajectory beside a reflection.
         passes: how many it took part in.
-        passes_before_ending: how many up to the end of its text.
+        passes_before_ending: how many up to where a second look can no longer be cut: the branch, or the end
+            of the text behind it. 0 without one.
     """
 
     tree: Tree
@@ -104,9 +105,10 @@ class Row(Response):
         """Append a token that was chosen, if any, and the forced run behind it; returns what they finish."""
         written, finished = len(self.tokens), list[SectionText]()
         was_text = self.cursor.stop_id is not None
+        reflects = token is not None and self._reflects(token)
         if token is not None:
             finished += self.append(token, vocabulary, logprob)
-        if was_text and self.cursor.stop_id is None:
+        if reflects or (was_text and self.cursor.stop_id is None):
             self.passes_before_ending = self.passes
         finished += self.append_forced(vocabulary)
         self.pending += [token.id for token in self.tokens[written:]]
@@ -144,6 +146,13 @@ class Row(Response):
         if wanted is None:
             return everything
         return leads if wanted else ~leads
+
+    def _reflects(self, token: int) -> bool:
+        """Whether a token of the branch leads to a second look."""
+        branch = self.request.family.branch
+        if branch is None or self.cursor.allowed().choice != branch.name:
+            return False
+        return leads_to_reflection(branch, self.cursor, token)
 
     def _ends(self, time_for: TimeFor) -> bool:
         """Whether a text stops here."""

@@ -10,6 +10,7 @@ import torch
 from model.driving.agreement import reason_and_change
 from model.driving.phrases import corrected, read_facts
 from model.driving.plan import Plan, parse_plan
+from model.engines.torch.deadlines import LatencyModel
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.runner import Runner
 from model.network.checkpoint import Loaded, load
@@ -57,3 +58,16 @@ def test_they_are_those_of_the_reference_decoder(phrased: Loaded) -> None:
     draws = decode(Decoder(Runner(phrased, 4)), one, request("other", 2, n=2, thinking="adaptive"))
     for expected in reference_draws(phrased, one):
         assert draws["one", expected.index].text == expected.text
+
+
+def test_what_a_second_look_takes_is_learned_from_those_that_are_taken(phrased: Loaded) -> None:
+    """Or a deadline that leaves time for one would leave it out for ever."""
+    latency = LatencyModel()
+    latency.ending_passes = 1000.0
+    decoder = Decoder(Runner(phrased, 8), latency=latency)
+    looks = [request(f"{k}", k, n=4, seed=k, thinking="always") for k in range(8)]
+    assert {draw.branch for draw in decode(decoder, *looks).values()} == {"Thinking:"}
+    learned = latency.ending_passes
+    assert learned < 500
+    decode(decoder, *(request(f"direct {k}", k, n=4, seed=k, thinking="never") for k in range(4)))
+    assert latency.ending_passes == learned, "a direct answer tells nothing of it"
