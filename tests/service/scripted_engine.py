@@ -161,9 +161,8 @@ def _draw(request: PlanRequest, index: int) -> Draw:
     first = controls.prefill or KEEP_ON
     followed = SLOW_DOWN if think else first
     branch = "Thinking:" if think else "Action:"
-    tokens = {"plan": 40, "branch": 1, "trajectory": 8} | (
-        {"thinking": 48, "revised_plan": 52} if think else {}
-    )
+    second_look = {"thinking": 48, "revised_plan": 52} if think else {}
+    tokens = {"plan": 40, "branch": 1, **second_look, "trajectory": 8}
     direct = Draw(
         index=index,
         text=f"{first}{branch}",
