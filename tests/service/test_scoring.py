@@ -206,7 +206,7 @@ def test_who_leaves_ends_the_scoring(scorer: Served[NoModel]) -> None:
     assert scorer.http.post("/v1/score", json=asked()).status_code == 200
     for _ in range(3):
         with pytest.raises(httpx.ReadTimeout):
-            scorer.http.post("/v1/score", json=long, timeout=0.5)
+            scorer.http.post("/v1/score", json=long, timeout=httpx.Timeout(30.0, read=0.02))
     assert len(scorer.http.post("/v1/score", json=asked()).json()["scores"]) == 2
     scoring = [each for each in psutil.Process().children() if "service.scorer" in " ".join(each.cmdline())]
     assert len(scoring) == 1
