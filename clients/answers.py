@@ -94,6 +94,7 @@ class PlannedDraw:
         cut: what the deadline did to the second look: skipped, shortened, replaced; else None.
         consistent: whether the parts of the draw agree; None where nothing can be said.
         disagreements: which do not: ``plan_trajectory``, ``reason_change``.
+        in_view: what the reflection could name; None without one, and where it could name anything.
         logprobs: its tokens and how likely each decision was; None unless asked for.
     """
 
@@ -109,6 +110,7 @@ class PlannedDraw:
     cut: wire.Cut | None = None
     consistent: bool | None = None
     disagreements: tuple[str, ...] = ()
+    in_view: tuple[str, ...] | None = None
     logprobs: wire.Logprobs | None = None
     times_s: tuple[float, ...] = TEN_HZ_S
 
@@ -146,7 +148,7 @@ class LookedAt:
         changes: the stretches in which they differ.
         trajectory, times_s: as of a `PlannedDraw`.
         tokens: tokens per section.
-        consistent, disagreements, logprobs: as of a `PlannedDraw`.
+        consistent, disagreements, in_view, logprobs: as of a `PlannedDraw`.
     """
 
     index: int
@@ -159,6 +161,7 @@ class LookedAt:
     tokens: dict[str, int]
     consistent: bool | None = None
     disagreements: tuple[str, ...] = ()
+    in_view: tuple[str, ...] | None = None
     logprobs: wire.Logprobs | None = None
     times_s: tuple[float, ...] = TEN_HZ_S
 
@@ -326,6 +329,7 @@ def _times_s(draw: wire.Draw | wire.Reflection) -> tuple[float, ...]:
 
 
 def _looked_at(draw: wire.Reflection) -> LookedAt:
+    times_s = _times_s(draw)
     return LookedAt(
         index=draw.index,
         decision=draw.decision,
@@ -333,16 +337,18 @@ def _looked_at(draw: wire.Reflection) -> LookedAt:
         revised_plan=None if draw.revised_plan is None else parse_plan(draw.revised_plan.text),
         plan_iou=draw.plan_iou,
         changes=tuple(draw.changes),
-        trajectory=check_trajectory(draw.trajectory, _times_s(draw)),
-        times_s=_times_s(draw),
+        trajectory=check_trajectory(draw.trajectory, times_s),
+        times_s=times_s,
         tokens=draw.tokens,
         consistent=draw.consistent,
         disagreements=tuple(draw.disagreements),
+        in_view=None if draw.in_view is None else tuple(draw.in_view),
         logprobs=draw.logprobs,
     )
 
 
 def _draw(draw: wire.Draw) -> PlannedDraw:
+    times_s = _times_s(draw)
     return PlannedDraw(
         index=draw.index,
         plan=None if draw.plan is None else parse_plan(draw.plan.text),
@@ -350,14 +356,15 @@ def _draw(draw: wire.Draw) -> PlannedDraw:
         think_probability=draw.think_probability,
         thinking=draw.thinking,
         revised_plan=None if draw.revised_plan is None else parse_plan(draw.revised_plan.text),
-        trajectory=check_trajectory(draw.trajectory, _times_s(draw)),
-        times_s=_times_s(draw),
+        trajectory=check_trajectory(draw.trajectory, times_s),
+        times_s=times_s,
         draft_trajectory=None
         if draw.draft_trajectory is None
-        else check_trajectory(draw.draft_trajectory, _times_s(draw)),
+        else check_trajectory(draw.draft_trajectory, times_s),
         tokens=draw.tokens,
         cut=draw.cut,
         consistent=draw.consistent,
         disagreements=tuple(draw.disagreements),
+        in_view=None if draw.in_view is None else tuple(draw.in_view),
         logprobs=draw.logprobs,
     )

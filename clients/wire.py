@@ -31,6 +31,7 @@ Camera = Literal[
 ]
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
+Cues = Literal["in_view", "any"]
 Branch = Literal["Action:", "Thinking:"]
 Cut = Literal["skipped", "shortened", "replaced"]
 AgentKind = Literal["vehicle", "pedestrian", "cone", "barrier"]
@@ -241,6 +242,11 @@ class ReflectControls(Asked):
         default=False,
         description="Begin only trajectories that do what the plan says, as our labeller reads them.",
     )
+    cues: Cues = Field(
+        default="in_view",
+        description="What a reflection in phrases may say is to be seen: only what is in view by the tracks "
+        "or, without tracks, by what the model reads from the pictures; or any thing.",
+    )
     logprobs: bool = Field(
         default=False, description="Tell each draw's tokens, and how likely each of its decisions was."
     )
@@ -282,7 +288,7 @@ class Logprobs(Answered):
     logprobs: list[Annotated[float, Field(le=0, allow_inf_nan=False)] | None] = Field(
         description="Natural logarithm of a token's probability among those that the format allows there, at "
         "the request's temperature (0 counts as 1), however it was chosen: least_error, top_p, thinking, "
-        "bind and deadlines change nothing. null where the format forces the token."
+        "bind, cues and deadlines change nothing. null where the format forces the token."
     )
 
 
@@ -313,6 +319,11 @@ class Draw(Answered):
         default_factory=list,
         description="Which parts do not: plan_trajectory (the trajectory does something else than the plan "
         "it follows), reason_change (the revised plan does not change as the reasoning asks for).",
+    )
+    in_view: list[str] | None = Field(
+        default=None,
+        description="What a reflection could name, as the model's tracks or pictures tell; null without a "
+        "reflection, and where it could name anything.",
     )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
     logprobs: Logprobs | None = Field(default=None, description="Null unless asked for.")
@@ -416,6 +427,11 @@ class Reflection(Answered):
         default_factory=list,
         description="Which parts do not: plan_trajectory (the trajectory does something else than the plan "
         "it follows), reason_change (the revised plan does not change as the reasoning asks for).",
+    )
+    in_view: list[str] | None = Field(
+        default=None,
+        description="What a reflection could name, as the model's tracks or pictures tell; null without a "
+        "reflection, and where it could name anything.",
     )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
     logprobs: Logprobs | None = Field(default=None, description="Null unless asked for.")

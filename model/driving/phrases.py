@@ -200,6 +200,11 @@ def details(head: Head) -> tuple[tuple[str, ...], ...]:
             return ()
 
 
+def sentence(cue: Cue) -> str:
+    """The sentence that names a cue; raises `PhraseError` for one that there are no words for."""
+    return "".join(_texts_of(cue)) + END
+
+
 def change_of(correction: Correction) -> Change:
     """The change of a plan that a correction asks for."""
     return "slower" if correction == "stop" else correction
@@ -301,6 +306,15 @@ def facts_of(text: str) -> Facts | None:
         return read_facts(text)
     except PhraseError:
         return None
+
+
+def unfinished(text: str) -> str:
+    """What is written behind the whole statements that a text begins with."""
+    place = 0
+    while found := _STATEMENT.match(text, place):
+        place = found.end()
+        place += text.startswith(SPACE, place)
+    return text[place:]
 
 
 def agrees(facts: Facts, before: Plan, after: Plan) -> bool:

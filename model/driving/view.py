@@ -5,6 +5,7 @@ Made from a scene's annotations, of which only the past and the present are look
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -13,6 +14,7 @@ import numpy.typing as npt
 
 from model.driving.lead import LANE_HALF_WIDTH_M
 from model.driving.scene import EGO_LENGTH_M, Agent, AgentKind, LabelledScene, Scene
+from model.driving.tracks import Track, track_of
 from model.driving.trajectory import HISTORY_STEPS, STEP_S, FloatArray, present_speed
 
 Array = npt.NDArray[np.float64]
@@ -35,6 +37,7 @@ _TOUCH_M: Final = 1.0
 _TURN_RAD: Final = float(np.deg2rad(30))
 _PAST_STEPS: Final = 10
 """Motion is judged over the last second; clips show two."""
+_STRAIGHT: Final[Array] = np.array([[0.0, 0.0], [100.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -95,57 +98,82 @@ class Surroundings:
 
 
 def view_of(scene: Scene, surroundings: Surroundings) -> View:
-    """What the cameras of a scene show."""
-    lane = _own_lane(surroundings.lane_lines)
-    speed_ms = present_speed(scene.history)
-    seen = [agent for agent in surroundings.agents if _visible(agent, surroundings.agents)]
-    sights = sorted((_sight(agent, lane) for agent in seen), key=lambda each: each.ahead_m)
+    """What the cameras of a scene show. The own lane is the way to go, where that is known."""
+    lane = _own_lane(surroundings.lane_lines) if scene.route is None else _from_here(scene.route)
+    known = [(agent, track) for agent in surroundings.agents if (track := track_of(agent)) is not None]
+    tracks = [track for _, track in known]
+    sights = [_sight(track, _speed_ms(agent), lane) for agent, track in known if _visible(track, tracks)]
     bend, bend_m = _bend(lane)
     lines = [line.astype(np.float64) for line in surroundings.lane_lines if len(line) > 1]
-    return View(speed_ms, tuple(sights), bend, bend_m, _turns(lines, lane), _beside(lines))
+    turns, beside = _turns(lines, lane), _beside(lines)
+    return View(present_speed(scene.history), _nearest_first(sights), bend, bend_m, turns, beside)
 
 
-def _visible(agent: Agent, others: tuple[Agent, ...]) -> bool:
-    x, y = (float(value) for value in agent.present[:2])
-    if not x > EGO_LENGTH_M / 2:  # False where absent (NaN)
+def view_along(history: FloatArray, route: FloatArray | None, tracks: Sequence[Track]) -> View:
+    """What is in view as far as tracks and the way to go tell it: nothing is known of other lanes.
+
+    Args:
+        history: float32 [16, 4].
+        route: float32 [20, 2]; the road is straight where there is none.
+        tracks: what is around; a vehicle's speed is that along x.
+    """
+    lane = _STRAIGHT if route is None else _from_here(route)
+    sights = [
+        _sight(track, track.speed_ms * float(np.cos(track.heading_rad)), lane)
+        for track in tracks
+        if _visible(track, tracks)
+    ]
+    return View(present_speed(history), _nearest_first(sights), *_bend(lane))
+
+
+def _visible(track: Track, others: Sequence[Track]) -> bool:
+    """Whether front cameras show it: near enough, in their field of view, not behind a vehicle."""
+    if not track.x_m > EGO_LENGTH_M / 2:
         return False
-    bearing, distance = float(np.arctan2(y, x)), float(np.hypot(x, y))
-    near, far = _SEEN_WITHIN_M[agent.kind]
+    bearing, distance = float(np.arctan2(track.y_m, track.x_m)), float(np.hypot(track.x_m, track.y_m))
+    near, far = _SEEN_WITHIN_M[track.kind]
     if abs(bearing) > _HALF_VIEW_RAD or distance > (far if abs(bearing) < _TELE_HALF_VIEW_RAD else near):
         return False
-    return not any(_hides(other, bearing, distance) for other in others if other is not agent)
+    return not any(_hides(other, bearing, distance) for other in others if other is not track)
 
 
-def _hides(other: Agent, bearing: float, distance: float) -> bool:
+def _hides(other: Track, bearing: float, distance: float) -> bool:
     """Whether a vehicle stands nearer in the same direction and covers the middle of what is behind."""
-    x, y = (float(value) for value in other.present[:2])
-    if other.kind != "vehicle" or not x > 0 or np.hypot(x, y) > distance - 2:
+    nearer = np.hypot(other.x_m, other.y_m)
+    if other.kind != "vehicle" or not other.x_m > 0 or nearer > distance - 2:
         return False
-    return bool(abs(np.arctan2(y, x) - bearing) < np.arctan2(other.width_m / 2, np.hypot(x, y)))
+    return bool(abs(np.arctan2(other.y_m, other.x_m) - bearing) < np.arctan2(other.width_m / 2, nearer))
 
 
-def _sight(agent: Agent, lane: Array) -> Sight:
-    x, y = (float(value) for value in agent.present[:2])
-    left = _left_of(lane, np.array([x, y]))
-    place: Place = "my lane"
-    if abs(left) > LANE_HALF_WIDTH_M:
-        side: tuple[Place, Place] = (
-            ("the left lane", "the right lane")
-            if abs(left) < LANE_HALF_WIDTH_M + _LANE_M
-            else ("the left side", "the right side")
-        )
-        place = side[0] if left > 0 else side[1]
+def _sight(track: Track, speed_ms: float, lane: Array) -> Sight:
+    place = lane_place(_left_of(lane, np.array([track.x_m, track.y_m])))
+    length_m = track.length_m if track.kind == "vehicle" else 0.0
+    ahead_m = max(0.0, track.x_m - (EGO_LENGTH_M + length_m) / 2)
+    return Sight(track.kind, ahead_m, place, speed_ms, "brake" in track.lights)
+
+
+def lane_place(left_m: float) -> Place:
+    """The place of what is so far to the left of the middle of the own lane."""
+    if abs(left_m) <= LANE_HALF_WIDTH_M:
+        return "my lane"
+    if abs(left_m) < LANE_HALF_WIDTH_M + _LANE_M:
+        return "the left lane" if left_m > 0 else "the right lane"
+    return "the left side" if left_m > 0 else "the right side"
+
+
+def _speed_ms(agent: Agent) -> float:
+    """Along x over the last second: all poses are in the ego frame of now, so it is over ground."""
     before = agent.poses[HISTORY_STEPS - 1 - _PAST_STEPS]
-    # All poses are in the ego frame of now: differences are speeds over ground.
-    speed_ms = float(x - before[0]) / (_PAST_STEPS * STEP_S)
-    length = agent.length_m if agent.kind == "vehicle" else 0.0
-    ahead_m = max(0.0, x - (EGO_LENGTH_M + length) / 2)
-    return Sight(agent.kind, ahead_m, place, speed_ms, "brake" in agent.lights)
+    return float(agent.present[0] - before[0]) / (_PAST_STEPS * STEP_S)
+
+
+def _nearest_first(sights: Iterable[Sight]) -> tuple[Sight, ...]:
+    return tuple(sorted(sights, key=lambda each: each.ahead_m))
 
 
 def _own_lane(lane_lines: tuple[FloatArray, ...]) -> Array:
     """The centre line that the ego drives on, from here onwards, [k, 2]; straight ahead where unknown."""
-    best, straight = None, np.array([[0.0, 0.0], [100.0, 0.0]])
+    best = None
     for line in lane_lines:
         points = line.astype(np.float64)
         distances = np.linalg.norm(points, axis=1)
@@ -160,7 +188,7 @@ def _own_lane(lane_lines: tuple[FloatArray, ...]) -> Array:
         rating = (round(distances[nearest], 1), -length)
         if best is None or rating < best[0]:
             best = (rating, onwards)
-    return straight if best is None else best[1]
+    return _STRAIGHT if best is None else best[1]
 
 
 def _left_of(lane: Array, point: Array) -> float:
@@ -173,6 +201,15 @@ def _left_of(lane: Array, point: Array) -> float:
     nearest = int(np.linalg.norm(away, axis=1).argmin())
     side = step[nearest, 0] * away[nearest, 1] - step[nearest, 1] * away[nearest, 0]
     return float(np.copysign(np.linalg.norm(away[nearest]), side))
+
+
+def bend_of(way: npt.NDArray[np.floating]) -> tuple[Bend | None, float]:
+    """Which way a way [k, 2] from the ego bends within reach, and where it begins to, in m."""
+    return _bend(_from_here(way))
+
+
+def _from_here(way: npt.NDArray[np.floating]) -> Array:
+    return np.concatenate([np.zeros((1, 2)), np.asarray(way, np.float64)])
 
 
 def _bend(lane: Array) -> tuple[Bend | None, float]:

@@ -16,6 +16,7 @@ from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
 from model.driving.trajectory import ROUTE_POINTS, FloatArray
 from model.network.encoders import HistoryEncoder, RouteEncoder
+from model.network.fact_reader import likely
 from model.network.inputs import ModelInputs, Prompt, rotary_positions
 from model.network.intent import TrackReader
 from model.network.resampler import SceneResampler
@@ -145,6 +146,18 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         tokens = vision_tokens.view(len(history), self.settings.vision_tokens, -1)
         resampled: Tensor = self.resampler(tokens, history, route, has_route)
         return resampled.flatten(0, 1)
+
+    @torch.inference_mode()
+    def read_facts(self, scene_tokens: Tensor) -> FloatArray | None:
+        """Facts [len(FACTS)] that stand in a prompt's scene tokens, with their probabilities; None without.
+
+        Args:
+            scene_tokens: [scene_tokens, hidden], where the pictures stand in the prompt.
+        """
+        if self.resampler is None:
+            return None
+        read = likely(self.resampler.facts(scene_tokens[None].to(self.dtype)))
+        return cast("FloatArray", read[0].cpu().numpy())
 
     def _way(self, history: Tensor, route: Tensor | None, input_ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """History, route and which rows have one: those whose prompt [b, t] has the route's token."""

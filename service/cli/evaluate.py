@@ -51,6 +51,10 @@ def evaluate(
     bind: Annotated[
         bool, typer.Option("--bind", help="Begin only trajectories that do what their plan says.")
     ] = False,
+    cues: Annotated[
+        Literal["in_view", "any"],
+        typer.Option(help="What reflections in phrases may name: only what is in view, or anything."),
+    ] = "in_view",
     rows: Rows = 96,
     engine: EngineName = "torch",
     device: Device = "cpu",
@@ -112,6 +116,7 @@ def evaluate(
             numbers=numbers,
             codes=codes,
             bind=bind,
+            cues=cues,
         )
         labelled = list(evenly(read_scenes(scenes, dense=False), count_scenes(scenes), limit))
         if perception:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from model.engines.binding import Binding, binding_of
+from model.engines.cue_mask import cue_mask_of
 from model.engines.engine import (
     DraftFinished,
     Draw,
@@ -278,7 +279,10 @@ class Decoder:
             if tree.request.phase is Phase.ENDED:
                 continue
             if not isinstance(begun, Exception):
-                tree.prompt = begun
+                tree.prompt, request = begun, tree.request
+                request.cue_mask = cue_mask_of(
+                    request.plan_request, request.family, self._vocabulary, begun.facts
+                )
             elif isinstance(begun, ValueError):
                 events.append(self._fail(tree.request, RequestError(str(begun))))
             else:
@@ -368,6 +372,7 @@ class Decoder:
             row.draws,
             loaded.vocabulary,
             loaded.codec,
+            request.cue_mask,
         )
         if row.passes_before_ending:
             self._latency.saw_ending(row.passes - row.passes_before_ending)

@@ -67,6 +67,7 @@ class Prompt:
         pictures: tells apart what stands in the prompt for its pictures: with a resampler that depends on
             history and route as well.
         pictured: tokens up to the end of the pictures.
+        facts: float32 [len(FACTS)] that are read from the pictures; None where the network reads none.
     """
 
     kv_row: int
@@ -78,6 +79,7 @@ class Prompt:
     shown: bytes
     pictures: bytes
     pictured: int
+    facts: FloatArray | None = None
 
     @property
     def length(self) -> int:
@@ -339,6 +341,7 @@ class Runner:
             shown,
             shown + _gathered_with(scene.history, route) if loaded.settings.scene_tokens else shown,
             int(clips[-1]) + 1,
+            loaded.model.read_facts(embedded.embeddings[int(clips[0]) : int(clips[-1]) + 1]),
         )
         if self._reuse:
             self._begin_with_shared(begun, format, int(clips[0]))

@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from model.engines.cue_mask import CueMask
 from model.engines.engine import (
     MAX_DRAWS,
     DrawFinished,
@@ -79,6 +80,7 @@ class Decoding:
         family: of the response.
         start: where its response begins.
         least_error: tells how far apart numbers and codes lie.
+        cue_mask: what reflections may name; None for anything.
     """
 
     def __init__(
@@ -90,10 +92,11 @@ class Decoding:
         family: Family,
         start: Cursor,
         least_error: LeastError,
+        cue_mask: CueMask | None = None,
     ) -> None:
         self._llm, self._parts, self._grammar = llm, parts, grammar
         self._request, self._family = request, family
-        self._start, self._least_error = start, least_error
+        self._start, self._least_error, self._cue_mask = start, least_error, cue_mask
         self._happened: asyncio.Queue[Event | Exception] = asyncio.Queue()
         self._tasks: set[asyncio.Task[None]] = set()
         self._requests = 0
@@ -139,13 +142,13 @@ class Decoding:
         try:
             written = [token.id for token in draws[0].tokens]
             number, self._requests = self._requests, self._requests + 1
-            allowed = draws[0].cursor.allowed()
+            allowed, left = draws[0].cursor.allowed(), self._left(draws[0])
             # What is weighed is the same for all draws, so vLLM is asked for one.
             weighs = self._expected(allowed) is not None
-            alone = weighs or self._between_numbers(allowed)
+            alone = weighs or self._between_numbers(allowed) or len(left) < len(allowed.ids)
             stream = self._llm.generate(
                 self._prompt.then(written),
-                self._parameters(draws, allowed, weighs=weighs, alone=alone),
+                self._parameters(draws, allowed, left, weighs=weighs, alone=alone),
                 f"{self._request.request_id}/{number}",
             )
             following = {draw.index for draw in draws}
@@ -167,7 +170,9 @@ class Decoding:
         except Exception as error:  # vLLM's own, of whatever type
             self.fail(EngineError.because("vLLM failed", error))
 
-    def _parameters(self, draws: Sequence[_Walk], allowed: Allowed, *, weighs: bool, alone: bool) -> Any:
+    def _parameters(
+        self, draws: Sequence[_Walk], allowed: Allowed, left: IntArray, *, weighs: bool, alone: bool
+    ) -> Any:
         from vllm import SamplingParams
         from vllm.sampling_params import RequestOutputKind, StructuredOutputsParams
 
@@ -184,11 +189,17 @@ class Decoding:
             max_tokens=1 if alone else first.cursor.compiled.longest(),
             logprobs=-1 if (weighs or controls.logprobs) and named is None else None,
             logprob_token_ids=named,
-            allowed_token_ids=allowed.ids.tolist() if alone else None,
+            allowed_token_ids=left.tolist() if alone else None,
             structured_outputs=grammar,
             detokenize=False,
             output_kind=RequestOutputKind.DELTA,
         )
+
+    def _left(self, draw: _Walk) -> IntArray:
+        """The allowed ids that name only what may be named."""
+        ids = draw.cursor.allowed().ids
+        left = None if self._cue_mask is None else self._cue_mask.leaves(draw.cursor, draw.tokens)
+        return ids if left is None else ids[left]
 
     def _between_numbers(self, allowed: Allowed) -> bool:
         """Whether vLLM is asked for the next token alone: between numbers no grammar is needed."""
@@ -232,7 +243,7 @@ class Decoding:
                 if expected is not None:
                     wanted = int(allowed.ids[least_error(logits, expected)])
                 logprob = reported(self._request.controls, draw.cursor, logits, wanted)
-            fits = wanted in allowed.ids
+            fits = wanted in self._left(draw)
             if fits:
                 self._tell(draw, draw.append(wanted, self._parts.vocabulary, logprob))
                 if self._request.live and (new := draw.new_text(self._parts.vocabulary)):
@@ -267,6 +278,7 @@ class Decoding:
             [draw.index],
             self._parts.vocabulary,
             self._parts.codec,
+            self._cue_mask,
         ):
             self._happened.put_nowait(DrawFinished(finished))
 

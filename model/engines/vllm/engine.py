@@ -16,6 +16,7 @@ import numpy as np
 
 from model.driving.images import ImageError
 from model.driving.scene import Scene
+from model.engines.cue_mask import cue_mask_of
 from model.engines.engine import EngineError, Event, Load, ModelCard, PlanRequest, RequestError
 from model.engines.least_error import LeastError
 from model.engines.pictures import PictureThreads
@@ -147,7 +148,11 @@ class VllmEngine:
         if request.controls.bind:
             raise RequestError("bind needs the torch engine: vLLM has no grammar that depends on the plan")
         family = self._families[request.format]
-        decoding = Decoding(llm, self._parts, self._grammar_of, request, family, start, self._least_error)
+        # Facts that are read from pictures stay within vLLM's processes: only tracks tell what is in view.
+        cue_mask = cue_mask_of(request, family, self._parts.vocabulary, None)
+        decoding = Decoding(
+            llm, self._parts, self._grammar_of, request, family, start, self._least_error, cue_mask
+        )
         self._running[request.request_id] = decoding
         try:
             prompt = await self._pictures.run(lambda: self.prompt(request.scene, request.format))

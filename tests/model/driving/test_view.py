@@ -24,7 +24,8 @@ def scene(*agents: Agent, bend: float = 0.0) -> LabelledScene:
     """A road that goes straight on for 15 m and then bends by so much."""
     angles = np.where(np.arange(60) < 15, 0.0, bend)
     line = np.stack([np.cos(angles), np.sin(angles)], axis=1).cumsum(axis=0).astype(np.float32)
-    return replace(labelled("made-up"), agents=agents, lane_lines=(line,))
+    made = labelled("made-up")
+    return replace(made, scene=replace(made.scene, route=None), agents=agents, lane_lines=(line,))
 
 
 def view_of(made: LabelledScene) -> View:
@@ -55,6 +56,16 @@ def test_the_own_lane_may_bend() -> None:
     assert [sight.place for sight in view.sights] == ["my lane"]
     assert view_of(scene(bend=-0.5)).bend == "right"
     assert view_of(scene(bend=0.1)).bend is None
+
+
+def test_the_way_to_go_is_the_own_lane_where_it_is_known() -> None:
+    made = scene(agent(15 + 20 * np.cos(0.5), 20 * np.sin(0.5)))
+    assert [sight.place for sight in view_of(made).sights] == ["the left side"]
+    angles = np.where(np.arange(1, 21) * 4 < 15, 0.0, 0.5)
+    route = (4 * np.stack([np.cos(angles), np.sin(angles)], axis=1)).cumsum(axis=0).astype(np.float32)
+    view = view_of(replace(made, scene=replace(made.scene, route=route)))
+    assert view.bend == "left"
+    assert [sight.place for sight in view.sights] == ["my lane"]
 
 
 def test_speeds_are_those_over_ground() -> None:

@@ -14,6 +14,7 @@ from transformers import DynamicCache
 
 from model.driving.plan import Plan
 from model.engines.binding import binding_of
+from model.engines.cue_mask import cue_mask_of
 from model.engines.engine import Draw, PlanRequest
 from model.engines.least_error import LeastError, least_error
 from model.engines.sampling import choose, probabilities, uniform
@@ -93,6 +94,8 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
     cursor = compiled.start(given)
     tokens: list[Token] = []
     binding = binding_of(request, loaded.codec, loaded.vocabulary)
+    facts = model.read_facts(prompt.embeddings[inputs.prompt.ids == model.config.video_token_id])
+    cue_mask = cue_mask_of(request, family, loaded.vocabulary, facts)
     least = LeastError(loaded.codec, loaded.vocabulary)
     think_probability = None
     shares: Shares = {}
@@ -112,6 +115,8 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
                 left = thinks == (think_probability > controls.think_threshold)
         if binding is not None and (bound := binding.leaves(allowed.ids, tokens, family.plans)) is not None:
             left = bound
+        if cue_mask is not None and (named := cue_mask.leaves(cursor, tokens)) is not None:
+            left = named
         expected = least.expected(allowed, controls)
         number = np.array([uniform(controls.seed, index, len(tokens))])
         if expected is None:

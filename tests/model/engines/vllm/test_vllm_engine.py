@@ -14,12 +14,14 @@ import torch
 
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.images import ImageError
+from model.driving.phrases import read_facts, sentence
 from model.driving.plan import parse_plan
 from model.driving.scene import Clip, Scene
 from model.driving.scene_store import read_scenes
 from model.driving.tracks import Track
 from model.engines.engine import (
     Controls,
+    Cues,
     Decision,
     Draw,
     DrawFinished,
@@ -91,7 +93,9 @@ async def plans(engine: Engine, requests: list[PlanRequest]) -> list[list[Draw]]
 
 
 def greedy(name: str, scene: Scene, **controls: object) -> PlanRequest:
-    return PlanRequest(name, scene, controls=Controls(n=1, temperature=0.0, **controls))  # type: ignore[arg-type]
+    # Behind vLLM only tracks tell what is in view.
+    cues: Cues = "any" if scene.tracks is None else "in_view"
+    return PlanRequest(name, scene, controls=Controls(n=1, temperature=0.0, cues=cues, **controls))  # type: ignore[arg-type]
 
 
 def mixed_scenes(count: int) -> list[Scene]:
@@ -186,6 +190,25 @@ def test_the_branch_can_be_forced(
     assert [draw.text for [draw] in ours] == [draw.text for [draw] in theirs]
     assert {draw.branch for [draw] in theirs} == {"Thinking:" if thinking == "always" else "Action:"}
     assert all(draw.think_probability is not None for [draw] in theirs)
+
+
+def test_reflections_name_only_what_the_tracks_tell(
+    loop: asyncio.AbstractEventLoop, vllm: VllmEngine, torch_engine: TorchEngine
+) -> None:
+    tracked = [replace(scene, tracks=some_tracks(k)) for k, scene in enumerate(mixed_scenes(8))]
+    requests = [greedy(f"tracked-{k}", scene, thinking="always") for k, scene in enumerate(tracked)]
+    ours = loop.run_until_complete(plans(torch_engine, requests))
+    theirs = loop.run_until_complete(plans(vllm, requests))
+    assert [draw.text for [draw] in ours] == [draw.text for [draw] in theirs]
+    for decision in ("least_error", "drawn"):
+        controls = Controls(n=4, temperature=1.5, thinking="always", numbers=decision)
+        asked = [PlanRequest(f"{decision}-{k}", scene, controls=controls) for k, scene in enumerate(tracked)]
+        for draws in loop.run_until_complete(plans(vllm, asked)):
+            for draw in draws:
+                assert draw.thinking is not None
+                assert draw.in_view is not None
+                named = {sentence(each.cue) for each in read_facts(draw.thinking).statements}
+                assert named <= set(draw.in_view)
 
 
 def test_the_threshold_decides(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:

@@ -1,0 +1,147 @@
+"""Reflections that name only what is in view, as the engine writes them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model.driving.phrases import HEADS, NOTHING, Cue, Facts, Thing, read_facts, sentence
+from model.driving.tracks import Track
+from model.engines.cue_mask import CueMask, cue_mask_of
+from model.engines.engine import Controls, PlanRequest, RequestError
+from model.engines.torch.decoder import Decoder
+from model.engines.torch.runner import Runner
+from model.families.cf_vla import CF_VLA
+from model.families.traj_only import TRAJ_ONLY
+from model.formats.cursor import CompiledFormat, Token
+from model.formats.phrases import Phrases
+from model.formats.pieces import Format, Section, Sequence
+from model.formats.pieces import Literal as Text
+from model.network.checkpoint import Loaded, load
+from tests.checkpoints import noisy_scene
+from tests.model.driving.strategies import facts
+from tests.model.engines.decoding import decode, request
+from tests.model.engines.reference import exactly, reference_draws
+
+CUES = st.lists(facts(), max_size=3).map(
+    lambda made: frozenset(each.cue for some in made for each in some.statements)
+)
+TRACKS = (
+    Track(18.0, 0.0, 0.0, 0.0, 4.5, 1.9, "vehicle"),
+    Track(40.0, 3.5, 0.0, 4.0, 4.5, 1.9, "vehicle", frozenset({"brake"})),
+    Track(20.0, -6.5, 1.6, 1.0, 0.6, 0.6, "pedestrian"),
+)
+
+
+@pytest.fixture(scope="module")
+def phrased(resampling_checkpoint: Path) -> Loaded:
+    return exactly(load(resampling_checkpoint, dtype=torch.float64))
+
+
+def tracked(name: str, scene: int, **controls: object) -> PlanRequest:
+    asked = request(name, scene, **controls)
+    return replace(asked, scene=replace(asked.scene, tracks=TRACKS))
+
+
+def named(thinking: str | None) -> set[str]:
+    assert thinking is not None
+    return {sentence(each.cue) for each in read_facts(thinking).statements}
+
+
+@pytest.mark.usefixtures("inference")
+def test_reflections_name_only_what_is_in_view(phrased: Loaded) -> None:
+    """At a temperature at which nearly anything is written."""
+    requests = [
+        ask(f"{k}{ask.__name__}", k, n=6, seed=k, thinking="always", temperature=2.0)
+        for k in range(4)
+        for ask in (request, tracked)
+    ]
+    draws = decode(Decoder(Runner(phrased, 16)), *requests)
+    said = [named(draw.thinking) for draw in draws.values()]
+    for draw, cues in zip(draws.values(), said, strict=True):
+        assert draw.in_view is not None
+        assert cues <= set(draw.in_view)
+    assert sum(map(len, said)) > 16
+    free = decode(
+        Decoder(Runner(phrased, 16)),
+        *(replace(each, controls=replace(each.controls, cues="any")) for each in requests),
+    )
+    assert any(not named(free[key].thinking) <= set(draw.in_view or ()) for key, draw in draws.items())
+    assert {draw.in_view for draw in free.values()} == {None}
+
+
+@pytest.mark.usefixtures("inference")
+def test_masked_requests_decode_as_the_reference_does(phrased: Loaded) -> None:
+    mixed = [
+        tracked("tracks", 1, n=3, seed=5, thinking="always", temperature=1.5),
+        request("pictures", 2, n=3, seed=6, thinking="always", temperature=1.5),
+        request("any", 2, n=2, seed=6, thinking="always", cues="any"),
+        request("bare", 3, "traj_only", n=2),
+    ]
+    draws = decode(Decoder(Runner(phrased, 16)), *mixed)
+    for asked in mixed:
+        for expected in reference_draws(phrased, asked):
+            assert draws[asked.request_id, expected.index].text == expected.text
+
+
+@given(CUES, st.lists(st.integers(0, 2**16), min_size=40, max_size=40))
+def test_every_walk_ends_and_names_nothing_else(
+    phrased: Loaded, cues: frozenset[Cue], turns: list[int]
+) -> None:
+    body = Section("why", Sequence((Phrases(), Text("\n"))))
+    compiled = CompiledFormat(Format("walk", body), phrased.vocabulary)
+    mask = CueMask(cues, "why", phrased.vocabulary)
+    cursor, written = compiled.start(), list[Token]()
+    for turn in turns:
+        run, cursor = cursor.forced()
+        written += run
+        if cursor.done:
+            break
+        ids, left = cursor.allowed().ids, mask.leaves(cursor, written)
+        ids = ids if left is None else ids[left]
+        assert len(ids)
+        written.append(Token(int(ids[turn % len(ids)]), "why"))
+        cursor = cursor.advance(written[-1].id)
+    assert cursor.done
+    facts = read_facts(phrased.vocabulary.decode([token.id for token in written]).strip())
+    assert {each.cue for each in facts.statements} <= cues
+
+
+def test_where_nothing_is_in_view_nothing_is_said(phrased: Loaded) -> None:
+    compiled = CompiledFormat(
+        Format("walk", Section("why", Sequence((Phrases(), Text("\n"))))), phrased.vocabulary
+    )
+    start = compiled.start()
+    left = CueMask((), "why", phrased.vocabulary).leaves(start, [])
+    assert left is not None
+    (token,) = start.allowed().ids[left]
+    assert NOTHING.startswith(phrased.vocabulary.decode([int(token)]))
+    assert len(start.allowed().ids) > len(HEADS) // 2
+
+
+def test_who_knows_nothing_is_not_masked(phrased: Loaded) -> None:
+    asked, vocabulary = PlanRequest("a", noisy_scene(), controls=Controls()), phrased.vocabulary
+    assert cue_mask_of(asked, CF_VLA, vocabulary, None) is None
+    assert cue_mask_of(asked, TRAJ_ONLY, vocabulary, np.zeros(80, np.float32)) is None
+    assert cue_mask_of(replace(asked, controls=Controls(cues="any")), CF_VLA, vocabulary, None) is None
+    with_tracks = replace(asked, scene=replace(asked.scene, tracks=()))
+    mask = cue_mask_of(with_tracks, CF_VLA, vocabulary, None)
+    assert mask is not None
+    assert set(mask.sentences) == {"My lane is clear.", "The road runs straight on."}
+
+
+def test_other_values_are_refused() -> None:
+    with pytest.raises(RequestError, match="cues must be in_view or any"):
+        Controls(cues="all")  # type: ignore[arg-type]
+
+
+def test_a_cue_is_told_by_one_sentence() -> None:
+    cue = Thing("vehicle", "my lane", 15, "braking")
+    assert sentence(cue) == "A braking vehicle is in my lane some 15 metres ahead."
+    assert Facts().statements == ()
