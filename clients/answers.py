@@ -94,7 +94,7 @@ class PlannedDraw:
         cut: what the deadline did to the second look: skipped, shortened, replaced; else None.
         consistent: whether the parts of the draw agree; None where nothing can be said.
         disagreements: which do not: ``plan_trajectory``, ``reason_change``.
-        in_view: what the reflection could name; None without one, and where it could name anything.
+        reasons: the statements that the reflection could make; None without one, and where it could make any.
         logprobs: its tokens and how likely each decision was; None unless asked for.
     """
 
@@ -110,7 +110,7 @@ class PlannedDraw:
     cut: wire.Cut | None = None
     consistent: bool | None = None
     disagreements: tuple[str, ...] = ()
-    in_view: tuple[str, ...] | None = None
+    reasons: tuple[str, ...] | None = None
     logprobs: wire.Logprobs | None = None
     times_s: tuple[float, ...] = TEN_HZ_S
 
@@ -148,7 +148,7 @@ class LookedAt:
         changes: the stretches in which they differ.
         trajectory, times_s: as of a `PlannedDraw`.
         tokens: tokens per section.
-        consistent, disagreements, in_view, logprobs: as of a `PlannedDraw`.
+        consistent, disagreements, reasons, logprobs: as of a `PlannedDraw`.
     """
 
     index: int
@@ -161,7 +161,7 @@ class LookedAt:
     tokens: dict[str, int]
     consistent: bool | None = None
     disagreements: tuple[str, ...] = ()
-    in_view: tuple[str, ...] | None = None
+    reasons: tuple[str, ...] | None = None
     logprobs: wire.Logprobs | None = None
     times_s: tuple[float, ...] = TEN_HZ_S
 
@@ -342,7 +342,7 @@ def _looked_at(draw: wire.Reflection) -> LookedAt:
         tokens=draw.tokens,
         consistent=draw.consistent,
         disagreements=tuple(draw.disagreements),
-        in_view=None if draw.in_view is None else tuple(draw.in_view),
+        reasons=None if draw.reasons is None else tuple(draw.reasons),
         logprobs=draw.logprobs,
     )
 
@@ -365,6 +365,6 @@ def _draw(draw: wire.Draw) -> PlannedDraw:
         cut=draw.cut,
         consistent=draw.consistent,
         disagreements=tuple(draw.disagreements),
-        in_view=None if draw.in_view is None else tuple(draw.in_view),
+        reasons=None if draw.reasons is None else tuple(draw.reasons),
         logprobs=draw.logprobs,
     )

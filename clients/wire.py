@@ -31,7 +31,7 @@ Camera = Literal[
 ]
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
-Cues = Literal["in_view", "any"]
+Reasons = Literal["in_view", "any"]
 Branch = Literal["Action:", "Thinking:"]
 Cut = Literal["skipped", "shortened", "replaced"]
 AgentKind = Literal["vehicle", "pedestrian", "cone", "barrier"]
@@ -242,10 +242,10 @@ class ReflectControls(Asked):
         default=False,
         description="Begin only trajectories that do what the plan says, as our labeller reads them.",
     )
-    cues: Cues = Field(
+    reasons: Reasons = Field(
         default="in_view",
-        description="What a reflection in phrases may say is to be seen: only what is in view by the tracks "
-        "or, without tracks, by what the model reads from the pictures; or any thing.",
+        description="What a reflection in phrases may state: only what the view gives a reason for, by the "
+        "tracks or, without tracks, by what the model reads from the pictures; or anything.",
     )
     logprobs: bool = Field(
         default=False, description="Tell each draw's tokens, and how likely each of its decisions was."
@@ -288,7 +288,7 @@ class Logprobs(Answered):
     logprobs: list[Annotated[float, Field(le=0, allow_inf_nan=False)] | None] = Field(
         description="Natural logarithm of a token's probability among those that the format allows there, at "
         "the request's temperature (0 counts as 1), however it was chosen: least_error, top_p, thinking, "
-        "bind, cues and deadlines change nothing. null where the format forces the token."
+        "bind, reasons and deadlines change nothing. null where the format forces the token."
     )
 
 
@@ -320,10 +320,10 @@ class Draw(Answered):
         description="Which parts do not: plan_trajectory (the trajectory does something else than the plan "
         "it follows), reason_change (the revised plan does not change as the reasoning asks for).",
     )
-    in_view: list[str] | None = Field(
+    reasons: list[str] | None = Field(
         default=None,
-        description="What a reflection could name, as the model's tracks or pictures tell; null without a "
-        "reflection, and where it could name anything.",
+        description="The statements that the reflection could make, by what is in view; null without a "
+        "reflection, and where it could make any.",
     )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
     logprobs: Logprobs | None = Field(default=None, description="Null unless asked for.")
@@ -428,10 +428,10 @@ class Reflection(Answered):
         description="Which parts do not: plan_trajectory (the trajectory does something else than the plan "
         "it follows), reason_change (the revised plan does not change as the reasoning asks for).",
     )
-    in_view: list[str] | None = Field(
+    reasons: list[str] | None = Field(
         default=None,
-        description="What a reflection could name, as the model's tracks or pictures tell; null without a "
-        "reflection, and where it could name anything.",
+        description="The statements that the reflection could make, by what is in view; null without a "
+        "reflection, and where it could make any.",
     )
     tokens: dict[str, int] = Field(description="Tokens per section of the response.")
     logprobs: Logprobs | None = Field(default=None, description="Null unless asked for.")

@@ -112,7 +112,7 @@ def _draw(draw: Draw, agreement: Agreement, draft: Draw | None) -> wire.Draw:
         cut=draw.cut,
         consistent=agreement.consistent,
         disagreements=list(agreement.disagreements),
-        in_view=None if draw.in_view is None else list(draw.in_view),
+        reasons=None if draw.reasons is None else list(draw.reasons),
         tokens=dict(draw.tokens),
         logprobs=_logprobs(draw),
     )
@@ -149,7 +149,7 @@ def _reflection(given: Plan, draw: Draw, agreement: Agreement) -> wire.Reflectio
         cut=draw.cut,
         consistent=agreement.consistent,
         disagreements=list(agreement.disagreements),
-        in_view=None if draw.in_view is None else list(draw.in_view),
+        reasons=None if draw.reasons is None else list(draw.reasons),
         tokens=dict(draw.tokens),
         logprobs=_logprobs(draw),
     )

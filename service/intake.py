@@ -148,7 +148,7 @@ def _controls(asked: wire.ReflectControls, prefill: Plan | None) -> Controls:
             numbers=asked.numbers,
             codes=asked.codes,
             bind=asked.bind,
-            cues=asked.cues,
+            reasons=asked.reasons,
             logprobs=asked.logprobs,
         )
     except RequestError as error:

@@ -103,7 +103,7 @@ class Extras(wire.Asked):
     numbers: wire.Decision = "least_error"
     codes: wire.Decision = "least_error"
     bind: bool = False
-    cues: wire.Cues = "in_view"
+    reasons: wire.Reasons = "in_view"
     logprobs: bool = False
     format: str = Field(default="cf_vla", max_length=40)
 

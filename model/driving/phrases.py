@@ -200,11 +200,6 @@ def details(head: Head) -> tuple[tuple[str, ...], ...]:
             return ()
 
 
-def sentence(cue: Cue) -> str:
-    """The sentence that names a cue; raises `PhraseError` for one that there are no words for."""
-    return "".join(_texts_of(cue)) + END
-
-
 def change_of(correction: Correction) -> Change:
     """The change of a plan that a correction asks for."""
     return "slower" if correction == "stop" else correction

@@ -15,7 +15,7 @@ from model.driving.trajectory import TEN_HZ_S, FloatArray, at_10_hz
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
-Cues = Literal["in_view", "any"]
+Reasons = Literal["in_view", "any"]
 Cut = Literal["skipped", "shortened", "replaced"]
 """What a deadline did to a second look: not begun, ended early, given up for the draft."""
 
@@ -59,8 +59,8 @@ class Controls:
             words are.
         codes: how trajectory codes are chosen, likewise.
         bind: only trajectories may be begun that do what the plan says (`model.engines.binding`).
-        cues: what a reflection in phrases may say is to be seen: only what is ``in_view`` as far as the model
-            can know, or ``any`` thing (`model.engines.cue_mask`).
+        reasons: what a reflection in phrases may state: only what has a reason ``in_view``, as far as the
+            model can know, or ``any`` statement (`model.engines.reason_mask`).
         logprobs: draws tell how likely each of their decisions was.
     """
 
@@ -75,7 +75,7 @@ class Controls:
     numbers: Decision = "least_error"
     codes: Decision = "least_error"
     bind: bool = False
-    cues: Cues = "in_view"
+    reasons: Reasons = "in_view"
     logprobs: bool = False
 
     def __post_init__(self) -> None:
@@ -84,8 +84,8 @@ class Controls:
         for name, decision in (("numbers", self.numbers), ("codes", self.codes)):
             if decision not in ("least_error", "drawn"):
                 raise RequestError(f"{name} must be least_error or drawn, got {decision!r}")
-        if self.cues not in ("in_view", "any"):
-            raise RequestError(f"cues must be in_view or any, got {self.cues!r}")
+        if self.reasons not in ("in_view", "any"):
+            raise RequestError(f"reasons must be in_view or any, got {self.reasons!r}")
         if not isinstance(self.n, int) or not 1 <= self.n <= MAX_DRAWS:
             raise RequestError(f"n must be a whole number in 1..{MAX_DRAWS}, got {self.n}")
         if not 0.0 <= self.temperature <= 2.0:
@@ -147,7 +147,7 @@ class Draw:
         cut: what the deadline did to its second look; None where it did nothing.
         times_s: of the poses of the trajectory, its family's.
         ids: of its tokens.
-        in_view: the cues that its reflection could name; None where it could name any.
+        reasons: the statements that its reflection could make; None where it could make any.
         logprobs: of each token's choice, see `model.engines.logprobs`; None where the token is forced. Empty
             where `Controls.logprobs` does not ask for them.
     """
@@ -167,7 +167,7 @@ class Draw:
     cut: Cut | None = None
     times_s: tuple[float, ...] = TEN_HZ_S
     ids: tuple[int, ...] = ()
-    in_view: tuple[str, ...] | None = None
+    reasons: tuple[str, ...] | None = None
     logprobs: tuple[float | None, ...] = ()
 
     @property

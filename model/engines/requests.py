@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 
 from model.driving.plan import Plan
 from model.driving.trajectory import check_trajectory
-from model.engines.cue_mask import CueMask
 from model.engines.engine import Draw, ModelCard, PlanRequest, RequestError
+from model.engines.reason_mask import ReasonMask
 from model.engines.response import Response
 from model.families.family import Branch, Family
 from model.formats.cursor import CompiledFormat, Cursor
@@ -68,7 +68,7 @@ def read(
     draws: Iterable[int],
     vocabulary: Vocabulary,
     codec: TrajectoryCodec,
-    cue_mask: CueMask | None = None,
+    reason_mask: ReasonMask | None = None,
 ) -> list[Draw]:
     """The draws that wrote ``response``: all the same, but for their index.
 
@@ -98,7 +98,7 @@ def read(
             cut=response.cut,
             times_s=family.times_s,
             ids=ids,
-            in_view=None if cue_mask is None or reading.reflection is None else cue_mask.sentences,
+            reasons=None if reason_mask is None or reading.reflection is None else reason_mask.statements,
             logprobs=tuple(response.logprobs) if request.controls.logprobs else (),
         )
         for index in draws

@@ -51,9 +51,9 @@ def evaluate(
     bind: Annotated[
         bool, typer.Option("--bind", help="Begin only trajectories that do what their plan says.")
     ] = False,
-    cues: Annotated[
+    reasons: Annotated[
         Literal["in_view", "any"],
-        typer.Option(help="What reflections in phrases may name: only what is in view, or anything."),
+        typer.Option(help="What reflections in phrases may state: what has a reason in view, or anything."),
     ] = "in_view",
     rows: Rows = 96,
     engine: EngineName = "torch",
@@ -116,7 +116,7 @@ def evaluate(
             numbers=numbers,
             codes=codes,
             bind=bind,
-            cues=cues,
+            reasons=reasons,
         )
         labelled = list(evenly(read_scenes(scenes, dense=False), count_scenes(scenes), limit))
         if perception:

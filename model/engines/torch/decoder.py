@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from model.engines.binding import Binding, binding_of
-from model.engines.cue_mask import cue_mask_of
 from model.engines.engine import (
     DraftFinished,
     Draw,
@@ -25,6 +24,7 @@ from model.engines.engine import (
 )
 from model.engines.least_error import LeastError
 from model.engines.logprobs import reported
+from model.engines.reason_mask import reason_mask_of
 from model.engines.requests import begin, read
 from model.engines.torch.batch import Batch, Feed
 from model.engines.torch.deadlines import LatencyModel, drafts_of
@@ -280,7 +280,7 @@ class Decoder:
                 continue
             if not isinstance(begun, Exception):
                 tree.prompt, request = begun, tree.request
-                request.cue_mask = cue_mask_of(
+                request.reason_mask = reason_mask_of(
                     request.plan_request, request.family, self._vocabulary, begun.facts
                 )
             elif isinstance(begun, ValueError):
@@ -372,7 +372,7 @@ class Decoder:
             row.draws,
             loaded.vocabulary,
             loaded.codec,
-            request.cue_mask,
+            request.reason_mask,
         )
         if row.passes_before_ending:
             self._latency.saw_ending(row.passes - row.passes_before_ending)

@@ -15,9 +15,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from model.engines.binding import Binding
-from model.engines.cue_mask import CueMask
 from model.engines.engine import Controls, Draw, PlanRequest
 from model.engines.least_error import LeastError
+from model.engines.reason_mask import ReasonMask
 from model.engines.torch.memory import Memory
 from model.engines.torch.rows import Row
 from model.families.family import Family
@@ -111,7 +111,7 @@ class Request:
         drafts: by draw, until the draw is answered.
         started: whether it has left the queue once.
         binding: where the caller's control ``bind`` asks for it.
-        cue_mask: what its reflections may name, known once its prompt is; None for anything.
+        reason_mask: what its reflections may name, known once its prompt is; None for anything.
     """
 
     plan_request: PlanRequest
@@ -126,7 +126,7 @@ class Request:
     drafts: dict[int, Draw] = field(default_factory=dict)
     started: bool = False
     binding: Binding | None = None
-    cue_mask: CueMask | None = None
+    reason_mask: ReasonMask | None = None
 
     @property
     def id(self) -> str:

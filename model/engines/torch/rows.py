@@ -133,10 +133,10 @@ class Row(Response):
                 self.cut = "shortened"
                 stops: npt.NDArray[np.bool_] = allowed.ids == self.cursor.stop_id
                 return stops
-            binding, cue_mask = self.request.binding, self.request.cue_mask
+            binding, reason_mask = self.request.binding, self.request.reason_mask
             bound = None if binding is None else binding.leaves(allowed.ids, self.tokens, family.plans)
-            if bound is None and cue_mask is not None:
-                bound = cue_mask.leaves(self.cursor, self.tokens)
+            if bound is None and reason_mask is not None:
+                bound = reason_mask.leaves(self.cursor, self.tokens)
             return everything if bound is None else bound
         leads = np.array(
             [leads_to_reflection(family.branch, self.cursor, int(token)) for token in allowed.ids]

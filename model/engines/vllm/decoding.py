@@ -12,7 +12,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.cue_mask import CueMask
 from model.engines.engine import (
     MAX_DRAWS,
     DrawFinished,
@@ -25,6 +24,7 @@ from model.engines.engine import (
 )
 from model.engines.least_error import Expected, LeastError, least_error
 from model.engines.logprobs import reported
+from model.engines.reason_mask import ReasonMask
 from model.engines.requests import leads_to_reflection, read
 from model.engines.response import Response, SectionText
 from model.families.family import Branch, Family
@@ -80,7 +80,7 @@ class Decoding:
         family: of the response.
         start: where its response begins.
         least_error: tells how far apart numbers and codes lie.
-        cue_mask: what reflections may name; None for anything.
+        reason_mask: what reflections may name; None for anything.
     """
 
     def __init__(
@@ -92,11 +92,11 @@ class Decoding:
         family: Family,
         start: Cursor,
         least_error: LeastError,
-        cue_mask: CueMask | None = None,
+        reason_mask: ReasonMask | None = None,
     ) -> None:
         self._llm, self._parts, self._grammar = llm, parts, grammar
         self._request, self._family = request, family
-        self._start, self._least_error, self._cue_mask = start, least_error, cue_mask
+        self._start, self._least_error, self._reason_mask = start, least_error, reason_mask
         self._happened: asyncio.Queue[Event | Exception] = asyncio.Queue()
         self._tasks: set[asyncio.Task[None]] = set()
         self._requests = 0
@@ -198,7 +198,7 @@ class Decoding:
     def _left(self, draw: _Walk) -> IntArray:
         """The allowed ids that name only what may be named."""
         ids = draw.cursor.allowed().ids
-        left = None if self._cue_mask is None else self._cue_mask.leaves(draw.cursor, draw.tokens)
+        left = None if self._reason_mask is None else self._reason_mask.leaves(draw.cursor, draw.tokens)
         return ids if left is None else ids[left]
 
     def _between_numbers(self, allowed: Allowed) -> bool:
@@ -278,7 +278,7 @@ class Decoding:
             [draw.index],
             self._parts.vocabulary,
             self._parts.codec,
-            self._cue_mask,
+            self._reason_mask,
         ):
             self._happened.put_nowait(DrawFinished(finished))
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from model.driving.images import ImageError
 from model.driving.scene import Scene
-from model.engines.cue_mask import cue_mask_of
 from model.engines.engine import EngineError, Event, Load, ModelCard, PlanRequest, RequestError
 from model.engines.least_error import LeastError
 from model.engines.pictures import PictureThreads
+from model.engines.reason_mask import reason_mask_of
 from model.engines.requests import begin
 from model.engines.vllm.decoding import Decoding, VllmPrompt
 from model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
@@ -149,9 +149,9 @@ class VllmEngine:
             raise RequestError("bind needs the torch engine: vLLM has no grammar that depends on the plan")
         family = self._families[request.format]
         # Facts that are read from pictures stay within vLLM's processes: only tracks tell what is in view.
-        cue_mask = cue_mask_of(request, family, self._parts.vocabulary, None)
+        reason_mask = reason_mask_of(request, family, self._parts.vocabulary, None)
         decoding = Decoding(
-            llm, self._parts, self._grammar_of, request, family, start, self._least_error, cue_mask
+            llm, self._parts, self._grammar_of, request, family, start, self._least_error, reason_mask
         )
         self._running[request.request_id] = decoding
         try:

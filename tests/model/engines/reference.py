@@ -14,9 +14,9 @@ from transformers import DynamicCache
 
 from model.driving.plan import Plan
 from model.engines.binding import binding_of
-from model.engines.cue_mask import cue_mask_of
 from model.engines.engine import Draw, PlanRequest
 from model.engines.least_error import LeastError, least_error
+from model.engines.reason_mask import reason_mask_of
 from model.engines.sampling import choose, probabilities, uniform
 from model.families.family import Family
 from model.families.registry import families_of
@@ -95,7 +95,7 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
     tokens: list[Token] = []
     binding = binding_of(request, loaded.codec, loaded.vocabulary)
     facts = model.read_facts(prompt.embeddings[inputs.prompt.ids == model.config.video_token_id])
-    cue_mask = cue_mask_of(request, family, loaded.vocabulary, facts)
+    reason_mask = reason_mask_of(request, family, loaded.vocabulary, facts)
     least = LeastError(loaded.codec, loaded.vocabulary)
     think_probability = None
     shares: Shares = {}
@@ -115,7 +115,7 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
                 left = thinks == (think_probability > controls.think_threshold)
         if binding is not None and (bound := binding.leaves(allowed.ids, tokens, family.plans)) is not None:
             left = bound
-        if cue_mask is not None and (named := cue_mask.leaves(cursor, tokens)) is not None:
+        if reason_mask is not None and (named := reason_mask.leaves(cursor, tokens)) is not None:
             left = named
         expected = least.expected(allowed, controls)
         number = np.array([uniform(controls.seed, index, len(tokens))])

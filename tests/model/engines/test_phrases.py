@@ -35,7 +35,7 @@ def phrased(resampling_checkpoint: Path) -> Loaded:
 def test_every_second_look_agrees_with_its_change_of_plan(phrased: Loaded, prefill: Plan | None) -> None:
     """At a temperature at which nearly anything is written."""
     requests = [
-        request(f"{k}", k, n=8, seed=k, thinking="always", temperature=2.0, prefill=prefill, cues="any")
+        request(f"{k}", k, n=8, seed=k, thinking="always", temperature=2.0, prefill=prefill, reasons="any")
         for k in range(4)
     ]
     draws = decode(Decoder(Runner(phrased, 16)), *requests)

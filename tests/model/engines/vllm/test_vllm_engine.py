@@ -14,14 +14,13 @@ import torch
 
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.images import ImageError
-from model.driving.phrases import read_facts, sentence
+from model.driving.phrases import read_facts
 from model.driving.plan import parse_plan
 from model.driving.scene import Clip, Scene
 from model.driving.scene_store import read_scenes
 from model.driving.tracks import Track
 from model.engines.engine import (
     Controls,
-    Cues,
     Decision,
     Draw,
     DrawFinished,
@@ -29,6 +28,7 @@ from model.engines.engine import (
     EngineError,
     Event,
     PlanRequest,
+    Reasons,
     RequestError,
     SectionFinished,
     Started,
@@ -94,8 +94,8 @@ async def plans(engine: Engine, requests: list[PlanRequest]) -> list[list[Draw]]
 
 def greedy(name: str, scene: Scene, **controls: object) -> PlanRequest:
     # Behind vLLM only tracks tell what is in view.
-    cues: Cues = "any" if scene.tracks is None else "in_view"
-    return PlanRequest(name, scene, controls=Controls(n=1, temperature=0.0, cues=cues, **controls))  # type: ignore[arg-type]
+    reasons: Reasons = "any" if scene.tracks is None else "in_view"
+    return PlanRequest(name, scene, controls=Controls(n=1, temperature=0.0, reasons=reasons, **controls))  # type: ignore[arg-type]
 
 
 def mixed_scenes(count: int) -> list[Scene]:
@@ -192,7 +192,7 @@ def test_the_branch_can_be_forced(
     assert all(draw.think_probability is not None for [draw] in theirs)
 
 
-def test_reflections_name_only_what_the_tracks_tell(
+def test_reflections_state_only_what_the_tracks_tell(
     loop: asyncio.AbstractEventLoop, vllm: VllmEngine, torch_engine: TorchEngine
 ) -> None:
     tracked = [replace(scene, tracks=some_tracks(k)) for k, scene in enumerate(mixed_scenes(8))]
@@ -206,9 +206,8 @@ def test_reflections_name_only_what_the_tracks_tell(
         for draws in loop.run_until_complete(plans(vllm, asked)):
             for draw in draws:
                 assert draw.thinking is not None
-                assert draw.in_view is not None
-                named = {sentence(each.cue) for each in read_facts(draw.thinking).statements}
-                assert named <= set(draw.in_view)
+                assert draw.reasons is not None
+                assert set(map(str, read_facts(draw.thinking).statements)) <= set(draw.reasons)
 
 
 def test_the_threshold_decides(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:

@@ -1,8 +1,8 @@
-"""Reflections that name only what is in view: the control ``cues``. No torch.
+"""Reflections that state only what the view gives a reason for: the control ``reasons``. No torch.
 
 A second look that speaks of what is not there is worth nothing, whoever reads it. What is in view is what
 the scene's tracks tell or, without any, the facts that the network reads from the pictures
-(`model.driving.cues`). A mask leaves out the words that lead to anything else.
+(`model.driving.reasons`). A mask leaves out the words that lead to any other statement.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.cues import cues_read, cues_tracked
-from model.driving.phrases import NOTHING, Cue, sentence, unfinished
+from model.driving.phrases import NOTHING, Statement, unfinished
+from model.driving.reasons import reasons_read, reasons_tracked
 from model.driving.trajectory import FloatArray
 from model.engines.engine import PlanRequest
 from model.families.family import Family
@@ -31,10 +31,10 @@ class Vocabulary(Protocol):
         ...
 
 
-def cue_mask_of(
+def reason_mask_of(
     request: PlanRequest, family: Family, vocabulary: Vocabulary, facts: FloatArray | None
-) -> CueMask | None:
-    """The mask of a request; None where any cue may be named, or nobody knows what is in view.
+) -> ReasonMask | None:
+    """The mask of a request; None where any reason may be given, or nobody knows what is in view.
 
     Args:
         request: its tracks tell what is in view, if it has any.
@@ -43,28 +43,28 @@ def cue_mask_of(
         facts: float32 [len(FACTS)] that the network reads from the pictures; None where it reads none.
     """
     scene = request.scene
-    if request.controls.cues == "any" or family.reflection is None:
+    if request.controls.reasons == "any" or family.reflection is None:
         return None
     if scene.tracks is not None:
-        cues = cues_tracked(scene.history, scene.route, scene.tracks)
+        reasons = reasons_tracked(scene.history, scene.route, scene.tracks)
     elif facts is not None:
-        cues = cues_read(scene.history, scene.route, facts)
+        reasons = reasons_read(scene.history, scene.route, facts)
     else:
         return None
-    return CueMask(cues, family.reflection, vocabulary)
+    return ReasonMask(reasons, family.reflection, vocabulary)
 
 
-class CueMask:
-    """Which words a reflection may choose, given the cues that it may name.
+class ReasonMask:
+    """Which words a reflection may choose, given the statements that it may make.
 
     Args:
-        cues: that may be named.
+        reasons: the statements.
         section: where reflections are written.
         vocabulary: of the tokens.
     """
 
-    def __init__(self, cues: Iterable[Cue], section: str, vocabulary: Vocabulary) -> None:
-        self.sentences = tuple(sorted(map(sentence, cues)))
+    def __init__(self, reasons: Iterable[Statement], section: str, vocabulary: Vocabulary) -> None:
+        self.statements = tuple(sorted(map(str, reasons)))
         self._section, self._vocabulary = section, vocabulary
 
     def leaves(self, cursor: Cursor, written: Sequence[Token]) -> BoolArray | None:
@@ -84,14 +84,14 @@ class CueMask:
         return None if left.all() else left
 
     def _leads_on(self, cursor: Cursor, token: int, text: str) -> bool:
-        """Whether a response can go on behind a token without naming what is not in view."""
+        """Whether behind a token a statement that may be made can be finished, or the section ends."""
         text += self._vocabulary.decode([token])
-        statement = unfinished(text.lstrip())
-        if any(statement.startswith(each) for each in (*self.sentences, NOTHING)):
-            return True
-        if not any(each.startswith(statement) for each in (*self.sentences, NOTHING, "\n")):
+        begun = unfinished(text.strip())
+        if not any(each.startswith(begun) for each in (*self.statements, NOTHING)):
             return False
         cursor = cursor.advance(token)
         if cursor.done or cursor.section != self._section:
+            return True
+        if text.endswith(self.statements):
             return True
         return any(self._leads_on(cursor, int(then), text) for then in cursor.allowed().ids)

@@ -1,4 +1,4 @@
-"""Reflections that name only what is in view, as the engine writes them."""
+"""Reflections that state only what the view gives a reason for, as the engine writes them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.phrases import HEADS, NOTHING, Cue, Facts, Thing, read_facts, sentence
+from model.driving.phrases import HEADS, NOTHING, Statement, read_facts
 from model.driving.tracks import Track
-from model.engines.cue_mask import CueMask, cue_mask_of
 from model.engines.engine import Controls, PlanRequest, RequestError
+from model.engines.reason_mask import ReasonMask, reason_mask_of
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.runner import Runner
 from model.families.cf_vla import CF_VLA
@@ -29,8 +29,8 @@ from tests.model.driving.strategies import facts
 from tests.model.engines.decoding import decode, request
 from tests.model.engines.reference import exactly, reference_draws
 
-CUES = st.lists(facts(), max_size=3).map(
-    lambda made: frozenset(each.cue for some in made for each in some.statements)
+REASONS = st.lists(facts(), max_size=3).map(
+    lambda made: frozenset(each for some in made for each in some.statements)
 )
 TRACKS = (
     Track(18.0, 0.0, 0.0, 0.0, 4.5, 1.9, "vehicle"),
@@ -49,13 +49,13 @@ def tracked(name: str, scene: int, **controls: object) -> PlanRequest:
     return replace(asked, scene=replace(asked.scene, tracks=TRACKS))
 
 
-def named(thinking: str | None) -> set[str]:
+def stated(thinking: str | None) -> set[str]:
     assert thinking is not None
-    return {sentence(each.cue) for each in read_facts(thinking).statements}
+    return set(map(str, read_facts(thinking).statements))
 
 
 @pytest.mark.usefixtures("inference")
-def test_reflections_name_only_what_is_in_view(phrased: Loaded) -> None:
+def test_reflections_state_only_what_has_a_reason(phrased: Loaded) -> None:
     """At a temperature at which nearly anything is written."""
     requests = [
         ask(f"{k}{ask.__name__}", k, n=6, seed=k, thinking="always", temperature=2.0)
@@ -63,17 +63,17 @@ def test_reflections_name_only_what_is_in_view(phrased: Loaded) -> None:
         for ask in (request, tracked)
     ]
     draws = decode(Decoder(Runner(phrased, 16)), *requests)
-    said = [named(draw.thinking) for draw in draws.values()]
-    for draw, cues in zip(draws.values(), said, strict=True):
-        assert draw.in_view is not None
-        assert cues <= set(draw.in_view)
-    assert sum(map(len, said)) > 16
+    said = [stated(draw.thinking) for draw in draws.values()]
+    for draw, statements in zip(draws.values(), said, strict=True):
+        assert draw.reasons is not None
+        assert statements <= set(draw.reasons)
+    assert sum(map(len, said)) > 8
     free = decode(
         Decoder(Runner(phrased, 16)),
-        *(replace(each, controls=replace(each.controls, cues="any")) for each in requests),
+        *(replace(each, controls=replace(each.controls, reasons="any")) for each in requests),
     )
-    assert any(not named(free[key].thinking) <= set(draw.in_view or ()) for key, draw in draws.items())
-    assert {draw.in_view for draw in free.values()} == {None}
+    assert any(not stated(free[key].thinking) <= set(draw.reasons or ()) for key, draw in draws.items())
+    assert {draw.reasons for draw in free.values()} == {None}
 
 
 @pytest.mark.usefixtures("inference")
@@ -81,7 +81,7 @@ def test_masked_requests_decode_as_the_reference_does(phrased: Loaded) -> None:
     mixed = [
         tracked("tracks", 1, n=3, seed=5, thinking="always", temperature=1.5),
         request("pictures", 2, n=3, seed=6, thinking="always", temperature=1.5),
-        request("any", 2, n=2, seed=6, thinking="always", cues="any"),
+        request("any", 2, n=2, seed=6, thinking="always", reasons="any"),
         request("bare", 3, "traj_only", n=2),
     ]
     draws = decode(Decoder(Runner(phrased, 16)), *mixed)
@@ -90,13 +90,13 @@ def test_masked_requests_decode_as_the_reference_does(phrased: Loaded) -> None:
             assert draws[asked.request_id, expected.index].text == expected.text
 
 
-@given(CUES, st.lists(st.integers(0, 2**16), min_size=40, max_size=40))
-def test_every_walk_ends_and_names_nothing_else(
-    phrased: Loaded, cues: frozenset[Cue], turns: list[int]
+@given(REASONS, st.lists(st.integers(0, 2**16), min_size=40, max_size=40))
+def test_every_walk_ends_and_states_nothing_else(
+    phrased: Loaded, reasons: frozenset[Statement], turns: list[int]
 ) -> None:
     body = Section("why", Sequence((Phrases(), Text("\n"))))
     compiled = CompiledFormat(Format("walk", body), phrased.vocabulary)
-    mask = CueMask(cues, "why", phrased.vocabulary)
+    mask = ReasonMask(reasons, "why", phrased.vocabulary)
     cursor, written = compiled.start(), list[Token]()
     for turn in turns:
         run, cursor = cursor.forced()
@@ -110,7 +110,7 @@ def test_every_walk_ends_and_names_nothing_else(
         cursor = cursor.advance(written[-1].id)
     assert cursor.done
     facts = read_facts(phrased.vocabulary.decode([token.id for token in written]).strip())
-    assert {each.cue for each in facts.statements} <= cues
+    assert set(facts.statements) <= reasons
 
 
 def test_where_nothing_is_in_view_nothing_is_said(phrased: Loaded) -> None:
@@ -118,7 +118,7 @@ def test_where_nothing_is_in_view_nothing_is_said(phrased: Loaded) -> None:
         Format("walk", Section("why", Sequence((Phrases(), Text("\n"))))), phrased.vocabulary
     )
     start = compiled.start()
-    left = CueMask((), "why", phrased.vocabulary).leaves(start, [])
+    left = ReasonMask((), "why", phrased.vocabulary).leaves(start, [])
     assert left is not None
     (token,) = start.allowed().ids[left]
     assert NOTHING.startswith(phrased.vocabulary.decode([int(token)]))
@@ -127,21 +127,20 @@ def test_where_nothing_is_in_view_nothing_is_said(phrased: Loaded) -> None:
 
 def test_who_knows_nothing_is_not_masked(phrased: Loaded) -> None:
     asked, vocabulary = PlanRequest("a", noisy_scene(), controls=Controls()), phrased.vocabulary
-    assert cue_mask_of(asked, CF_VLA, vocabulary, None) is None
-    assert cue_mask_of(asked, TRAJ_ONLY, vocabulary, np.zeros(80, np.float32)) is None
-    assert cue_mask_of(replace(asked, controls=Controls(cues="any")), CF_VLA, vocabulary, None) is None
+    assert reason_mask_of(asked, CF_VLA, vocabulary, None) is None
+    assert reason_mask_of(asked, TRAJ_ONLY, vocabulary, np.zeros(80, np.float32)) is None
+    assert reason_mask_of(replace(asked, controls=Controls(reasons="any")), CF_VLA, vocabulary, None) is None
     with_tracks = replace(asked, scene=replace(asked.scene, tracks=()))
-    mask = cue_mask_of(with_tracks, CF_VLA, vocabulary, None)
+    mask = reason_mask_of(with_tracks, CF_VLA, vocabulary, None)
     assert mask is not None
-    assert set(mask.sentences) == {"My lane is clear.", "The road runs straight on."}
+    assert set(mask.statements) == {
+        "My lane is clear. Going on like this would be needlessly cautious, so I should pick up speed.",
+        "My lane is clear. Going on like this would be unnecessary, so I should stay in my lane.",
+        "The road runs straight on. Going on like this would carry me out of the lane, so I should "
+        "steer straight for longer.",
+    }
 
 
 def test_other_values_are_refused() -> None:
-    with pytest.raises(RequestError, match="cues must be in_view or any"):
-        Controls(cues="all")  # type: ignore[arg-type]
-
-
-def test_a_cue_is_told_by_one_sentence() -> None:
-    cue = Thing("vehicle", "my lane", 15, "braking")
-    assert sentence(cue) == "A braking vehicle is in my lane some 15 metres ahead."
-    assert Facts().statements == ()
+    with pytest.raises(RequestError, match="reasons must be in_view or any"):
+        Controls(reasons="all")  # type: ignore[arg-type]
