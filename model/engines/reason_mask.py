@@ -19,6 +19,7 @@ from model.driving.trajectory import FloatArray
 from model.engines.engine import PlanRequest
 from model.families.family import Family
 from model.formats.cursor import Cursor, Token
+from model.formats.phrases import in_phrases
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -34,7 +35,7 @@ class Vocabulary(Protocol):
 def reason_mask_of(
     request: PlanRequest, family: Family, vocabulary: Vocabulary, facts: FloatArray | None
 ) -> ReasonMask | None:
-    """The mask of a request; None where any reason may be given, or nobody knows what is in view.
+    """The mask of a request; None where anything may be stated, or nobody knows what is in view.
 
     Args:
         request: its tracks tell what is in view, if it has any.
@@ -43,7 +44,7 @@ def reason_mask_of(
         facts: float32 [len(FACTS)] that the network reads from the pictures; None where it reads none.
     """
     scene = request.scene
-    if request.controls.reasons == "any" or family.reflection is None:
+    if request.controls.reasons == "any" or family.reflection is None or not in_phrases(family.format):
         return None
     if scene.tracks is not None:
         reasons = reasons_tracked(scene.history, scene.route, scene.tracks)

@@ -31,6 +31,7 @@ from model.driving.plan import GROUPS, TICKS
 from model.formats.pieces import (
     Choice,
     Compound,
+    Format,
     FormatError,
     Literal,
     Maybe,
@@ -40,6 +41,7 @@ from model.formats.pieces import (
     Sequence,
     Shorthand,
     Value,
+    walk,
 )
 from model.formats.plan_tracks import written_plan
 
@@ -69,6 +71,11 @@ class Reflection(Narrowing):
         """Statements of what can be changed in the first plan."""
         plan = written_plan(written[self.first_plan])
         return Phrases(frozenset(change for change in CHANGES if needed(plan, change) <= TICKS))
+
+
+def in_phrases(format: Format) -> bool:
+    """Whether a format writes reflections in phrases."""
+    return any(isinstance(each, Reflection | Phrases) for each in walk(format.body))
 
 
 @dataclass(frozen=True)

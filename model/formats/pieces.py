@@ -303,8 +303,8 @@ def holds(piece: Piece) -> int | None:
 
 def narrowing_sections(piece: Piece) -> frozenset[str]:
     """The sections whose texts narrow something within ``piece``."""
-    own = frozenset(piece.sections) if isinstance(piece, Narrowing) else frozenset()
-    return own.union(*map(narrowing_sections, _children(piece)))
+    narrowings = (each for each in walk(piece) if isinstance(each, Narrowing))
+    return frozenset(section for each in narrowings for section in each.sections)
 
 
 def repeatable(piece: Piece) -> None:
@@ -329,19 +329,20 @@ def _children(piece: Piece) -> collections.abc.Sequence[Piece]:
             return ()
 
 
-def choices(piece: Piece) -> Iterator[Choice]:
-    """The choices within ``piece``, those that its shorthands stand for apart."""
-    if isinstance(piece, Choice):
-        yield piece
+def walk(piece: Piece) -> Iterator[Piece]:
+    """``piece`` and the pieces within it, those that its shorthands stand for apart."""
+    yield piece
     for child in _children(piece):
-        yield from choices(child)
+        yield from walk(child)
+
+
+def choices(piece: Piece) -> Iterator[Choice]:
+    """The choices within ``piece``."""
+    return (each for each in walk(piece) if isinstance(each, Choice))
 
 
 def _sections(piece: Piece) -> Iterator[str]:
-    if isinstance(piece, Section):
-        yield piece.name
-    for child in _children(piece):
-        yield from _sections(child)
+    return (each.name for each in walk(piece) if isinstance(each, Section))
 
 
 def _refuse_sections(piece: Piece, where: str) -> None:

@@ -11,6 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from model.driving.facts import FACTS
 from model.driving.phrases import HEADS, NOTHING, Statement, read_facts
 from model.driving.tracks import Track
 from model.engines.engine import Controls, PlanRequest, RequestError
@@ -125,13 +126,17 @@ def test_where_nothing_is_in_view_nothing_is_said(phrased: Loaded) -> None:
     assert len(start.allowed().ids) > len(HEADS) // 2
 
 
-def test_who_knows_nothing_is_not_masked(phrased: Loaded) -> None:
-    asked, vocabulary = PlanRequest("a", noisy_scene(), controls=Controls()), phrased.vocabulary
-    assert reason_mask_of(asked, CF_VLA, vocabulary, None) is None
-    assert reason_mask_of(asked, TRAJ_ONLY, vocabulary, np.zeros(80, np.float32)) is None
-    assert reason_mask_of(replace(asked, controls=Controls(reasons="any")), CF_VLA, vocabulary, None) is None
-    with_tracks = replace(asked, scene=replace(asked.scene, tracks=()))
-    mask = reason_mask_of(with_tracks, CF_VLA, vocabulary, None)
+def test_who_knows_nothing_or_writes_no_phrases_is_not_masked(phrased: Loaded) -> None:
+    vocabulary, facts = phrased.vocabulary, np.zeros(len(FACTS), np.float32)
+    asked, phrases = PlanRequest("a", noisy_scene(), controls=Controls()), CF_VLA.in_dialect("phrases")
+    tracked_one = replace(asked, scene=replace(asked.scene, tracks=()))
+    assert reason_mask_of(asked, phrases, vocabulary, None) is None
+    assert reason_mask_of(asked, phrases, vocabulary, facts) is not None
+    for family in (CF_VLA.in_dialect("free_text"), TRAJ_ONLY):
+        assert reason_mask_of(tracked_one, family, vocabulary, facts) is None
+    free = replace(tracked_one, controls=Controls(reasons="any"))
+    assert reason_mask_of(free, phrases, vocabulary, facts) is None
+    mask = reason_mask_of(tracked_one, phrases, vocabulary, None)
     assert mask is not None
     assert set(mask.statements) == {
         "My lane is clear. Going on like this would be needlessly cautious, so I should pick up speed.",
