@@ -12,11 +12,14 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from service.errors import problem_response
 from service.keys import Keys
 from service.metrics import Metrics
+from service.openai_errors import PATHS
 from service.problems import MISDIRECTED, UNAUTHORIZED, ProblemError
 
 OPEN_PATHS: Final = frozenset({"/healthz", "/readyz"})
 NOBODY: Final = ""
 """Whoever asks where no keys are set."""
+_QUOTED: Final = 100
+"""Characters of a name that is not this service's; longer ones are sent to be sent back."""
 
 
 class Guard:
@@ -41,20 +44,25 @@ class Guard:
             return
         host = _host(Headers(scope=scope).get("host", ""))
         if not self._keys and self._hosts is not None and host not in self._hosts:
-            problem = ProblemError(MISDIRECTED, f"this is not {host!r}; LOOKTWICE_HOSTS tells its names")
-            await problem_response(problem, scope["state"]["request_id"])(scope, receive, send)
+            detail = f"this is not {host[:_QUOTED]!r}; LOOKTWICE_HOSTS tells its names"
+            await self._refuse(ProblemError(MISDIRECTED, detail), scope, receive, send)
             return
         owner: str | None = NOBODY
         if self._keys and scope["path"] not in OPEN_PATHS:
             key = _key(Headers(scope=scope).get("authorization", ""))
             owner = None if key is None else self._keys.owner(key)
         if owner is None:
-            problem = ProblemError(UNAUTHORIZED, "send a key of this service: Authorization: Bearer …")
-            self._metrics.problem_told(UNAUTHORIZED)
-            await problem_response(problem, scope["state"]["request_id"])(scope, receive, send)
+            told = ProblemError(UNAUTHORIZED, "send a key of this service: Authorization: Bearer …")
+            await self._refuse(told, scope, receive, send)
             return
         scope["state"]["owner"] = owner
         await self._app(scope, receive, send)
+
+    async def _refuse(self, problem: ProblemError, scope: Scope, receive: Receive, send: Send) -> None:
+        self._metrics.problem_told(problem.kind)
+        dialect = scope["path"].startswith(PATHS)
+        answer = problem_response(problem, scope["state"]["request_id"], dialect=dialect)
+        await answer(scope, receive, send)
 
 
 def _host(given: str) -> str:

@@ -15,7 +15,7 @@ from clients.wire import (
     Problem,
 )
 from service.auth import OPEN_PATHS
-from service.problems import INTERNAL, Kind
+from service.problems import INTERNAL, MISDIRECTED, Kind
 
 Responses = dict[int | str, dict[str, Any]]
 
@@ -34,9 +34,9 @@ PACKED: Responses = {
 
 
 def problems(*kinds: Kind) -> Responses:
-    """What a route declares about its errors; 500 can occur anywhere."""
+    """What a route declares about its errors; 421 and 500 can occur anywhere."""
     by_status: dict[int, list[Kind]] = {}
-    for kind in (*kinds, INTERNAL):
+    for kind in (*kinds, MISDIRECTED, INTERNAL):
         by_status.setdefault(kind.status, []).append(kind)
     return {
         status: {

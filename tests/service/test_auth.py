@@ -135,6 +135,17 @@ def test_without_keys_only_known_names_are_answered_to(served: Served, host: str
         problem(answer, "misdirected")
 
 
+def test_a_name_that_is_not_its_own_is_counted_and_not_told_at_length(served: Served) -> None:
+    counted = {"reason": "misdirected"}
+    before = served.metric("looktwice_rejections_total", **counted)
+    for path in ("/readyz", "/v1/models", "/v1/chat/completions"):
+        answer = served.http.get(path, headers={"Host": "x" * 20_000})
+        assert problem(answer, "misdirected").status == 421
+        assert len(answer.content) < 1000
+        assert ("error" in answer.json()) == path.startswith("/v1/chat")
+    assert served.metric("looktwice_rejections_total", **counted) == before + 3
+
+
 def test_whom_a_service_answers_to_can_be_told(guarded: Served, keys: tuple[Path, str, str]) -> None:
     assert guarded.http.get("/v1/models", headers={"Host": "car.example.com"}).status_code == 200
     assert Settings(open=True).answers_to() is None

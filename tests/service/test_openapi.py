@@ -23,7 +23,7 @@ def test_every_error_is_described_as_a_problem(description: dict[str, Any]) -> N
     for operations in description["paths"].values():
         for operation in operations.values():
             responses = operation["responses"]
-            assert {"200", "500"} <= responses.keys()
+            assert {"200", "421", "500"} <= responses.keys()
             for status, response in responses.items():
                 if status != "200":
                     (media_type,) = response["content"]
@@ -32,7 +32,7 @@ def test_every_error_is_described_as_a_problem(description: dict[str, Any]) -> N
                         "$ref": "#/components/schemas/Problem"
                     }
     plan = description["paths"]["/v1/plan"]["post"]["responses"]
-    refusals = {"400", "401", "408", "413", "415", "422", "429", "500", "503", "504"}
+    refusals = {"400", "401", "408", "413", "415", "421", "422", "429", "500", "503", "504"}
     assert plan.keys() == {"200"} | refusals
     assert "image" not in description["components"]["schemas"]
     assert "HTTPValidationError" not in description["components"]["schemas"]
