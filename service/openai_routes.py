@@ -24,7 +24,7 @@ from service.openai_chat import (
     trajectory_text,
 )
 from service.openai_errors import dialect_error
-from service.openapi import Responses, problems
+from service.openapi import Responses, event_stream, problems
 from service.parts import Parts
 from service.payloads import payload_route
 from service.planning import Planned, last
@@ -46,9 +46,7 @@ _ANSWERS: Final[Responses] = {
                     },
                 }
             },
-            wire.SSE_MEDIA_TYPE: {
-                "schema": {"type": "string", "description": "With stream: true. Chat completion chunks."}
-            },
+            **event_stream("With stream: true. A chat completion chunk, or [DONE]."),
         }
     }
 }

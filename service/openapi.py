@@ -12,6 +12,7 @@ from clients.wire import (
     MULTIPART_MEDIA_TYPE,
     PROBLEM_MEDIA_TYPE,
     REQUEST_PART,
+    SSE_MEDIA_TYPE,
     Problem,
 )
 from service.auth import OPEN_PATHS
@@ -31,6 +32,20 @@ PACKED: Responses = {
     200: {"content": {MSGPACK_MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}}}
 }
 """Of a route that answers in msgpack where that is accepted."""
+
+
+def event_stream(description: str, *names: str) -> dict[str, Any]:
+    """The content of a stream of server-sent events: what one of them is.
+
+    Args:
+        description: of the stream.
+        names: that events have; none where they are told apart by their data alone.
+    """
+    fields: dict[str, Any] = {"data": {"type": "string", "description": "JSON."}}
+    if names:
+        fields["event"] = {"type": "string", "enum": list(names)}
+    schema = {"type": "object", "description": description, "required": list(fields), "properties": fields}
+    return {SSE_MEDIA_TYPE: {"schema": schema}}
 
 
 def problems(*kinds: Kind) -> Responses:

@@ -20,7 +20,7 @@ from service.callers import while_connected
 from service.errors import problem_document, validated
 from service.examples import example_reflection, example_request
 from service.idempotency import NotKept
-from service.openapi import PACKED, Responses, payloads, problems
+from service.openapi import PACKED, Responses, event_stream, payloads, problems
 from service.parts import Parts
 from service.payloads import packed, payload_route
 from service.planning import Arrival, Asked, Planned, last
@@ -67,15 +67,8 @@ REFLECT_EXAMPLES: dict[str, Example] = {
 }
 STREAM: Responses = {
     200: {
-        "content": {
-            **PACKED[200]["content"],
-            wire.SSE_MEDIA_TYPE: {
-                "schema": {
-                    "type": "string",
-                    "description": "With stream: true. Events " + ", ".join((*wire.EVENTS, "done")) + ".",
-                }
-            },
-        }
+        "content": PACKED[200]["content"]
+        | event_stream("With stream: true. One event of it.", *wire.EVENTS, "done")
     }
 }
 REFUSALS = (

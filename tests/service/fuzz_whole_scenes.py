@@ -7,6 +7,7 @@ that are served otherwise: fields left out, added, null, of another type, and at
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import schemathesis
@@ -65,6 +66,7 @@ WHOLE: dict[tuple[str, str], dict[str, Any]] = {
     ("Labels", "drivable"): _one(_LABELS["drivable"], None),
     ("Labels", "centreline"): _one(_LABELS["centreline"], None),
     ("PreviousPlan", "trajectory"): _one(_SCORE["reference"]),
+    ("ScoreRequest", "scene_id"): _one(None),
     ("ScoreRequest", "trajectories"): _one(_SCORE["trajectories"]),
     ("ScoreRequest", "reference"): _one(_SCORE["reference"], None),
     ("ScoreRequest", "human"): _one(_SCORE["reference"], None),
@@ -76,8 +78,11 @@ packed = fuzz_hooks.packed
 
 @schemathesis.hook
 def before_load_schema(context: Any, raw_schema: dict[str, Any]) -> None:
-    """Put them there."""
-    _put(raw_schema["components"]["schemas"])
+    """Put them there; answers tell plans by a schema that requests share, and theirs stays."""
+    schemas = raw_schema["components"]["schemas"]
+    told = deepcopy(schemas["Tracks"])
+    _put(schemas)
+    schemas["Plan"]["properties"]["tracks"] = told
 
 
 def _put(node: Any) -> None:

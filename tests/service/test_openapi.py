@@ -58,6 +58,19 @@ def test_the_example_can_be_sent_as_it_is(description: dict[str, Any], served: S
     assert served.http.post("/v1/plan", json=example["value"]).status_code == 200
 
 
+@pytest.mark.parametrize("path", ["/v1/plan", "/v1/reflect"])
+def test_streams_hold_the_events_that_are_described(
+    description: dict[str, Any], served: Served, path: str
+) -> None:
+    operation = description["paths"][path]["post"]
+    one = operation["responses"]["200"]["content"]["text/event-stream"]["schema"]["properties"]
+    (example,) = operation["requestBody"]["content"]["application/json"]["examples"].values()
+    asked = example["value"] | {"stream": True}
+    lines = served.http.post(path, json=asked).text.splitlines()
+    told = {line.removeprefix("event: ") for line in lines if line.startswith("event: ")}
+    assert {"branch", "trajectory", "done"} <= told <= set(one["event"]["enum"])
+
+
 def test_fields_say_their_units(description: dict[str, Any]) -> None:
     schemas = description["components"]["schemas"]
     history = schemas["Scene"]["properties"]["history"]
