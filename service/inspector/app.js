@@ -130,7 +130,7 @@ async function ask(doing, request) {
   const began = performance.now();
   try {
     const body = await request(running.signal);
-    showDraws(body.draws, body.agreed ?? null);
+    showDraws(body);
     const { total_ms: total, engine_ms: engine } = body.timing;
     const deadline = body.deadline ? `, deadline ${body.deadline.met ? "met" : "missed"}` : "";
     say(`${body.draws.length} draws in ${total.toFixed(0)} ms (engine ${engine.toFixed(0)} ms, `
@@ -186,9 +186,8 @@ const DISAGREES = {
   reason_change: ["words ≠ plan", "the revised plan does not change as the reasoning asks for"],
 };
 
-function showDraws(draws, agreed) {
-  state.draws = draws;
-  state.agreed = agreed;
+function showDraws({ draws, agreed = null, deadline = null }) {
+  Object.assign(state, { draws, agreed, deadline });
   byId("draws").hidden = draws.length === 0;
   for (const empty of document.querySelectorAll(".empty")) empty.hidden = true;
   byId("draws").tBodies[0].replaceChildren(...draws.map(drawRow));
@@ -205,13 +204,21 @@ function drawRow(draw, index) {
     element("td", {}, element("label", {}, radio, `draw ${draw.index}`),
       index === state.agreed ? element("span", { className: "agreed", textContent: "agreed", title: "nearest to all other draws: the one to drive by" }) : ""),
     element("td", {}, draw.branch === null ? "–" : branch,
-      draw.cut ? element("span", { className: "cut", textContent: draw.cut, title: "what the deadline did to the second look" }) : "",
       ...draw.disagreements.map((parts) => element("span", { className: "disagrees", textContent: DISAGREES[parts]?.[0] ?? parts, title: DISAGREES[parts]?.[1] ?? "" }))),
     element("td", {}, draw.think_probability === null ? "–" : probability(draw.think_probability)),
+    element("td", {}, ...deadlineOf(draw)),
     element("td", { className: "number", textContent: tokens }),
     element("td", { className: "number", textContent: errorOf(draw) }));
   row.addEventListener("click", () => choose(index));
   return row;
+}
+
+// Whether the answer was in time, and what that took of the draw's second look.
+function deadlineOf(draw) {
+  if (!state.deadline) return ["–"];
+  const told = [state.deadline.met ? "met" : "missed"];
+  if (draw.cut) told.push(" ", element("span", { className: "cut", textContent: draw.cut, title: "what the deadline did to the second look" }));
+  return told;
 }
 
 function probability(value) {

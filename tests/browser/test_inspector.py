@@ -393,9 +393,51 @@ def test_a_link_leads_to_the_same_plan(inspector: Page, served: Served, engine: 
     expect(inspector.get_by_role("alert")).to_contain_text("not here")
 
 
-def test_what_became_of_the_deadline_is_shown(inspector: Page) -> None:
+def test_what_became_of_the_deadline_is_shown_beside_every_draw(
+    inspector: Page, engine: ScriptedEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "cut", "shortened")
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
     plan(inspector)
     expect(inspector.get_by_role("status")).to_contain_text("deadline met")
+    told = inspector.locator("#draws tbody tr td:nth-child(4)")
+    expect(told).to_have_text(["met shortened"] * 6)
+    inspector.get_by_label("Deadline, ms").fill("")
+    plan(inspector)
+    expect(told).to_have_text([re.compile("^.$")] * 6)  # a dash
+
+
+def test_the_legend_names_every_colour_that_is_drawn(inspector: Page) -> None:
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
+    plan(inspector)
+    expect(inspector.locator("#birdseye")).to_have_attribute("aria-label", re.compile("its draft ended"))
+    inspector.evaluate(
+        """() => {
+          window.drawn = new Set();
+          const pens = CanvasRenderingContext2D.prototype;
+          for (const [draw, style] of [["stroke", "strokeStyle"], ["fill", "fillStyle"]]) {
+            const own = pens[draw];
+            pens[draw] = function (...given) {
+              window.drawn.add(this[style]);
+              return own.apply(this, given);
+            };
+          }
+        }"""
+    )
+    inspector.locator("#draws tbody tr").nth(1).click()
+    drawn = {
+        tuple(int(text[place : place + 2], 16) for place in (1, 3, 5))
+        for text in inspector.evaluate("[...window.drawn]")
+    }
+    named = inspector.evaluate(
+        """() => [...document.querySelectorAll(".legend li")].flatMap((item) => {
+          const style = getComputedStyle(item, "::before");
+          return [style.borderTopColor, style.backgroundColor];
+        })"""
+    )
+    assert len(drawn) > 8
+    inside_of_dots = (255, 255, 255)
+    assert drawn - {tuple(map(int, re.findall(r"\d+", text)))[:3] for text in named} == {inside_of_dots}
 
 
 def test_a_service_that_is_gone_is_told(browser: Browser, tmp_path: Path) -> None:

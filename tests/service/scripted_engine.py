@@ -13,6 +13,7 @@ import numpy as np
 from model.driving.plan import GROUPS, Plan, parse_plan
 from model.driving.trajectory import FUTURE_STEPS, STEP_S, TEN_HZ_S, FloatArray, at_times, present_speed
 from model.engines.engine import (
+    Cut,
     DraftFinished,
     Draw,
     DrawFinished,
@@ -65,6 +66,7 @@ class ScriptedEngine:
         may_finish: requests wait for it behind their first plan.
         breaks: what is put into it ends the engine.
         times_s: of the poses of its trajectories.
+        cut: what deadlines do to second looks.
         starts: how often it was started.
         submitted, cancelled: what was asked, in order.
     """
@@ -81,6 +83,7 @@ class ScriptedEngine:
         self.may_begin.set()
         self.breaks: asyncio.Queue[EngineError] = asyncio.Queue()
         self.times_s = TEN_HZ_S
+        self.cut: Cut | None = None
         self.starts = 0
         self.submitted: list[PlanRequest] = []
         self.cancelled: list[str] = []
@@ -131,7 +134,8 @@ class ScriptedEngine:
                         yield TextWritten(draw.index, "thinking", f" {word}")
                     yield SectionFinished(draw.index, "thinking", f" {draw.thinking}\n")
                     yield SectionFinished(draw.index, "revised_plan", str(draw.revised_plan))
-                yield DrawFinished(draw)
+                cut = None if draw.thinking is None or request.controls.deadline_ms is None else self.cut
+                yield DrawFinished(replace(draw, cut=cut))
         except (GeneratorExit, asyncio.CancelledError):
             self.cancel(request.request_id)
             raise
