@@ -16,7 +16,7 @@ from loadtests.call import Call
 from loadtests.sending import Target
 
 _DRIP_S: Final = 0.5
-"""Between two bytes of a body that never ends."""
+"""Between two bytes of a body that never ends, and between two looks at readiness."""
 _SMALL_BUFFER: Final = 4096
 _NO_LINGER: Final = struct.pack("ii", 1, 0)
 """Closing resets the connection, as a process does that dies."""
@@ -31,6 +31,7 @@ class Hostility:
         never_reading: clients that ask for one and never read what comes.
         slow_bodies: clients that send a byte of their body now and then.
         costly: clients that send requests that are dear to serve, one behind the other.
+        labelling: clients that have a teacher asked, one question behind the other.
         leave_after_s: time enough for the service to begin.
     """
 
@@ -38,34 +39,70 @@ class Hostility:
     never_reading: int = 0
     slow_bodies: int = 0
     costly: int = 0
+    labelling: int = 0
     leave_after_s: float = 0.05
 
 
+@dataclass(frozen=True)
+class Bait:
+    """What hostile clients send.
+
+    Attributes:
+        plan: for those who leave, never read or dawdle.
+        dear: requests that are dear to serve.
+        labels: questions to a teacher.
+    """
+
+    plan: Call
+    dear: Sequence[Call] = ()
+    labels: Sequence[Call] = ()
+
+
 RUDE: Final = Hostility(leaving=4, never_reading=8, slow_bodies=16)
-COSTLY: Final = Hostility(costly=8)
+COSTLY: Final = Hostility(costly=8, labelling=4)
 
 
 async def be_hostile(
-    target: Target, call: Call, dear: Sequence[Call], hostility: Hostility, seconds: float
+    target: Target, bait: Bait, hostility: Hostility, seconds: float
 ) -> dict[str, dict[str, int]]:
     """Do it for so many seconds; what became of these clients, by kind and by how it ended.
+
+    Somebody polite asks meanwhile whether the service is ready.
 
     ``held``: the service still held the connection at the end. ``closed``: it had closed it without a word.
     A number is the status of its answer. ``left``: the client went away itself.
     """
+    call = bait.plan
     clients = {
         "leaving": [
             _leaves(target, call, hostility.leave_after_s, seconds) for _ in range(hostility.leaving)
         ],
         "never_reading": [_never_reads(target, call, seconds) for _ in range(hostility.never_reading)],
-        "costly": [_asks_much(target, dear, number, seconds) for number in range(hostility.costly)],
+        "costly": [_asks_much(target, bait.dear, number, seconds) for number in range(hostility.costly)],
+        "labelling": [_asks_much(target, bait.labels, 0, seconds) for _ in range(hostility.labelling)],
         "slow_bodies": [_sends_slowly(target, call, seconds) for _ in range(hostility.slow_bodies)],
+        "ready": [_is_ready(target, seconds)],
     }
     ends = {}
     for name, ended in zip(
         clients, await asyncio.gather(*(asyncio.gather(*each) for each in clients.values())), strict=True
     ):
         ends[name] = dict(sum(ended, Counter[str]()))
+    return ends
+
+
+async def _is_ready(target: Target, seconds: float) -> Counter[str]:
+    ends = Counter[str]()
+    clock = asyncio.get_running_loop().time
+    until = clock() + seconds
+    while clock() < until:
+        try:
+            reader, writer = await _connect(target)
+            writer.write(_lines(target, "GET /readyz HTTP/1.1"))
+            ends += await _ending(reader, writer, max(_DRIP_S, until - clock()))
+        except OSError:
+            ends["refused"] += 1
+        await asyncio.sleep(_DRIP_S)
     return ends
 
 
@@ -102,6 +139,7 @@ async def _asks_much(target: Target, dear: Sequence[Call], first: int, seconds: 
             ends += await _ending(reader, writer, max(_DRIP_S, until - clock()))
         except OSError:
             ends["refused"] += 1
+            await asyncio.sleep(_DRIP_S)
     return ends
 
 
@@ -157,10 +195,11 @@ async def _connect(target: Target) -> tuple[asyncio.StreamReader, asyncio.Stream
 
 
 def _head(target: Target, call: Call, length: int) -> bytes:
-    lines = [
-        f"POST {call.path} HTTP/1.1",
-        f"Host: {urlsplit(target.url).netloc}",
-        f"Content-Length: {length}",
-    ]
-    lines += [f"{name}: {value}" for name, value in (*call.headers, *target.headers.items())]
+    headers = (("Content-Length", str(length)), *call.headers)
+    return _lines(target, f"POST {call.path} HTTP/1.1", headers)
+
+
+def _lines(target: Target, first: str, headers: Sequence[tuple[str, str]] = ()) -> bytes:
+    named = (("Host", urlsplit(target.url).netloc), *headers, *target.headers.items())
+    lines = [first, *(f"{name}: {value}" for name, value in named)]
     return ("\r\n".join(lines) + "\r\n\r\n").encode()

@@ -1,20 +1,25 @@
-"""Scenarios `hostile` and `costly`: a steady rate of polite requests while others dawdle, or ask much."""
+"""Scenario `hostile`: a steady rate of polite requests while others dawdle, or (see `costly`) ask much."""
 
 from __future__ import annotations
 
 import asyncio
+import os
 import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final
 
 from loadtests.aftermath import left_behind
 from loadtests.arrivals import Phase, poisson_arrivals, windows
 from loadtests.bodies import make_call, make_calls
 from loadtests.costly import costly_calls
-from loadtests.hostile import Hostility, be_hostile
+from loadtests.hostile import Bait, Hostility, be_hostile
 from loadtests.loads import OpenLoop
 from loadtests.mix import Kind
 from loadtests.run import WARM_UP, Result, Setup, check, needed, run
 
 CALM, HOSTILE, AFTER = "calm", "hostile", "after"
+_NICENESS: Final = 5
+"""Of hostile clients, who have machines of their own elsewhere: here polite ones go before them."""
 
 
 def hostile(setup: Setup, hostility: Hostility, name: str = "hostile") -> Result:
@@ -30,17 +35,13 @@ def hostile(setup: Setup, hostility: Hostility, name: str = "hostile") -> Result
         Phase(name, setup.warm_up_s if name == WARM_UP else setup.seconds, setup.rate_rps) for name in names
     ]
     calls = tuple(make_calls(setup.scenes, setup.mix, needed(phases, setup), setup.seed))
-    bait = make_call(
-        Kind("think", max(setup.mix.draws), stream=setup.mix.stream > 0), setup.scenes[:1], setup.seed
-    )
-    one = make_call(Kind("direct", 1), setup.scenes[:1], setup.seed)
-    dear = costly_calls(one) if hostility.costly else []
+    bait = make_bait(setup, hostility)
     begins = next(window for window in windows(phases) if window.name == HOSTILE)
     ends: dict[str, dict[str, int]] = {}
 
     def meanwhile(starts_at: float) -> None:
         time.sleep(max(0.0, starts_at + begins.start_s - time.monotonic()))
-        ends.update(asyncio.run(be_hostile(setup.target, bait, dear, hostility, begins.seconds)))
+        ends.update(attack(setup, hostility, bait, begins.seconds))
 
     ran = run(OpenLoop(poisson_arrivals(phases, setup.seed), calls), phases, setup, meanwhile)
     held = left_behind(setup.target)
@@ -61,11 +62,31 @@ def hostile(setup: Setup, hostility: Hostility, name: str = "hostile") -> Result
         {"hostile": {"clients": ends, "polite_p95_ratio": ratio, "left_behind": held}},
         (
             *(f"{name.replace('_', ' ')}: {_told(ended)}" for name, ended in ends.items()),
-            "no p95 to compare" if ratio is None else f"polite p95 meanwhile: {ratio:.1f} times that before",
+            "no p95 to compare" if ratio is None else f"polite p95 meanwhile: {ratio:.2f} times that before",
             f"held afterwards: {held}",
         ),
         ran.exchanges,
     )
+
+
+def make_bait(setup: Setup, hostility: Hostility) -> Bait:
+    """What hostile clients send; made before a run begins."""
+    scenes, seed = setup.scenes[:1], setup.seed
+    plan = make_call(Kind("think", max(setup.mix.draws), stream=setup.mix.stream > 0), scenes, seed)
+    dear = costly_calls(make_call(Kind("direct", 1), scenes, seed)) if hostility.costly else []
+    labels = [make_call(Kind("label", 1), scenes, seed)] if hostility.labelling else []
+    return Bait(plan, dear, labels)
+
+
+def attack(setup: Setup, hostility: Hostility, bait: Bait, seconds: float) -> dict[str, dict[str, int]]:
+    """How hostile clients ended, in a thread of less weight than this one; see `be_hostile`."""
+
+    def run_nicely() -> dict[str, dict[str, int]]:
+        os.nice(_NICENESS)
+        return asyncio.run(be_hostile(setup.target, bait, hostility, seconds))
+
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(run_nicely).result()
 
 
 def _told(ended: dict[str, int]) -> str:

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import socket
 import subprocess
 import sys
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import httpx
 import typer
 
 from model.evaluation.ladder import COUNTERFACTUAL, META_ACT, MULTI_ROUND, ROUND_2, WHOLE_DATASET
+from service.cli.serving import served
 
-START_WITHIN_S: Final = 300.0
 _LOOKTWICE: Final = (sys.executable, "-m", "service.cli")
 _CHECKPOINT_FILE: Final = "looktwice.json"
 
@@ -159,7 +154,9 @@ def _without(options: Sequence[str], names: frozenset[str]) -> list[str]:
 def _make(build: Build, folder: Path, scenes: Path, every: int, reflections: Path) -> None:
     """Everything from a checkpoint to a file of reflections on its plans."""
     place = str(folder / f"build-{build.name}")
-    with _served(folder / build.rung) as url:
+    # Nobody waits for an answer here: the more at once the better.
+    options = ["--checkpoint", str(folder / build.rung), "--rows", str(_ROWS)]
+    with served(options, {"LOOKTWICE_MAX_DRAWS": str(_ROWS)}) as (_, url):
         _run(
             _LOOKTWICE,
             ["build", "rollout", place, str(scenes), "--service", url, "--every", str(every)],
@@ -167,47 +164,6 @@ def _make(build: Build, folder: Path, scenes: Path, every: int, reflections: Pat
     _run(_LOOKTWICE, ["build", "filter", place, *build.keep])
     _run(_LOOKTWICE, ["build", "label", place, str(scenes), "--plans-per-scene", str(_PLANS_PER_SCENE)])
     _run(_LOOKTWICE, ["build", "export", place, "--to", str(reflections), *build.right])
-
-
-@contextmanager
-def _served(checkpoint: Path) -> Iterator[str]:
-    """A service over a checkpoint on a port of its own, until the block ends."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    command = [
-        *_LOOKTWICE,
-        "serve",
-        "--checkpoint",
-        str(checkpoint),
-        "--port",
-        str(port),
-        "--rows",
-        str(_ROWS),
-    ]
-    # Nobody waits for an answer here: the more at once the better.
-    environment = os.environ | {"LOOKTWICE_MAX_DRAWS": str(_ROWS)}
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
-    url = f"http://127.0.0.1:{port}"
-    try:
-        _wait_for(url, process)
-        yield url
-    finally:
-        process.terminate()
-        process.wait()
-
-
-def _wait_for(url: str, process: subprocess.Popen[bytes]) -> None:
-    until_s = time.monotonic() + START_WITHIN_S
-    while time.monotonic() < until_s:
-        if process.poll() is not None:
-            raise RuntimeError(f"the service ended with code {process.returncode}")
-        try:
-            if httpx.get(f"{url}/readyz").status_code == 200:
-                return
-        except httpx.TransportError:
-            pass
-        time.sleep(0.5)
-    raise RuntimeError(f"the service was not ready within {START_WITHIN_S:g} s")
 
 
 def _run(*parts: Sequence[str]) -> None:

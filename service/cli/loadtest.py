@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal
@@ -66,21 +67,31 @@ def loadtest(
     growth_limit: Annotated[
         float, typer.Option(help="soak: of memory over the second half; with more it is not valid.", min=0)
     ] = 0.05,
-    server_pid: Annotated[int | None, typer.Option(help="soak: whose memory is watched.")] = None,
+    server_pid: Annotated[int | None, typer.Option(help="soak, costly: whose memory is watched.")] = None,
+    own_service: Annotated[
+        bool,
+        typer.Option(
+            "--own-service",
+            help="costly: start a service for it, with a teacher that means no good and a log that nobody "
+            "reads, and stop it in the midst.",
+        ),
+    ] = False,
     factor: Annotated[float, typer.Option(help="burst: times the rate.", min=1)] = 10.0,
     burst_seconds: Annotated[float, typer.Option(help="burst: how long.", min=0.5)] = 5.0,
     report: Annotated[Path | None, typer.Option(help="Write a page with plots here (HTML).")] = None,
     as_json: Json = False,
 ) -> None:
     """Offer load, measured from when each request was due; exits with 1 where the run is not valid."""
-    with told():
+    with told(), ExitStack() as stack:
         from loadtests.about import about_client, about_service, versions
-        from loadtests.hostile import COSTLY, RUDE
+        from loadtests.bad_teacher import bad_teacher
+        from loadtests.hostile import RUDE
         from loadtests.knee import KneeSearch
         from loadtests.mix import parse_mix
         from loadtests.report import Report
         from loadtests.run import Result, Setup
         from loadtests.scenarios.burst import burst
+        from loadtests.scenarios.costly import OwnService, costly
         from loadtests.scenarios.fleet import fleet
         from loadtests.scenarios.hostile import hostile
         from loadtests.scenarios.poisson import poisson
@@ -88,6 +99,7 @@ def loadtest(
         from loadtests.scenarios.sweep import sweep
         from loadtests.sending import Target
         from model.driving.scene_store import read_scenes
+        from service.cli.serving import served
 
         def soaked() -> Result:
             if knee is None or server_pid is None:
@@ -103,8 +115,17 @@ def loadtest(
             "soak": soaked,
             "burst": lambda: burst(setup, factor, burst_seconds),
             "hostile": lambda: hostile(setup, RUDE),
-            "costly": lambda: hostile(setup, COSTLY, "costly"),
+            "costly": lambda: costly(setup, own, server_pid),
         }
+        own: OwnService | None = None
+        if own_service:
+            if scenario != "costly":
+                raise ValueError("only the scenario costly starts a service of its own")
+            teacher = stack.enter_context(bad_teacher())
+            settings = {"KIND": "openai", "BASE_URL": teacher.url, "MODEL": "no-good"}
+            environment = {f"LOOKTWICE_TEACHER_{name}": value for name, value in settings.items()}
+            process, service = stack.enter_context(served((), environment, unread_log=True))
+            own = OwnService(process, teacher)
         goal_s = (1 / hz if scenario == "fleet" else 1.0) if goal_ms is None else goal_ms / 1000
         setup = Setup(
             target=Target(service.rstrip("/"), api_key, timeout_s),

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from model.bundled import SCENES
-from service.cli import ladder
+from service.cli import ladder, serving
 from service.cli.commands import app
 
 
@@ -29,8 +29,8 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
                 (made / "looktwice.json").touch()
 
     monkeypatch.setattr(ladder, "_run", run)
-    monkeypatch.setattr(ladder, "_wait_for", lambda *_: None)
-    monkeypatch.setattr("service.cli.ladder.subprocess.Popen", _NoProcess)
+    monkeypatch.setattr(serving, "_wait_for", lambda *_: None)
+    monkeypatch.setattr("service.cli.serving.subprocess.Popen", _NoProcess)
     return ran
 
 

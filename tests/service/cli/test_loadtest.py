@@ -68,3 +68,32 @@ def test_what_cannot_be_run_is_refused_before_it_begins() -> None:
             refused = loadtest(served.url, *options)
             assert refused.returncode == 2, options
             assert refused.stderr.startswith("looktwice: ")
+
+
+def test_a_service_of_its_own_stands_what_is_dear_and_stops_in_the_midst_of_it() -> None:
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "service.cli", "loadtest", "--scenario", "costly", "--own-service"),
+            *("--rate", "1", "--seconds", "6", "--warm-up", "1", "--mix", "direct", "--n", "1"),
+            *("--lag-limit-ms", "5000", "--timeout-s", "120", "--json"),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=400,
+    )
+    # Whether the run counts is a matter of how busy the machine is.
+    assert done.returncode in (0, 1), done.stderr
+    told = json.loads(done.stdout)["hostile"]
+    assert sum(told["clients"]["costly"].values()) >= 8
+    assert told["clients"]["ready"]
+    assert {"100 MB", "a byte a second"} <= told["teacher"].keys()
+    assert told["lines_lost"] > 0
+    assert told["peak_bytes"] < 1_500_000_000
+    assert told["exit_code"] == 0
+    assert not any(told["left_behind"].values())
+
+
+def test_only_what_is_dear_needs_a_service_of_its_own() -> None:
+    done = loadtest("http://127.0.0.1:9", "--own-service")
+    assert done.returncode == 2
+    assert "costly" in done.stderr
