@@ -120,6 +120,11 @@ class Scene:
                 return clip
         raise SceneError(f"scene {self.scene_id} has no clip of camera {camera}")
 
+    @property
+    def pictures(self) -> tuple[bytes, ...]:
+        """Those of all clips, encoded as they are."""
+        return tuple(image for clip in self.clips for image in clip.images)
+
 
 @dataclass(frozen=True, eq=False)
 class LaneTrace:

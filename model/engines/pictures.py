@@ -4,39 +4,68 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 from typing import Final, TypeVar
 
+from model.driving.images import check_image
+
 _Result = TypeVar("_Result")
 THREADS: Final = 2
+LARGE_THREADS: Final = 1
+LARGE_PIXELS: Final = 2_000_000
+"""Of all pictures of a scene, one of full HD: scenes with more wait for each other, and hold up no others."""
 
 
 class PictureThreads:
-    """Runs work on pictures for one event loop."""
+    """Runs work on pictures for one event loop; scenes with large ones have a thread apart."""
 
     def __init__(self) -> None:
-        self._pool: ThreadPoolExecutor | None = None
+        self._pools: dict[bool, ThreadPoolExecutor] = {}
         self._numbers, self._since_s = count(), dict[int, float]()
 
     @property
     def waiting_s(self) -> float:
-        """How long the oldest piece of work has waited to be finished; 0 where there is none."""
+        """How long the oldest piece of work has waited to be finished; 0 where there is none.
+
+        Of large ones only the one that is worked on counts: that others wait behind it says nothing about the
+        rest of the service.
+        """
         return time.monotonic() - min(self._since_s.values()) if self._since_s else 0.0
 
-    async def run(self, work: Callable[[], _Result]) -> _Result:
-        """What ``work`` gives. Who stops waiting leaves work that has begun to end by itself."""
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(THREADS, "looktwice-pictures")
+    async def run(self, work: Callable[[], _Result], pictures: Sequence[bytes] = ()) -> _Result:
+        """What ``work`` on ``pictures`` gives. Who stops waiting leaves work that has begun to end by itself.
+
+        Raises:
+            ImageError: one of the pictures is none.
+        """
+        if await self._run(lambda: _pixels(pictures) > LARGE_PIXELS, large=False):
+            return await self._run(work, large=True)
+        return await self._run(work, large=False)
+
+    async def _run(self, work: Callable[[], _Result], *, large: bool) -> _Result:
+        if large not in self._pools:
+            threads = LARGE_THREADS if large else THREADS
+            self._pools[large] = ThreadPoolExecutor(threads, "looktwice-pictures")
         number = next(self._numbers)
-        self._since_s[number] = time.monotonic()
-        future = self._pool.submit(work)
-        future.add_done_callback(lambda _: self._since_s.pop(number))
+
+        def begun() -> _Result:
+            self._since_s.setdefault(number, time.monotonic())
+            return work()
+
+        if not large:
+            self._since_s[number] = time.monotonic()
+        future = self._pools[large].submit(begun)
+        future.add_done_callback(lambda _: self._since_s.pop(number, None))
         return await asyncio.wrap_future(future)
 
     def close(self) -> None:
         """Drop what has not begun."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
-            self._pool = None
+        for pool in self._pools.values():
+            pool.shutdown(wait=False, cancel_futures=True)
+        self._pools.clear()
+
+
+def _pixels(pictures: Sequence[bytes]) -> int:
+    return sum(width * height for width, height in map(check_image, pictures))

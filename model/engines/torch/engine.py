@@ -161,7 +161,7 @@ class TorchEngine:
         # Now and not when the thread gets to it, which may be a long step later.
         submitted_s = time.monotonic()
         try:
-            binding = await self._pictures.run(lambda: self._prepared(request))
+            binding = await self._pictures.run(lambda: self._prepared(request), request.scene.pictures)
             self._commands.put(lambda decoder: self._add(decoder, request, submitted_s, binding))
             remaining = request.controls.n
             while remaining:

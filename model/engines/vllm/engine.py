@@ -155,7 +155,8 @@ class VllmEngine:
         )
         self._running[request.request_id] = decoding
         try:
-            prompt = await self._pictures.run(lambda: self.prompt(request.scene, request.format))
+            scene, format = request.scene, request.format
+            prompt = await self._pictures.run(lambda: self.prompt(scene, format), scene.pictures)
             async with aclosing(decoding.events(prompt)) as events:
                 async for event in events:
                     yield event

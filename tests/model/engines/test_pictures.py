@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
 
+import numpy as np
 import pytest
 
-from model.engines.pictures import THREADS, PictureThreads
+from model.driving.images import ImageError, encode_jpeg
+from model.engines.pictures import LARGE_PIXELS, THREADS, PictureThreads
 
 
 def test_work_runs_on_threads_of_its_own_and_tells_how_long_it_waits() -> None:
@@ -29,6 +32,35 @@ def test_work_runs_on_threads_of_its_own_and_tells_how_long_it_waits() -> None:
         assert await asyncio.gather(*tasks) == [7] * (THREADS + 1)
         assert threads.waiting_s == 0.0
         assert all(name.startswith("looktwice-pictures") for name in names)
+        threads.close()
+
+    asyncio.run(asyncio.wait_for(test(), 60))
+
+
+def test_large_pictures_hold_up_no_small_ones() -> None:
+    side = math.isqrt(LARGE_PIXELS // 2) + 1
+    small, large = (encode_jpeg(np.zeros((rows, rows, 3), np.uint8)) for rows in (32, side))
+
+    async def test() -> None:
+        threads, go_on = PictureThreads(), threading.Event()
+        begun: list[str] = []
+
+        def stuck() -> None:
+            begun.append("large")
+            assert go_on.wait(30)
+
+        tasks = [asyncio.create_task(threads.run(stuck, [large, large])) for _ in range(5)]
+        while not begun:
+            await asyncio.sleep(0.01)
+        assert await threads.run(lambda: 7, [small, large]) == 7, "one large picture is not yet much"
+        assert begun == ["large"], "one at a time"
+        assert threads.waiting_s > 0, "what is worked on may be stuck"
+        go_on.set()
+        await asyncio.gather(*tasks)
+        assert len(begun) == 5
+        assert threads.waiting_s == 0.0
+        with pytest.raises(ImageError):
+            await threads.run(lambda: 7, [b"no picture"])
         threads.close()
 
     asyncio.run(asyncio.wait_for(test(), 60))
