@@ -11,13 +11,17 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 _DRAIN_FACTOR: Final = 4
+LARGE_BYTES: Final = 1_000_000
+"""Ten scenes of the bundled size. Larger bodies share a part of what is held: small ones always find room."""
+_LARGE_SHARE: Final = 4
 
 
 class BodyLimit:
     """Ends a request with 413 when its body is read and turns out, or is announced, to be too large.
 
     With 408 when it is not there after ``timeout_s``, and with 429 when the bodies of all requests under way
-    together would be more than ``max_held_bytes``: a place is reserved only once a body is read.
+    together would be more than ``max_held_bytes``, or the large ones more than a quarter of that (but one is
+    always taken): a place is reserved only once a body is read.
 
     What still arrives of such a body within that time is read and dropped, up to four times the limit: a
     server that answers and closes while the caller is still sending resets the connection, and the answer is
@@ -27,6 +31,7 @@ class BodyLimit:
     def __init__(self, app: ASGIApp, max_bytes: int, max_held_bytes: int, timeout_s: float) -> None:
         self._app, self._timeout_s = app, timeout_s
         self._max_bytes, self._max_held_bytes, self._held_bytes = max_bytes, max_held_bytes, 0
+        self._max_large_bytes, self._large_bytes = max(max_bytes, max_held_bytes // _LARGE_SHARE), 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection; anything but HTTP passes through."""
@@ -53,22 +58,39 @@ class BodyLimit:
             except TimeoutError:
                 raise HTTPException(408, f"it was not there after {self._timeout_s:g} s") from None
             complete = not message.get("more_body", False)
-            received += len(message.get("body", b""))
-            self._held_bytes += len(message.get("body", b""))
-            too_large, too_many = received > self._max_bytes, self._held_bytes > self._max_held_bytes
-            if (too_large or too_many) and not complete:
+            before, received = received, received + len(message.get("body", b""))
+            self._held_bytes += received - before
+            self._large_bytes += _large(received) - _large(before)
+            too_large = received > self._max_bytes
+            too_many = self._too_many(received)
+            if (too_large or too_many is not None) and not complete:
+                self._forget(received)
+                received = 0
                 await self._drain(receive, ends_s)
             if too_large:
                 raise self._too_large()
-            if too_many:
-                detail = f"the bodies of all requests together hold at most {self._max_held_bytes} bytes"
-                raise HTTPException(429, detail, {"Retry-After": "1"})
+            if too_many is not None:
+                raise HTTPException(429, too_many, {"Retry-After": "1"})
             return message
 
         try:
             await self._app(scope, receive_within_limit, send)
         finally:
-            self._held_bytes -= received
+            self._forget(received)
+
+    def _forget(self, received: int) -> None:
+        self._held_bytes -= received
+        self._large_bytes -= _large(received)
+
+    def _too_many(self, received: int) -> str | None:
+        """Why a body of which so many bytes are there is more than can be held; None where it is not."""
+        if self._held_bytes > self._max_held_bytes:
+            return f"the bodies of all requests together hold at most {self._max_held_bytes} bytes"
+        if received > LARGE_BYTES and self._large_bytes > self._max_large_bytes:
+            return (
+                f"bodies of more than {LARGE_BYTES} bytes together hold at most {self._max_large_bytes} bytes"
+            )
+        return None
 
     async def _drain(self, receive: Receive, ends_s: float) -> None:
         dropped = 0
@@ -82,3 +104,8 @@ class BodyLimit:
 
     def _too_large(self) -> HTTPException:
         return HTTPException(413, f"at most {self._max_bytes} bytes are accepted")
+
+
+def _large(received: int) -> int:
+    """Bytes of a body that count among those of large ones."""
+    return received if received > LARGE_BYTES else 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
 
 import msgpack
@@ -20,14 +21,15 @@ from clients.wire import (
     REQUEST_PART,
 )
 from clients.wire_values import with_pictures
+from service.body_limit import LARGE_BYTES
 from service.documents import read_json, read_msgpack
 from service.problems import INVALID_BODY, INVALID_IMAGE, INVALID_JSON, ProblemError
 
 _JSON: Final = b"application/json"
 _MAX_PARTS: Final = 2048
 """Pictures of a batch."""
-_LARGE_BYTES: Final = 1_000_000
-"""Larger bodies are read on a thread, beside the answers of others."""
+_ONE_AT_A_TIME: Final = ThreadPoolExecutor(1, "looktwice-bodies")
+"""Reads large bodies beside the answers of others: several at once would leave planning no processor."""
 _MAX_JSON_BYTES: Final = 8_000_000
 """Of the JSON part of a multipart body."""
 
@@ -69,11 +71,12 @@ def payload_route(check_open: Callable[[Request], None]) -> type[APIRoute]:
                     raise
                 media_type = media_type_of(request.headers)
                 if media_type == MSGPACK_MEDIA_TYPE:
-                    request = _Decoded(request, await _read(read_msgpack, await request.body()))
+                    request = _Decoded(request, await _read(read_msgpack, await _whole(request)))
                 elif media_type == MULTIPART_MEDIA_TYPE:
                     request = _Decoded(request, await _multipart(request))
-                elif _is_json(media_type) and (body := await request.body()):
-                    request = _Decoded(request, await _read(read_json, body))
+                elif _is_json(media_type):
+                    body = await _whole(request)
+                    request = _Decoded(request, await _read(read_json, body) if body else None)
                 return await handle(request)
 
             return decoded
@@ -98,7 +101,14 @@ def packed(value: Any) -> bytes:
 
 
 async def _read(read: Callable[[bytes], Any], body: bytes) -> Any:
-    return await asyncio.to_thread(read, body) if len(body) > _LARGE_BYTES else read(body)
+    if len(body) <= LARGE_BYTES:
+        return read(body)
+    return await asyncio.get_running_loop().run_in_executor(_ONE_AT_A_TIME, read, body)
+
+
+async def _whole(request: Request) -> bytes:
+    """The body, which the request does not keep: it is decoded, and may be large."""
+    return b"".join([part async for part in request.stream()])
 
 
 async def _multipart(request: Request) -> Any:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Iterator
+from contextlib import ExitStack
 
 import pytest
 
@@ -75,4 +76,22 @@ def test_all_bodies_together_have_a_limit(engine: ScriptedEngine) -> None:
             assert "together" in problem(refused, "queue-full").detail
             assert refused.headers["Retry-After"] == "1"
             assert served.http.post("/v1/plan", json=body()).status_code == 200
+        served.until(lambda: served.http.post("/v1/plan", content=padded, headers=JSON).status_code == 200)
+
+
+def test_large_bodies_leave_room_for_small_ones(engine: ScriptedEngine) -> None:
+    """The large ones that are under way hold a quarter, and those that are refused nothing."""
+    settings = Settings(max_held_bytes=16_000_000, max_body_bytes=3_000_000, body_timeout_s=20)
+    with serve(engine, settings) as served, ExitStack() as stack:
+        host, port = served.url.removeprefix("http://").split(":")
+        head = b"POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2900000\r\n\r\n"
+        held = stack.enter_context(socket.create_connection((host, int(port)), timeout=30))
+        held.sendall(head + b" " * 2_500_000)
+        padded = json.dumps(body()) + " " * 2_000_000
+        served.until(lambda: served.http.post("/v1/plan", content=padded, headers=JSON).status_code == 429)
+        for _ in range(9):
+            refused = served.http.post("/v1/plan", content=padded, headers=JSON)
+            assert "4000000 bytes" in problem(refused, "queue-full").detail
+        assert served.http.post("/v1/plan", json=body()).status_code == 200
+        held.close()
         served.until(lambda: served.http.post("/v1/plan", content=padded, headers=JSON).status_code == 200)
