@@ -19,7 +19,7 @@ MAX_SCANS: Final = 32
 MAX_FRAMES: Final = 64
 """Of an animated WebP, whose first frame alone is shown: all of them are looked for when it is opened."""
 _JPEG, _SCAN, _RIFF, _FRAME = b"\xff\xd8", b"\xff\xda", b"RIFF", b"ANMF"
-MAX_READS: Final = 40_000
+MAX_READS: Final = 10_000
 """That a decoder may make: one for 64 kB of pixels, three for a chunk of a PNG, which is some kB."""
 MAX_DECODE_CPU_S: Final = 1.0
 """Five times what the dearest picture within the other bounds takes. Time of the thread itself, so that a
