@@ -10,9 +10,14 @@ from functools import cache
 from typing import Final
 
 _GLIBC_TRIM_THRESHOLD: Final = -1
+_GLIBC_MMAP_THRESHOLD: Final = -3
 _GLIBC_MMAP_MAX: Final = -4
 _GLIBC_ARENA_MAX: Final = -8
 _EVERY_S: Final = 30.0
+_LARGE_BYTES: Final = 4_000_000
+"""More than a request's usual body, pictures and tensors have."""
+_KEPT_BYTES: Final = 64_000_000
+"""At the end of the memory: as many as glibc would keep by itself in the end."""
 
 
 def keep_freed_memory() -> bool:
@@ -29,6 +34,22 @@ def keep_freed_memory() -> bool:
         return False
     # One arena: those of other threads are made of small maps and would fall back to mapping large tensors.
     options = ((_GLIBC_MMAP_MAX, 0), (_GLIBC_TRIM_THRESHOLD, -1), (_GLIBC_ARENA_MAX, 1))
+    return all(libc.mallopt(option, value) == 1 for option, value in options)
+
+
+def return_large_buffers() -> bool:
+    """Let glibc give the memory of every large buffer back when it is freed, for the rest of this process.
+
+    By default it learns to keep buffers of up to 32 MB: of large bodies and pictures a third of a gigabyte
+    would stay with the threads that read them.
+
+    Returns:
+        Whether it was done: other C libraries are left as they are.
+    """
+    libc = _glibc()
+    if libc is None:
+        return False
+    options = ((_GLIBC_MMAP_THRESHOLD, _LARGE_BYTES), (_GLIBC_TRIM_THRESHOLD, _KEPT_BYTES))
     return all(libc.mallopt(option, value) == 1 for option, value in options)
 
 

@@ -39,6 +39,19 @@ assert freed.give_back()
 assert not freed.give_back()
 print(before - resident())
 """
+_BODIES = """
+import os, sys
+from model.network.allocator import return_large_buffers
+if sys.argv[1] == "returned":
+    assert return_large_buffers()
+resident = lambda: int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+bytearray(31_000_000)  # from which glibc learns to keep buffers of this size
+before = resident()
+bodies = [bytearray(b"x") * 20_000_000 for _ in range(10)]
+last = bytearray(100_000)
+del bodies
+print(resident() - before)
+"""
 only_glibc = pytest.mark.skipif(
     platform.libc_ver()[0] != "glibc", reason="other allocators are left as they are"
 )
@@ -53,6 +66,13 @@ def test_what_is_free_between_what_is_used_goes_back_now_and_then() -> None:
 def test_tensors_made_anew_cost_no_page_faults() -> None:
     """20 tensors of 64 MB: their pages are mapped once, not 20 times."""
     assert _page_faults("mapped") > 10 * _page_faults("kept")
+
+
+@only_glibc
+def test_what_large_buffers_took_goes_back_at_once() -> None:
+    kept, returned = (int(_printed(_BODIES, mode)) for mode in ("kept", "returned"))
+    assert kept > 100_000_000
+    assert returned < 10_000_000
 
 
 def _page_faults(mode: str) -> int:
