@@ -74,6 +74,15 @@ def test_it_thinks_by_itself_now_and_then(planner: PlannerClient) -> None:
     assert len({draw.thinking for draw in thoughts}) > len(thoughts) / 2
 
 
+def test_the_page_opens_on_a_scene_where_a_second_look_happens(served: Served[TorchEngine]) -> None:
+    """The first one of the list, asked for as the page does before anything is changed."""
+    first = served.http.get("/v1/scenes").json()["scenes"][0]["scene_id"]
+    scene = served.http.get(f"/v1/scenes/{first}").json()["scene"]
+    controls = {"n": 6, "temperature": 1, "seed": 0}
+    answer = served.http.post("/v1/plan", json={"scene": scene, "controls": controls}, timeout=120).json()
+    assert any(draw["thinking"] for draw in answer["draws"])
+
+
 def test_it_plans_better_than_keeping_on(planner: PlannerClient) -> None:
     """Over the twelve scenes; the evaluation over a thousand is `looktwice evaluate`."""
     baselines = evaluate_baselines(BUNDLED)

@@ -113,6 +113,7 @@ BAD_BODIES: list[tuple[str, Any, str, str]] = [
     ("degrees", history(in_degrees), "invalid-history", "/scene/history/1"),
     ("route [19, 2]", with_([[1.0, 0.0]] * 19, "scene", "route"), "invalid-route", "/scene/route"),
     ("route far away", with_([[1e6, 0.0]] * 20, "scene", "route"), "invalid-route", "/scene/route"),
+    ("route that stands", with_([[7.0, 0.0]] * 20, "scene", "route"), "invalid-route", "/scene/route"),
     ("NaN route", with_(float("nan"), "scene", "route", 0, 0), "invalid-route", "/scene/route/0/0"),
     ("no clips", with_([], "scene", "clips"), "invalid-clip", "/scene/clips"),
     ("0 frames", with_(clip(images=[]), "scene", "clips", 0), "invalid-clip", "/scene/clips/0/images"),

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+from clients.wire import Controls
 from service.settings import Settings
 
 
@@ -20,3 +21,7 @@ def test_nonsense_is_refused_at_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LOOKTWICE_MAX_BODY_BYTES", "-1")
     with pytest.raises(ValidationError):
         Settings()
+
+
+def test_by_default_callers_who_come_close_together_are_let_in() -> None:
+    assert Settings().max_draws >= 4 * Controls().n

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import httpx
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from service.cli.commands import app
@@ -40,6 +43,30 @@ def test_every_setting_is_told_with_its_meaning() -> None:
 
 def test_what_cannot_be_listened_on_is_refused() -> None:
     assert "65535" in ran("serve", "--port", "65536", code=2)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is one")
+def test_a_missing_gpu_is_told_in_a_line() -> None:
+    told = ran("serve", "--device", "cuda", code=2)
+    assert told.startswith("looktwice: there is no CUDA device")
+    assert told.count("\n") == 1
+
+
+def test_a_service_says_where_it_is_and_where_its_page_is() -> None:
+    command = [sys.executable, "-m", "service.cli", "serve", "--no-model", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as started:
+        assert started.stdout is not None
+        told = started.stdout.readline()
+        url, page, description = re.findall(r"http://127\.0\.0\.1:[0-9]+[a-z/]*", told)
+        assert (page, description) == (f"{url}/", f"{url}/docs")
+        for place in (page, description):
+            assert httpx.get(place, trust_env=False, timeout=60).status_code == 200
+        started.terminate()
+        assert started.wait(60) == 0
+
+
+def test_a_load_test_says_what_its_rate_is() -> None:
+    assert "on average" in " ".join(ran("loadtest", "--help").split())
 
 
 def test_a_request_can_be_planned_for_without_a_service(tmp_path: Path) -> None:
