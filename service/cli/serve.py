@@ -16,8 +16,8 @@ from service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, told
 
 _TURN_S: Final = 0.0001
 """After which a thread that computes in Python lets others go on. The engine's thread asks for its turn many
-times in a pass: beside a thread that checks a body, plans took 3.6 times as long with Python's own 5 ms, and
-take 2.1 times as long with this."""
+times in a pass: beside a thread that checks a body, plans took 3 to 5 times as long with Python's own 5 ms,
+and take twice as long with this."""
 _INDENTED: Final[Any] = {"initial_indent": "    ", "subsequent_indent": "    "}
 
 
