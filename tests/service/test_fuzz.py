@@ -80,7 +80,7 @@ def test_nothing_described_can_break_the_service(
     run(served, key, tmp_path, (*options, "--checks", "all"), "tests.service.fuzz_hooks", 300)
 
 
-@pytest.mark.skipif("LOOKTWICE_TEST_COVERAGE" not in os.environ, reason="8,000 requests take a while")
+@pytest.mark.skipif("LOOKTWICE_TEST_COVERAGE" not in os.environ, reason="thousands of requests take a while")
 def test_nothing_around_whole_scenes_can_break_the_service(tmp_path: Path, scene_file: Path) -> None:
     """Its coverage phase, in JSON, msgpack and multipart.
 
