@@ -245,4 +245,6 @@ def _track(asked: wire_scores.ScoredAgent, pointer: str) -> TrackedBox:
     if not np.isfinite(poses).any():
         raise at(INVALID_LABELS, f"{pointer}/poses", "has no future: none of its poses is there")
     speed = first_speed_mps(poses) if asked.speed_mps is None else asked.speed_mps
-    return TrackedBox(asked.agent_id, asked.kind != "static", asked.length_m, asked.width_m, poses, speed)
+    return TrackedBox(
+        asked.agent_id, asked.kind != "static", asked.length_m, asked.width_m, poses, speed, asked.kind
+    )

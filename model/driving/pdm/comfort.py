@@ -37,10 +37,13 @@ MAX_LONGITUDINAL_JERK: Final = 4.13
 MAX_YAW_RATE: Final = 0.95
 MAX_YAW_ACCELERATION: Final = 1.93
 
-EXTENDED_ACCELERATION: Final = 0.7
-EXTENDED_JERK: Final = 0.5
-EXTENDED_YAW_RATE: Final = 0.1
-EXTENDED_YAW_ACCELERATION: Final = 0.1
+EXTENDED: Final = (
+    ("acceleration_change", 0.7),
+    ("jerk_change", 0.5),
+    ("yaw_rate_change", 0.1),
+    ("yaw_acceleration_change", 0.1),
+)
+"""The bounds of extended comfort, in SI units."""
 
 MOST_SECONDS_BETWEEN: Final = 0.55
 _DECIMALS: Final = 8
@@ -61,28 +64,70 @@ class Comfort:
     bound: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class Excess:
+    """A bound that a plan breaks: its name, the plan's worst value, and the limit that it is beyond."""
+
+    bound: str
+    value: float
+    limit: float
+
+
 def comfort(states: Array, vehicle: Vehicle, version: Version, past: Array | None = None) -> Comfort:
     """Comfort of simulated ``states`` [n, 41, 11], with the ``past`` [h, 11] before them in v2.2."""
-    before = 0
-    if past is not None:
-        # NAVSIM leaves the last of them out: its past ends at -0.2 s, and the plan begins at 0 s.
-        past = past[:-1].copy()
-        # ... and knows no turn: nuPlan's interpolated states have none.
-        past[:, [YAW_RATE, YAW_ACCELERATION]] = 0.0
-        before = len(past)
-        repeated = np.broadcast_to(past, (len(states), *past.shape))
-        states = np.concatenate([repeated, states], axis=1)
-    names, broken = zip(*_bounds(states, vehicle, version), strict=True)
+    states, before = _behind(states, past)
+    bounds = _bounds(states, vehicle, version)
+    broken = [each.broken for each in bounds]
     first = np.stack([np.where(each.any(axis=1), each.argmax(axis=1), states.shape[1]) for each in broken])
     worst = first.argmin(axis=0)
     earliest = first.min(axis=0)
     holds = earliest == states.shape[1]
-    bound = tuple("" if fine else names[kind] for fine, kind in zip(holds, worst, strict=True))
+    bound = tuple("" if fine else bounds[kind].name for fine, kind in zip(holds, worst, strict=True))
     return Comfort(holds, np.where(holds, -1, np.maximum(earliest - before, 0)), bound)
 
 
-def _bounds(states: Array, vehicle: Vehicle, version: Version) -> list[tuple[str, BoolArray]]:
-    """Each bound's name, and bool [n, t] where it is broken."""
+def excesses(states: Array, vehicle: Vehicle, version: Version, past: Array | None = None) -> list[Excess]:
+    """The bounds that one plan's ``states`` [1, 41, 11] break, and its worst values; see `comfort`."""
+    found = []
+    for bound in _bounds(_behind(states, past)[0], vehicle, version):
+        if bound.broken.any():
+            values = bound.values[0]
+            above, below = values - bound.high, bound.low - values
+            worst = int(np.maximum(above, below).argmax())
+            limit = bound.high if above[worst] >= below[worst] else bound.low
+            found.append(Excess(bound.name, float(values[worst]), limit))
+    return found
+
+
+def _behind(states: Array, past: Array | None) -> tuple[Array, int]:
+    """States with the past before them, and how many rows of it there are."""
+    if past is None:
+        return states, 0
+    # NAVSIM leaves the last of them out: its past ends at -0.2 s, and the plan begins at 0 s.
+    past = past[:-1].copy()
+    # ... and knows no turn: nuPlan's interpolated states have none.
+    past[:, [YAW_RATE, YAW_ACCELERATION]] = 0.0
+    repeated = np.broadcast_to(past, (len(states), *past.shape))
+    return np.concatenate([repeated, states], axis=1), len(past)
+
+
+@dataclass(frozen=True, eq=False)
+class _Bound:
+    """What a bound holds, [n, t], and between which values."""
+
+    name: str
+    values: Array
+    low: float
+    high: float
+
+    @property
+    def broken(self) -> BoolArray:
+        result: BoolArray = ~((self.values > self.low) & (self.values < self.high))
+        return result
+
+
+def _bounds(states: Array, vehicle: Vehicle, version: Version) -> list[_Bound]:
+    """All bounds, in the order in which they are told."""
     count = states.shape[1]
     longitudinal, lateral = states[..., ACCELERATION], states[..., ACCELERATION_Y]
     magnitude = np.hypot(longitudinal, lateral)
@@ -97,20 +142,16 @@ def _bounds(states: Array, vehicle: Vehicle, version: Version) -> list[tuple[str
     longitudinal, lateral = _smooth(longitudinal, window, 2), _smooth(lateral, window, 2)
     heading = _unwrapped(states[..., HEADING])
 
-    def beyond(values: Array, most: float) -> BoolArray:
-        result: BoolArray = ~((values > -most) & (values < most))
-        return result
+    def within(name: str, values: Array, most: float) -> _Bound:
+        return _Bound(name, values, -most, most)
 
     return [
-        (
-            "longitudinal_acceleration",
-            ~((longitudinal > MIN_ACCELERATION) & (longitudinal < MAX_ACCELERATION)),
-        ),
-        ("lateral_acceleration", beyond(lateral, MAX_LATERAL_ACCELERATION)),
-        ("jerk", beyond(jerk, MAX_JERK)),
-        ("longitudinal_jerk", beyond(longitudinal_jerk, MAX_LONGITUDINAL_JERK)),
-        ("yaw_acceleration", beyond(_smooth(heading, 5, 3, 2), MAX_YAW_ACCELERATION)),
-        ("yaw_rate", beyond(_smooth(heading, 5, 2, 1), MAX_YAW_RATE)),
+        _Bound("longitudinal_acceleration", longitudinal, MIN_ACCELERATION, MAX_ACCELERATION),
+        within("lateral_acceleration", lateral, MAX_LATERAL_ACCELERATION),
+        within("jerk", jerk, MAX_JERK),
+        within("longitudinal_jerk", longitudinal_jerk, MAX_LONGITUDINAL_JERK),
+        within("yaw_acceleration", _smooth(heading, 5, 3, 2), MAX_YAW_ACCELERATION),
+        within("yaw_rate", _smooth(heading, 5, 2, 1), MAX_YAW_RATE),
     ]
 
 
@@ -125,16 +166,30 @@ def extended_comfort(states: Array, previous: Array, seconds_between: float) -> 
     Raises:
         ScoreError: moments too far apart.
     """
+    result = np.ones(len(states), dtype=np.bool_)
+    for change, (_, bound) in zip(_changes(states, previous, seconds_between), EXTENDED, strict=True):
+        result &= change <= bound
+    return result
+
+
+def extended_excesses(states: Array, previous: Array, seconds_between: float) -> list[Excess]:
+    """The bounds of `extended_comfort` that one plan's ``states`` [1, 41, 11] break."""
+    changes = _changes(states, previous, seconds_between)
+    return [
+        Excess(name, float(change[0]), bound)
+        for change, (name, bound) in zip(changes, EXTENDED, strict=True)
+        if not change[0] <= bound
+    ]
+
+
+def _changes(states: Array, previous: Array, seconds_between: float) -> list[Array]:
+    """Of each feature the root of the mean square by which plans differ from the one before, [n] each."""
     if not STEP_S / 2 <= seconds_between < MOST_SECONDS_BETWEEN:
         raise ScoreError("previous", f"lies {STEP_S} to {MOST_SECONDS_BETWEEN} s back, not {seconds_between}")
     shift = round(seconds_between / STEP_S)
     earlier = np.broadcast_to(previous, states.shape)
     ours, theirs = (_features(each) for each in (states[:, :-shift], earlier[:, shift:]))
-    bounds = (EXTENDED_ACCELERATION, EXTENDED_JERK, EXTENDED_YAW_RATE, EXTENDED_YAW_ACCELERATION)
-    result = np.ones(len(states), dtype=np.bool_)
-    for one, other, bound in zip(ours, theirs, bounds, strict=True):
-        result &= np.sqrt(((one - other) ** 2).mean(axis=1)) <= bound
-    return result
+    return [np.sqrt(((one - other) ** 2).mean(axis=1)) for one, other in zip(ours, theirs, strict=True)]
 
 
 def _features(states: Array) -> tuple[Array, Array, Array, Array]:

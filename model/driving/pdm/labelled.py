@@ -130,7 +130,13 @@ def _track(agent: Agent) -> TrackedBox:
     poses = _ahead(agent).astype(np.float64)
     is_agent = agent.kind in ("vehicle", "pedestrian")
     return TrackedBox(
-        str(agent.agent_id), is_agent, agent.length_m, agent.width_m, poses, first_speed_mps(poses)
+        str(agent.agent_id),
+        is_agent,
+        agent.length_m,
+        agent.width_m,
+        poses,
+        first_speed_mps(poses),
+        agent.kind,
     )
 
 

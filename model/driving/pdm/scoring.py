@@ -101,6 +101,7 @@ class Scores:
         failures: of each sub-score with a time of failure.
         states: [n, 41, 11], simulated.
         progress_m: [n], before it is set in relation; None without a centre line.
+        reference_m: the reference's progress times what its factors are; None where it was not measured.
     """
 
     version: Version
@@ -112,6 +113,7 @@ class Scores:
     failures: Mapping[str, Failures]
     states: Array
     progress_m: Array | None
+    reference_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +185,7 @@ def score_states(world: World, states: Array, version: Version, others: Others =
     besides = (others.reference is not None) + (others.human is not None)
     subs = {name: None if value is None else value[besides:] for name, value in every.items()}
     own = states[besides:]
-    against = None
+    against, best = None, None
     if others.reference is not None and gained is not None:
         best = float(gained[0] * product[0])
         subs[PROGRESS] = progress_scores(gained[besides:], product[besides:], best, version)
@@ -199,7 +201,7 @@ def score_states(world: World, states: Array, version: Version, others: Others =
     complete = np.where(undecided | bool(missing), np.nan, partial)
     kept = {name: each.without(besides) for name, each in failures.items()}
     metres = None if gained is None else gained[besides:]
-    return Scores(version, subs, complete, partial, missing, against, kept, own, metres)
+    return Scores(version, subs, complete, partial, missing, against, kept, own, metres, best)
 
 
 def _forgive(subs: dict[str, Array | None], human: Mapping[str, float]) -> None:

@@ -143,6 +143,7 @@ class TrackedBox:
         length_m, width_m: the box; length lies along the heading.
         poses: float64 [t, 3] (x, y, heading) of the box's centre from now on at 10 Hz; NaN where absent.
         first_speed_mps: its speed when it is first there.
+        kind: what it is, for people; it changes no score.
     """
 
     track_id: str
@@ -151,6 +152,7 @@ class TrackedBox:
     width_m: float
     poses: Array
     first_speed_mps: float
+    kind: str = ""
 
     def __post_init__(self) -> None:
         if self.poses.ndim != 2 or self.poses.shape[1] != 3:

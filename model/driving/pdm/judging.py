@@ -1,0 +1,99 @@
+"""From scores to judged plans: facts, courses and waypoints of each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from model.driving.pdm.course import course_of
+from model.driving.pdm.failures import facts_of
+from model.driving.pdm.judged import THRESHOLD, JudgedPlan, Waypoint
+from model.driving.pdm.scoring import Others, Scores
+from model.driving.pdm.world import ACCELERATION, Array, ScoreError, World
+
+_EVERY: Final = {8: 1, 64: 5}
+"""Waypoints are told every half a second."""
+_WAYPOINTS: Final = 8
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a planner says of one plan: in words, and how it came to it; None where it says nothing."""
+
+    words: str | None = None
+    think: str | None = None
+
+
+_NOTHING: Final = Said()
+
+
+def judged_plans(
+    world: World,
+    plans: Array,
+    scores: Scores,
+    others: Others,
+    *,
+    threshold: float = THRESHOLD,
+    truth: Array | None = None,
+    said: Sequence[Said] | None = None,
+    command: str | None = None,
+    centre: bool = False,
+) -> list[JudgedPlan]:
+    """Each plan with what a teacher is told of it.
+
+    Args:
+        world, plans, others: as they were scored.
+        scores: what came of it.
+        threshold: from which score on a plan is correct, 0 to 1.
+        truth: [8, 3] or [64, 3], what the human drove.
+        said: of each plan.
+        command: where the ego is to go.
+        centre: whether poses are those of the box's centre instead of the rear axle.
+
+    Raises:
+        ScoreError: a plan of which no sub-score is known.
+    """
+    if not 0.0 <= threshold <= 1.0:
+        raise ScoreError("threshold", f"lies between 0 and 1, not at {threshold}")
+    facts = facts_of(world, scores, others)
+    ahead_m = world.vehicle.centre_m if centre else 0.0
+    true_course = None if truth is None else course_of(truth, world.ego, ahead_m)
+    judged = []
+    for row, plan in enumerate(plans):
+        whole, partial = float(scores.score[row]), float(scores.partial_score[row])
+        if np.isnan(partial):
+            raise ScoreError(f"plans/{row}", "cannot be judged: the labels lack what any sub-score needs")
+        own = _NOTHING if said is None else said[row]
+        judged.append(
+            JudgedPlan(
+                version=scores.version,
+                score=partial if np.isnan(whole) else whole,
+                is_partial=bool(np.isnan(whole)),
+                threshold=threshold,
+                sub_scores={
+                    name: None if values is None or np.isnan(values[row]) else float(values[row])
+                    for name, values in scores.sub_scores.items()
+                },
+                facts=facts[row],
+                acceleration_mps2=float(world.ego[ACCELERATION]),
+                course=course_of(plan, world.ego, ahead_m),
+                waypoints=_waypoints(plan),
+                true_course=true_course,
+                true_waypoints=() if truth is None else _waypoints(truth),
+                command=command,
+                words=own.words,
+                think=own.think,
+            )
+        )
+    return judged
+
+
+def _waypoints(plan: Array) -> tuple[Waypoint, ...]:
+    every = _EVERY[len(plan)]
+    told = plan[every - 1 :: every][:_WAYPOINTS]
+    return tuple(
+        Waypoint(0.5 * number, float(x), float(y)) for number, (x, y) in enumerate(told[:, :2], start=1)
+    )
