@@ -24,7 +24,7 @@ import msgpack
 from httpx_sse import EventSource
 from pydantic import BaseModel
 
-from clients import wire, wire_scores
+from clients import wire, wire_feedback, wire_scores
 from clients.answers import (
     BUSY_STATUSES,
     BadAnswer,
@@ -233,6 +233,10 @@ class PlannerClient:
         """Score trajectories by NAVSIM's rules; raises `PlannerError`."""
         return read(self._ask("/v1/score", request), wire_scores.ScoreResponse)
 
+    def feedback(self, request: wire_feedback.FeedbackRequest) -> wire_feedback.FeedbackResponse:
+        """Have trajectories judged, and be told why they fail; raises `PlannerError`."""
+        return read(self._ask("/v1/feedback", request), wire_feedback.FeedbackResponse)
+
     def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""
         return self._model_list().models
@@ -353,6 +357,10 @@ class AsyncPlannerClient:
     async def score(self, request: wire_scores.ScoreRequest) -> wire_scores.ScoreResponse:
         """Score trajectories by NAVSIM's rules; raises `PlannerError`."""
         return read(await self._ask("/v1/score", request), wire_scores.ScoreResponse)
+
+    async def feedback(self, request: wire_feedback.FeedbackRequest) -> wire_feedback.FeedbackResponse:
+        """Have trajectories judged, and be told why they fail; raises `PlannerError`."""
+        return read(await self._ask("/v1/feedback", request), wire_feedback.FeedbackResponse)
 
     async def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""

@@ -22,6 +22,7 @@ from service.problems import (
     INTERNAL,
     INVALID_CLIP,
     INVALID_CONTROLS,
+    INVALID_FEEDBACK,
     INVALID_HISTORY,
     INVALID_JSON,
     INVALID_LABELS,
@@ -58,7 +59,11 @@ _KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], Kind]]] = (
     (("controls", "prefill"), INVALID_PLAN),
     (("controls",), INVALID_CONTROLS),
     (("labels",), INVALID_LABELS),
-    *(((field,), INVALID_TRAJECTORY) for field in ("trajectories", "reference", "previous", "human")),
+    *(
+        ((field,), INVALID_TRAJECTORY)
+        for field in ("trajectories", "reference", "previous", "human", "ground_truth")
+    ),
+    (("said", "written"), INVALID_FEEDBACK),
 )
 _KIND_BY_STATUS: Final = {
     kind.status: kind

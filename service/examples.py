@@ -68,3 +68,16 @@ def example_score() -> dict[str, Any]:
         "reference": straight(8.0, brake=1.0),
         "against": "idm",
     }
+
+
+def example_feedback() -> dict[str, Any]:
+    """The same trajectories with what was thought of the one that does not brake, and what was driven."""
+    asked = example_score()
+    think = "The road is straight and clear. I keep my speed."
+    return {
+        "labels": asked["labels"],
+        "trajectories": asked["trajectories"],
+        "ground_truth": asked["reference"],
+        "said": [None, {"think": think}],
+        "command": "go straight on",
+    }

@@ -157,6 +157,12 @@ class Metrics:
             ["teacher", "check"],
             registry=registry,
         )
+        self._feedback = Counter(
+            "looktwice_feedback",
+            "Trajectories that feedback was given on, by who wrote it and whether they were correct.",
+            ["teacher", "verdict"],
+            registry=registry,
+        )
         self._teacher_tokens = Counter(
             "looktwice_teacher_tokens",
             "Tokens of teachers' answers, taken or not, as the teachers count.",
@@ -253,6 +259,15 @@ class Metrics:
         """Count one question to a teacher, and the checks that its answers failed."""
         if written:
             self._labels.labels(teacher).inc()
+        for check in failed:
+            self._label_checks_failed.labels(teacher, check).inc()
+
+    def feedback_told(self, teacher: str, *, correct: bool) -> None:
+        """Count feedback on one trajectory."""
+        self._feedback.labels(teacher, "correct" if correct else "wrong").inc()
+
+    def feedback_failed(self, teacher: str, failed: Iterable[str]) -> None:
+        """Count the checks that a teacher's feedback did not pass."""
         for check in failed:
             self._label_checks_failed.labels(teacher, check).inc()
 

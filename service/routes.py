@@ -15,6 +15,7 @@ from service.admission import Admission
 from service.answers import model_card
 from service.auth import NOBODY
 from service.callers import while_connected
+from service.feedback_routes import feedback_router
 from service.labelling import label, teacher_name
 from service.openai_routes import openai_router
 from service.openapi import PACKED, Responses, payloads, problems
@@ -78,7 +79,9 @@ def make_router(parts: Parts) -> APIRouter:
     router.include_router(openai_router(parts))
     _add_labelling(router, parts)
     bundled = BundledScenes(parts.settings.bundled_scenes)
-    router.include_router(scoring_router(parts))
+    scoring = Admission(parts.settings.max_scenes, parts.settings.max_scenes, time.monotonic)
+    router.include_router(scoring_router(parts, scoring))
+    router.include_router(feedback_router(parts, scoring))
     _add_models(router, parts)
     _add_probes(router, parts)
     _add_scenes(router, parts, bundled)

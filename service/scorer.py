@@ -18,8 +18,12 @@ import traceback
 from pathlib import Path
 from typing import BinaryIO, Final
 
+from pydantic import BaseModel
+
+import clients.wire_feedback as wire_feedback
 import clients.wire_scores as wire_scores
 from clients.wire import Fault
+from service.feedback import Given, feedback_given
 from service.problems import INVALID_LABELS, KINDS, ProblemError
 from service.scoring import scored
 from service.views import BundledScenes
@@ -31,7 +35,8 @@ MAX_CPU_S: Final = 20
 _PATIENCE_S: Final = 3 * MAX_CPU_S
 """On a machine that is busy otherwise."""
 _LENGTH: Final = struct.Struct(">I")
-_SCORED, _REFUSED, _FAILED = b"s", b"r", b"f"
+_DONE, _REFUSED, _FAILED = b"d", b"r", b"f"
+_SCORE, _FEEDBACK = "score", "feedback"
 _RUN: Final = "import sys; from pathlib import Path; from service.scorer import main; main(Path(sys.argv[1]))"
 
 
@@ -53,7 +58,19 @@ class Scorer:
         Raises:
             ProblemError: what `scored` refuses, and what takes too much to be scored.
         """
-        content = json.dumps([request_id, asked.model_dump()]).encode()
+        told = await self._work(_SCORE, asked, request_id)
+        return wire_scores.ScoreResponse.model_validate_json(told)
+
+    async def feedback(self, asked: wire_feedback.FeedbackRequest, request_id: str) -> Given:
+        """Feedback by rule on one request's trajectories, and what another teacher would be asked.
+
+        Raises:
+            ProblemError: what `feedback_given` refuses, and what takes too much to be scored.
+        """
+        return Given.of_json(await self._work(_FEEDBACK, asked, request_id))
+
+    async def _work(self, what: str, asked: BaseModel, request_id: str) -> bytes:
+        content = json.dumps([what, request_id, asked.model_dump()]).encode()
         async with self._turn:
             try:
                 async with asyncio.timeout(_PATIENCE_S):
@@ -64,8 +81,8 @@ class Scorer:
             except BaseException:
                 await self._end()
                 raise
-        if kind == _SCORED:
-            return wire_scores.ScoreResponse.model_validate_json(told)
+        if kind == _DONE:
+            return told
         if kind == _REFUSED:
             slug, detail, faults = json.loads(told)
             raise ProblemError(
@@ -118,10 +135,13 @@ def main(bundled: Path) -> None:
 
 
 def _answer(content: bytes, scenes: BundledScenes) -> tuple[bytes, bytes]:
-    request_id, document = json.loads(content)
+    what, request_id, document = json.loads(content)
     try:
+        if what == _FEEDBACK:
+            wanted = wire_feedback.FeedbackRequest.model_validate(document)
+            return _DONE, feedback_given(wanted, scenes, request_id).to_json()
         asked = wire_scores.ScoreRequest.model_validate(document)
-        return _SCORED, scored(asked, scenes, request_id).model_dump_json().encode()
+        return _DONE, scored(asked, scenes, request_id).model_dump_json().encode()
     except ProblemError as problem:
         return _REFUSED, _refusal(problem)
     except MemoryError:

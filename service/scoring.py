@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
 import numpy as np
@@ -46,6 +46,24 @@ _DECIMALS: Final = 6
 EXPERT: Final = "expert"
 
 
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """A request's trajectories with their scores.
+
+    Attributes:
+        world, plans, scores, others: as they were scored.
+        centre: whether poses are those of the box's centre.
+        expert: [64, 3], of a bundled scene; None of a caller's own labels.
+    """
+
+    world: World
+    plans: Array
+    scores: Scores
+    others: Others
+    centre: bool
+    expert: Array | None
+
+
 def scored(
     asked: wire_scores.ScoreRequest, bundled: BundledScenes, request_id: str
 ) -> wire_scores.ScoreResponse:
@@ -54,21 +72,29 @@ def scored(
     Raises:
         ProblemError: labels or trajectories that cannot be scored, an unknown scene.
     """
+    found = scores_of(asked, bundled)
+    return answer(found.world, found.scores, request_id)
+
+
+def scores_of(asked: wire_scores.ScoreRequest, bundled: BundledScenes) -> Scored:
+    """The scores of one request; raises as `scored` does."""
     centre = asked.point == "centre"
     against = asked.against
-    reference = None if asked.reference is None else _trajectory(asked.reference, "/reference")
+    expert = None
+    reference = None if asked.reference is None else trajectory_of(asked.reference, "/reference")
     if asked.labels is not None:
         world = _world(asked.labels, _vehicle(asked.vehicle), centre=centre)
     else:
         labelled = bundled.one(asked.scene_id or "")
         world, centre = world_of(labelled), True
+        expert = plans_of(labelled.future)
         if reference is None:
-            reference, against = plans_of(labelled.future), EXPERT
+            reference, against = expert, EXPERT
     plans = _trajectories(asked.trajectories)
     others = Others(
         reference,
         against,
-        human=None if asked.human is None else _trajectory(asked.human, "/human"),
+        human=None if asked.human is None else trajectory_of(asked.human, "/human"),
     )
     if asked.previous is not None:
         others = replace(
@@ -84,15 +110,15 @@ def scored(
         raise at(INVALID_LABELS, f"/labels/{error.place}", error.detail) from None
     except SolveError as error:
         raise at(INVALID_TRAJECTORY, "/trajectories", f"cannot be followed: {error}") from None
-    return answer(world, found, request_id)
+    return Scored(world, plans, found, others, centre, expert)
 
 
 def answer(world: World, found: Scores, request_id: str) -> wire_scores.ScoreResponse:
     """Scores as the contract tells them."""
     failures = failures_of(world, found)
-    subs = {name: _told(values, len(found.score)) for name, values in found.sub_scores.items()}
-    totals, partial = _told(found.score, len(found.score)), _told(found.partial_score, len(found.score))
-    progress = _told(found.progress_m, len(found.score))
+    subs = {name: rounded(values, len(found.score)) for name, values in found.sub_scores.items()}
+    totals, partial = rounded(found.score, len(found.score)), rounded(found.partial_score, len(found.score))
+    progress = rounded(found.progress_m, len(found.score))
     return wire_scores.ScoreResponse(
         request_id=request_id,
         version=found.version,
@@ -120,7 +146,8 @@ def answer(world: World, found: Scores, request_id: str) -> wire_scores.ScoreRes
     )
 
 
-def _told(values: Array | None, count: int) -> Sequence[float | None]:
+def rounded(values: Array | None, count: int) -> Sequence[float | None]:
+    """Values [n] as they are told: None where they are not known."""
     if values is None:
         return [None] * count
     return [None if math.isnan(value) else round(value, _DECIMALS) for value in values.tolist()]
@@ -134,7 +161,8 @@ def _trajectories(asked: list[list[list[float]]]) -> Array:
     return np.array(asked, dtype=np.float64)
 
 
-def _trajectory(asked: list[list[float]], pointer: str) -> Array:
+def trajectory_of(asked: list[list[float]], pointer: str) -> Array:
+    """A trajectory [8, 3] or [64, 3]; raises `ProblemError` at ``pointer`` for one of another length."""
     _check_length(asked, pointer)
     return np.array(asked, dtype=np.float64)
 
@@ -162,7 +190,7 @@ def _ego(asked: wire_scores.EgoMotion, vehicle: Vehicle, *, centre: bool) -> Arr
 
 def _previous(asked: wire_scores.PreviousPlan, vehicle: Vehicle, *, centre: bool) -> Array:
     pointer = "/previous/trajectory"
-    plan, ego = _trajectory(asked.trajectory, pointer), _ego(asked.ego, vehicle, centre=centre)
+    plan, ego = trajectory_of(asked.trajectory, pointer), _ego(asked.ego, vehicle, centre=centre)
     try:
         states: Array = simulate(reference_poses(plan[None], vehicle, ego, centre=centre), vehicle, ego)[0]
     except (ScoreError, SolveError) as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from typing import Annotated, Any, Final
 
 import structlog
@@ -43,16 +42,15 @@ from service.problems import (
 log = structlog.stdlib.get_logger()
 
 EXAMPLES: Final[dict[str, Example]] = {"straight on behind a car": {"value": example_score()}}
-_REFUSALS: Final = (
+SCORING_REFUSALS: Final = (
     *(INVALID_JSON, INVALID_BODY, UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE),
     *(INVALID_REQUEST, UNKNOWN_FIELD, INVALID_LABELS, INVALID_TRAJECTORY, UNKNOWN_SCENE),
     *(QUEUE_FULL, RATE_LIMITED, SCENES_UNREADABLE, DRAINING),
 )
 
 
-def scoring_router(parts: Parts) -> APIRouter:
-    """The endpoints of the scorer."""
-    admission = Admission(parts.settings.max_scenes, parts.settings.max_scenes, time.monotonic)
+def scoring_router(parts: Parts, admission: Admission) -> APIRouter:
+    """The endpoints of the scorer; ``admission`` bounds how many requests it has."""
 
     def check_open(_: Request) -> None:
         parts.lifecycle.check_accepting()
@@ -75,7 +73,7 @@ def scoring_router(parts: Parts) -> APIRouter:
         return wire_scores.ScoreResult(status=failure.kind.status, problem=document)
 
     router = APIRouter(route_class=payload_route(check_open), tags=["scoring"])
-    refusals = problems(*_REFUSALS)
+    refusals = problems(*SCORING_REFUSALS)
 
     @router.post(
         "/v1/score",

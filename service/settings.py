@@ -95,7 +95,7 @@ class TeacherSettings(BaseSettings):
     Attributes:
         kind: ``rules`` is built in; ``openai`` is any endpoint that speaks OpenAI's chat completions.
         base_url, model, api_key, temperature, max_tokens, timeout_s, input_price_usd, output_price_usd,
-            extra_body, reflection: of the endpoint, see `OpenAiSettings`.
+            extra_body, reflection, feedback_max_tokens: of the endpoint, see `OpenAiSettings`.
     """
 
     model_config = SettingsConfigDict(env_prefix="LOOKTWICE_TEACHER_", frozen=True, extra="ignore")
@@ -111,6 +111,7 @@ class TeacherSettings(BaseSettings):
     output_price_usd: float = Field(default=0.0, ge=0)
     extra_body: dict[str, Any] = {}
     reflection: ReflectionLanguage = "free_text"
+    feedback_max_tokens: int = Field(default=900, gt=0)
 
     def teacher(self) -> Teacher:
         """The teacher that is set; raises `ValueError` where something is missing."""

@@ -15,7 +15,7 @@ MOST_WORDS: Final = 80
 MOST_CHARACTERS: Final = 2000
 """Far more than so many words have. The time of the checks grows with the square of a text's length."""
 
-Check = Literal["answer", "form", "length", "leak", "anchor", "direction"]
+Check = Literal["answer", "form", "length", "leak", "anchor", "direction", "number"]
 
 _MARKUP: Final = re.compile(
     r"[*`#|<>\[\]{}~\\]|^\s*(?:[-+\u2022]|\d+[.)])\s|__|https?://|"

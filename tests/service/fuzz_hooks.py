@@ -12,13 +12,16 @@ import schemathesis
 from pydantic import ValidationError
 
 import clients.wire as wire
+from clients.wire_feedback import FeedbackRequest
 from clients.wire_scores import ScoreRequest
-from service.examples import example_score
+from service.examples import example_feedback, example_score
 from service.openai_chat import ChatRequest
 from tests.service.serving import body
 
 REAL = body()["scene"]
 SCORED = {"scene_id": None, **example_score()}
+JUDGED = {"scene_id": None, **example_feedback()}
+_JUDGED_ONLY = {"said", "threshold", "mode", "command", "ground_truth"}
 PICTURES = [
     {"type": "image_url", "image_url": {"url": f"data:image/jpeg;base64,{image}"}}
     for clip in REAL["clips"]
@@ -40,6 +43,8 @@ def map_body(context: Any, body: Any) -> Any:
     for request in requests:
         if isinstance(request, dict) and len(str(request)) % 2 and _is_of_the_schema(ScoreRequest, request):
             request.update(SCORED)
+        if isinstance(request, dict) and _JUDGED_ONLY & request.keys() and len(str(request)) % 2:
+            request.update(JUDGED if _is_of_the_schema(FeedbackRequest, request) else {})
         scene = request.get("scene") if isinstance(request, dict) else None
         if isinstance(scene, dict) and len(str(request)) % 2 and _is_of_the_schema(wire.Scene, scene):
             scene.update({part: REAL[part] for part in ("clips", "history", "route")})

@@ -70,6 +70,11 @@ WHOLE: dict[tuple[str, str], dict[str, Any]] = {
     ("ScoreRequest", "trajectories"): _one(_SCORE["trajectories"]),
     ("ScoreRequest", "reference"): _one(_SCORE["reference"], None),
     ("ScoreRequest", "human"): _one(_SCORE["reference"], None),
+    ("FeedbackRequest", "trajectories"): _one(_SCORE["trajectories"]),
+    **{
+        ("FeedbackRequest", field): _one(_SCORE["reference"], None)
+        for field in ("reference", "human", "ground_truth")
+    },
 }
 """What the description says instead, by the title of a schema and the name of a field in it."""
 

@@ -23,7 +23,7 @@ CHECKS = (
     *("not_a_server_error", "status_code_conformance", "content_type_conformance"),
     *("response_schema_conformance", "response_headers_conformance"),
 )
-WITH_SCENES = "^/v1/(plan|plan/batch|reflect|label|score|score/batch|chat/completions)$"
+WITH_SCENES = "^/v1/(plan|plan/batch|reflect|label|score|score/batch|feedback|chat/completions)$"
 CONFIG = """
 # That a picture is one, and that a history can be driven, no schema can say: such bodies get a 422.
 [checks]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import httpx
@@ -14,6 +14,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from clients.answers import retry_after_s
 from clients.labelling.checks import FailedCheck
 from clients.labelling.teachers.facts import RESPONSE_FORMAT, phrases_of
+from clients.labelling.teachers.feedback import (
+    FEEDBACK_PROMPT_VERSION,
+    FEEDBACK_SYSTEM,
+    FeedbackQuestion,
+)
 from clients.labelling.teachers.prompt import PROMPT_VERSION, SYSTEM, Part, Text, user_message
 from clients.labelling.teachers.teacher import (
     Answer,
@@ -49,6 +54,7 @@ class OpenAiSettings:
         extra_body: more fields of the request, such as an endpoint's own sampling options; null takes a
             field out.
         reflection: what it is to write: a paragraph, or facts (JSON) that are brought into phrases.
+        feedback_max_tokens: of the five sections of feedback, which are longer than a paragraph.
     """
 
     base_url: str
@@ -61,6 +67,7 @@ class OpenAiSettings:
     output_price_usd: float = 0.0
     extra_body: Mapping[str, Any] = field(default_factory=dict)
     reflection: ReflectionLanguage = "free_text"
+    feedback_max_tokens: int = 900
 
 
 class _Message(BaseModel):
@@ -112,9 +119,28 @@ class OpenAiTeacher:
         extra = "".join(f", {name}={value}" for name, value in sorted(settings.extra_body.items()))
         return told + extra + ", in phrases" * (settings.reflection == "phrases")
 
+    @property
+    def feedback_revision(self) -> str:
+        """The same of feedback."""
+        settings = self._settings
+        told = f"feedback prompt {FEEDBACK_PROMPT_VERSION}, temperature {settings.temperature:g}"
+        extra = "".join(f", {name}={value}" for name, value in sorted(settings.extra_body.items()))
+        return f"{told}, {settings.feedback_max_tokens} tokens{extra}"
+
     async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
         """See `Teacher.reflect`."""
-        body = completion_request(self._settings, question, complaints)
+        content = await self._complete(completion_request(self._settings, question, complaints))
+        return completion_answer(self._settings, content)
+
+    async def write_feedback(
+        self, question: FeedbackQuestion, complaints: Sequence[FailedCheck] = ()
+    ) -> Answer:
+        """See `FeedbackTeacher.write_feedback`."""
+        content = await self._complete(feedback_request(self._settings, question, complaints))
+        return completion_answer(replace(self._settings, reflection="free_text"), content)
+
+    async def _complete(self, body: Mapping[str, Any]) -> bytes:
+        """What the endpoint answers; raises `TeacherError`."""
         try:
             async with asyncio.timeout(self._settings.timeout_s):
                 response = await self._answer(body)
@@ -130,7 +156,7 @@ class OpenAiTeacher:
             raise TeacherClosed(_told(response))
         if status != 200:
             raise TeacherError(_told(response))
-        return completion_answer(self._settings, response.content)
+        return response.content
 
     async def _answer(self, body: Mapping[str, Any]) -> httpx.Response:
         """The response with its whole body; raises `TeacherError` for one that no completion needs."""
@@ -170,6 +196,26 @@ def completion_request(
         # Another try gets other random numbers.
         "seed": question.seed + len(complaints),
         "response_format": RESPONSE_FORMAT if settings.reflection == "phrases" else None,
+        **settings.extra_body,
+    }
+    return {name: value for name, value in body.items() if value is not None}
+
+
+def feedback_request(
+    settings: OpenAiSettings, question: FeedbackQuestion, complaints: Sequence[FailedCheck] = ()
+) -> dict[str, Any]:
+    """The body of POST /chat/completions for a question about a failed plan."""
+    told = "".join(f"\n- {each.detail}" for each in dict.fromkeys(complaints))
+    again = f"\n\nYou wrote feedback before that cannot be used. This time:{told}" if told else ""
+    body = {
+        "model": settings.model,
+        "messages": [
+            {"role": "system", "content": FEEDBACK_SYSTEM},
+            {"role": "user", "content": question.prompt + again},
+        ],
+        "temperature": settings.temperature,
+        "max_tokens": settings.feedback_max_tokens,
+        "seed": len(complaints),
         **settings.extra_body,
     }
     return {name: value for name, value in body.items() if value is not None}

@@ -255,24 +255,25 @@ class _Case:
     def _other(self, track: TrackedBox, step: int, ahead: int) -> Other:
         """``track`` when the plan fails; or ``ahead`` steps later, where it is not there yet."""
         kind = track.kind or ("road user" if track.is_agent else "obstacle")
-        now, then = self._seen(track.poses[0], 0), self._seen(track.poses[step], step)
         poses = track.poses
+        then = self._seen(poses[step], step)
+        now_ahead_m, now_left_m = self._seen(poses[0], 0) or (None, None)
+        ahead_m, left_m = then or self._seen(poses[step + ahead], step) or (None, None)
+        found = Other(track.track_id, kind, now_ahead_m, now_left_m, ahead_m, left_m)
         if then is None:
-            return Other(track.track_id, kind, *(now or (None, None)), *(self._seen(poses[step + ahead], step)
-                         or (None, None)))  # fmt: skip
+            return found
         box = track_boxes((track,), step + 1)[step, [0]]
-        gap = float(gaps(self.ego[[step]], box)[0])
+        found = replace(found, gap_m=float(gaps(self.ego[[step]], box)[0]))
         moves = np.diff(poses[max(step - 1, 0) : step + 2, :2], axis=0) / STEP_S
         moves = moves[np.isfinite(moves).all(axis=1)]
         if not len(moves):
-            return Other(track.track_id, kind, *(now or (None, None)), *then, gap)
+            return found
         velocity = moves.mean(axis=0)
         apart = poses[step, :2] - np.array([self.ego.x[step], self.ego.y[step]])
         distance = max(float(np.hypot(*apart)), 1e-9)
         own = self.scores.states[self.plan, step, SPEED] * np.array([self.ego.cos[step], self.ego.sin[step]])
         closing = float((own - velocity) @ apart / distance)
-        speed = float(np.hypot(*velocity))
-        return Other(track.track_id, kind, *(now or (None, None)), *then, gap, closing, speed)
+        return replace(found, closing_mps=closing, speed_mps=float(np.hypot(*velocity)))
 
     def _seen(self, pose: Array, step: int) -> tuple[float, float] | None:
         """Metres ahead and to the left of the ego's box at ``step``; None of a track that is absent."""

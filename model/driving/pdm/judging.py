@@ -17,6 +17,7 @@ from model.driving.pdm.world import ACCELERATION, Array, ScoreError, World
 _EVERY: Final = {8: 1, 64: 5}
 """Waypoints are told every half a second."""
 _WAYPOINTS: Final = 8
+SCORE_DECIMALS: Final = 6
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ def judged_plans(
         judged.append(
             JudgedPlan(
                 version=scores.version,
-                score=partial if np.isnan(whole) else whole,
+                # What is told is what is judged: a score that reads 0.8 is not below 0.8.
+                score=round(partial if np.isnan(whole) else whole, SCORE_DECIMALS),
                 is_partial=bool(np.isnan(whole)),
                 threshold=threshold,
                 sub_scores={

@@ -122,8 +122,8 @@ def _causes(judged: JudgedPlan) -> Iterator[tuple[str, str]]:
         if fact.other is not None and fact.other.other_id not in told:
             told.add(fact.other.other_id)
             yield fact.other.kind, _name(fact.other) + _now(fact.other)
-    if (fact := _fact(judged, DRIVABLE)) is not None:
-        yield "road", f"the edge of the road{_on(fact)}"
+    if (off_road := _fact(judged, DRIVABLE)) is not None:
+        yield "road", f"the edge of the road{_on(off_road)}"
 
 
 def _safety(judged: JudgedPlan) -> Iterator[str]:

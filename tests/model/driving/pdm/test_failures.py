@@ -48,6 +48,7 @@ def test_a_collision_tells_when_with_whom_and_how_fast() -> None:
     found = facts(road(tracks=(leader,)), straight(8))
     hit, close = found[COLLISIONS], found[TIME_TO_COLLISION]
     # Bumper to bumper: the leader's rear is at 17.75 m, the ego's front 4.05 m ahead of its axle.
+    assert hit.time_s is not None
     assert hit.time_s == pytest.approx((17.75 - 4.049) / 8, abs=0.15)
     assert hit.other is not None
     assert (hit.other.other_id, hit.other.kind, hit.other.gap_m) == ("leader", "vehicle", 0.0)
@@ -60,7 +61,8 @@ def test_a_collision_tells_when_with_whom_and_how_fast() -> None:
     assert close.other.gap_m is not None
     assert close.other.gap_m > 0
     (left,) = close.measures
-    assert (left.name, left.limit) == ("time_to_collision_s", pytest.approx(0.9))
+    assert left.name == "time_to_collision_s"
+    assert left.limit == pytest.approx(0.9)
     # At 8 m/s the gap is gone after so many seconds: looked at in steps of 0.3 s.
     assert left.value - 0.31 < close.other.gap_m / 8 <= left.value
 

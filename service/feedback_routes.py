@@ -1,0 +1,71 @@
+"""POST /v1/feedback; it needs no model."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Body, Request
+from fastapi.openapi.models import Example
+
+import clients.wire_feedback as wire_feedback
+from clients.labelling.teachers.feedback import FeedbackTeacher
+from service.admission import Admission
+from service.callers import while_connected
+from service.examples import example_feedback
+from service.feedback import taught
+from service.openapi import PACKED, payloads, problems
+from service.parts import Parts
+from service.payloads import payload_route
+from service.planning import full_as_problem, let_in
+from service.planning_routes import arrival_of, respond
+from service.problems import (
+    FEEDBACK_REFUSED,
+    INVALID_FEEDBACK,
+    OTHER_PLAN,
+    TEACHER_AWAY,
+    TEACHER_REFUSED,
+)
+from service.scoring_routes import SCORING_REFUSALS
+
+EXAMPLES: Final[dict[str, Example]] = {"why one of two trajectories is wrong": {"value": example_feedback()}}
+
+
+def feedback_router(parts: Parts, admission: Admission) -> APIRouter:
+    """The endpoint; it takes its places from the scorer's ``admission``."""
+
+    def check_open(_: Request) -> None:
+        parts.lifecycle.check_accepting()
+        with full_as_problem():
+            admission.check_open()
+
+    async def given(asked: wire_feedback.FeedbackRequest, request_id: str) -> wire_feedback.FeedbackResponse:
+        found = await parts.scorer.feedback(asked, request_id)
+        response = found.response
+        if asked.mode == "teacher" and isinstance(parts.teacher, FeedbackTeacher):
+            response = await taught(found, parts.teacher, parts.metrics)
+        for each in response.feedback:
+            parts.metrics.feedback_told(each.written_by, correct=each.correct)
+        return response
+
+    router = APIRouter(route_class=payload_route(check_open), tags=["scoring"])
+
+    @router.post(
+        "/v1/feedback",
+        response_model=wire_feedback.FeedbackResponse,
+        responses=problems(
+            *SCORING_REFUSALS,
+            *(INVALID_FEEDBACK, OTHER_PLAN, FEEDBACK_REFUSED, TEACHER_REFUSED, TEACHER_AWAY),
+        )
+        | PACKED,
+        openapi_extra=payloads(wire_feedback.FeedbackRequest),
+    )
+    async def feedback(
+        request: Request, asked: Annotated[wire_feedback.FeedbackRequest, Body(openapi_examples=EXAMPLES)]
+    ) -> Any:
+        """Why trajectories fail: facts, and a teacher's five sections on each that is wrong."""
+        arrival = arrival_of(request)
+        with parts.lifecycle.accepted(), let_in(admission.place(1)):
+            await parts.planning.spend(arrival.owner, len(asked.trajectories))
+            return respond(request, await while_connected(request, given(asked, arrival.request_id)))
+
+    return router
