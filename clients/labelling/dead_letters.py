@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Final
+from typing import Final, get_args
 
 from clients.labelling.ledger import Ledger, Stage
 from model.driving.whole_files import written_whole
 
 FILE: Final = "dead_letters.jsonl"
-_STAGES: Final[tuple[Stage, ...]] = ("rollout", "outcomes", "label")
+_STAGES: Final[tuple[Stage, ...]] = get_args(Stage)
 
 
 def write_dead_letters(ledger: Ledger, folder: Path) -> int:

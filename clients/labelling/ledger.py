@@ -19,7 +19,7 @@ from typing import Any, Final, Literal, NamedTuple, Self
 from clients.labelling.teachers.teacher import Answer
 from model.driving.hashing import hash_of
 
-Stage = Literal["rollout", "outcomes", "label"]
+Stage = Literal["rollout", "outcomes", "label", "inference", "feedback"]
 State = Literal["done", "dead"]
 Record = Mapping[str, Any]
 

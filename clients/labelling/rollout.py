@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -95,19 +96,9 @@ async def roll_out(
     """
     expert = expert_plan(labelled)
     scene = labelled.given(route=sampling.route, tracks=sampling.tracks)
-    try:
+    with of_the_service():
         free = await planner.plan(scene, sampling.controls)
         given = await planner.plan(scene, sampling.controls, prefill=expert)
-    except ServiceBusy as error:
-        raise TryLater(str(error), error.retry_after_s) from error
-    except PlannerUnreachable as error:
-        raise TryLater(str(error)) from error
-    except RequestRefused as error:
-        raise CannotBeDone(error.detail, type=error.type) from error
-    except PlannerProblem as error:
-        raise CannotBeDone(str(error), type=error.type) from error
-    except BadAnswer as error:
-        raise CannotBeDone(str(error)) from error
     for answer in (free, given):
         if answer.model != model:
             raise StageStopped(
@@ -120,6 +111,28 @@ async def roll_out(
         "free": _draws(free, labelled, expert),
         "prefilled": _draws(given, labelled, None),
     }
+
+
+@contextmanager
+def of_the_service() -> Iterator[None]:
+    """What a planning service may do wrong, as a stage takes it.
+
+    Raises:
+        TryLater: it is busy or away.
+        CannotBeDone: it refuses, or fails at, what it was asked.
+    """
+    try:
+        yield
+    except ServiceBusy as error:
+        raise TryLater(str(error), error.retry_after_s) from error
+    except PlannerUnreachable as error:
+        raise TryLater(str(error)) from error
+    except RequestRefused as error:
+        raise CannotBeDone(error.detail, type=error.type) from error
+    except PlannerProblem as error:
+        raise CannotBeDone(str(error), type=error.type) from error
+    except BadAnswer as error:
+        raise CannotBeDone(str(error)) from error
 
 
 def _draws(result: PlanResult, labelled: LabelledScene, expert: Plan | None) -> list[dict[str, Any]]:

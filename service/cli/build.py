@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
-import tempfile
-from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
@@ -15,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from service.cli.options import Json, told
+from service.cli.stages import do_jobs, progress_bar, report_run, run_stage, scenes_in
 
 if TYPE_CHECKING:
     from clients.labelling.label import Asked
-    from clients.labelling.ledger import Ledger, Record, Run
-    from clients.labelling.pipeline import Job, Limits, Tally
+    from clients.labelling.ledger import Ledger, Run
+    from clients.labelling.pipeline import Job, Tally
     from clients.labelling.teachers.openai import OpenAiSettings
     from clients.labelling.teachers.teacher import Teacher
     from model.driving.reflection_store import LabelledReflection
@@ -91,24 +89,24 @@ def rollout(
 
                 work = RolloutWork(run, service, access, model, sampling, limits)
                 found = chunks(ledger, run, scenes)
-                with _progress(run, _count(scenes), quiet=as_json) as show:
+                with progress_bar(run, scenes_in(scenes), quiet=as_json) as show:
                     return run, work_on_ray(ledger, run, found, work, on_ray, show, unlabelled.append)
-            return run, await _work(
+            return run, await do_jobs(
                 ledger,
                 run,
                 islice(jobs(run, scenes, unlabelled.append), 0, None, every),
                 lambda job: roll_out(planner, job.subject, model, sampling),
                 limits,
-                total=-(-_count(scenes) // every),
+                total=-(-scenes_in(scenes) // every),
                 quiet=as_json,
             )
 
     with told():
         _check_ray(on_ray, limit, dry_run, every)
-        run, tally = _stage(folder, roll, dry=dry_run > 0)
+        run, tally = run_stage(folder, roll, dry=dry_run > 0)
         for name in unlabelled:
             typer.echo(f"{name}: left out, it has no expert's future", err=True)
-        _report(run, tally, as_json, left_out=len(unlabelled))
+        report_run(run, tally, as_json, left_out=len(unlabelled))
 
 
 @app.command()
@@ -140,8 +138,8 @@ def outcomes(
         begun = ledger.run("outcomes", config_of(rollout))
         if retry_dead:
             ledger.forget_dead(begun)
-        total = None if limits.at_most else min(ledger.count(rollout), _count(scenes))
-        with _progress(begun, total, quiet=as_json) as show:
+        total = None if limits.at_most else min(ledger.count(rollout), scenes_in(scenes))
+        with progress_bar(begun, total, quiet=as_json) as show:
             tally = follow_all(ledger, begun, rollout, scenes, workers, limits, show)
         found = [Followed.of(entry.record) for entry in ledger.entries(begun)]
         plans = [plan for each in found for plan in each.plans]
@@ -155,8 +153,8 @@ def outcomes(
         return begun, tally
 
     with told():
-        begun, tally = _stage(folder, follow, dry=dry_run > 0)
-        _report(begun, tally, as_json, **counts)
+        begun, tally = run_stage(folder, follow, dry=dry_run > 0)
+        report_run(begun, tally, as_json, **counts)
 
 
 @app.command("filter")
@@ -270,11 +268,11 @@ def label(
 
                 work = LabelWork(begun, rollout, connect, plans_per_scene, seed, limits)
                 kept = chunks(ledger, begun, scenes, rollout)
-                with _progress(begun, ledger.count_kept(rollout, plans_per_scene), quiet=as_json) as show:
+                with progress_bar(begun, ledger.count_kept(rollout, plans_per_scene), quiet=as_json) as show:
                     tally = work_on_ray(ledger, begun, kept, work, on_ray, show)
             else:
                 found = questions(ledger, rollout, scenes, plans_per_scene=plans_per_scene, seed=seed)
-                tally = await _work(
+                tally = await do_jobs(
                     ledger,
                     begun,
                     jobs(begun, found),
@@ -290,8 +288,8 @@ def label(
 
     with told():
         _check_ray(on_ray, limit, dry_run)
-        begun, tally = _stage(folder, ask_all, dry=dry_run > 0)
-        _report(begun, tally, as_json, **spent)
+        begun, tally = run_stage(folder, ask_all, dry=dry_run > 0)
+        report_run(begun, tally, as_json, **spent)
 
 
 @app.command()
@@ -381,7 +379,7 @@ def take(
         before = ledger.spent(begun)
         tally = take_results(ledger, begun, found, read_results(lines, settings))
         write_dead_letters(ledger, folder)
-        _report(begun, tally, as_json, **ledger.spent(begun).since(before))
+        report_run(begun, tally, as_json, **ledger.spent(begun).since(before))
 
 
 def _batch(
@@ -408,98 +406,3 @@ async def _teacher_of_settings() -> Teacher:
     from service.settings import TeacherSettings
 
     return TeacherSettings().teacher()
-
-
-def _stage(
-    folder: Path, work: Callable[[Ledger], Coroutine[Any, Any, tuple[Run, Tally]]], *, dry: bool
-) -> tuple[Run, Tally]:
-    """Run a stage on a folder's ledger, or on a copy that is thrown away."""
-    from clients.labelling.dead_letters import write_dead_letters
-    from clients.labelling.ledger import FILE, Ledger
-
-    if dry:
-        with tempfile.TemporaryDirectory(prefix="looktwice-") as scratch:
-            if (folder / FILE).exists():
-                Ledger.copy(folder, Path(scratch))
-            with Ledger(Path(scratch)) as ledger:
-                result = asyncio.run(work(ledger))
-                for entry in ledger.latest(result[0], result[1].done + result[1].dead):
-                    typer.echo(json.dumps({"scene_id": entry.scene_id, entry.state: entry.record}, indent=1))
-                return result
-    with Ledger(folder) as ledger:
-        try:
-            return asyncio.run(work(ledger))
-        finally:
-            write_dead_letters(ledger, folder)
-
-
-async def _work(
-    ledger: Ledger,
-    run: Run,
-    jobs: Iterator[Job[Any]],
-    do: Callable[[Job[Any]], Awaitable[Record]],
-    limits: Limits,
-    *,
-    total: int,
-    quiet: bool,
-) -> Tally:
-    from clients.labelling.pipeline import work_through
-
-    with _progress(run, total if limits.at_most is None else None, quiet=quiet) as show:
-        return await work_through(ledger, run, jobs, do, limits, show)
-
-
-@contextmanager
-def _progress(run: Run, total: int | None, *, quiet: bool) -> Iterator[Callable[[Tally], None]]:
-    """A bar on stderr, moved by what it is told; it also says who is waited for."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-    from stamina.instrumentation import RetryDetails, get_on_retry_hooks, set_on_retry_hooks
-
-    columns = (TextColumn(run.stage), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    bar = TextColumn("{task.description}")
-    with Progress(*columns, bar, console=Console(stderr=True, quiet=quiet)) as progress:
-        task = progress.add_task("", total=total)
-
-        def show(tally: Tally) -> None:
-            ended = tally.done + tally.dead + tally.earlier
-            told = f"{tally.dead} dead letters" if tally.dead else ""
-            progress.update(task, completed=ended, description=told)
-
-        def wait(details: RetryDetails) -> None:
-            # Not a line for each of many that wait, on the output that scripts read.
-            progress.update(task, description=f"waiting: {details.caused_by}")
-
-        hooks = get_on_retry_hooks()
-        set_on_retry_hooks([wait])
-        try:
-            yield show
-        finally:
-            set_on_retry_hooks(hooks)
-
-
-def _count(scenes: Path) -> int:
-    from model.driving.scene_store import count_scenes
-
-    return count_scenes(scenes)
-
-
-def _report(run: Run, tally: Tally, as_json: bool, **more: Any) -> None:
-    result = {
-        "run": run.id,
-        "config": dict(run.config),
-        "done": tally.done,
-        "dead": tally.dead,
-        "earlier": tally.earlier,
-        "seconds": round(tally.seconds, 3),
-        "per_s": round((tally.done + tally.dead) / max(tally.seconds, 1e-9), 3),
-    } | more
-    if as_json:
-        typer.echo(json.dumps(result))
-        return
-    typer.echo(
-        f"{run.stage} {run.id[:8]}: {tally.done} done in {tally.seconds:.0f} s ({result['per_s']} a second), "
-        f"{tally.dead} dead letters, {tally.earlier} were done before"
-    )
-    for name, value in more.items():
-        typer.echo(f"  {name.replace('_', ' ')}: {value}")

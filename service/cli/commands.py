@@ -13,6 +13,7 @@ import service.cli.describe as describe
 import service.cli.drive as drive
 import service.cli.egodriver as egodriver
 import service.cli.evaluate as evaluate
+import service.cli.failures as failures
 import service.cli.feedback as feedback
 import service.cli.keys as keys
 import service.cli.loadtest as loadtest
@@ -49,6 +50,7 @@ app.command("plan")(plan.plan)
 app.command("serve")(serve.serve)
 app.command("train")(train.train)
 app.command("score")(score.score)
+app.command("failures")(failures.failures)
 app.command("feedback")(feedback.feedback)
 app.command("evaluate")(evaluate.evaluate)
 app.command("describe")(describe.describe)

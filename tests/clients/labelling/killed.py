@@ -5,10 +5,24 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
+from clients.labelling.failures import (
+    Inference,
+    Sample,
+    feedback_config,
+    feedback_jobs,
+    infer,
+    inference_config,
+    sampled,
+    writer,
+)
 from clients.labelling.label import config_of, jobs, labeller, questions
 from clients.labelling.ledger import Ledger
 from clients.labelling.pipeline import Limits, work_through
+from clients.labelling.rollout import PATIENCE
+from clients.labelling.rollout import jobs as rollout_jobs
 from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from clients.planner import AsyncPlannerClient
+from clients.wire import ModelName
 
 AT_ONCE = 4
 
@@ -25,6 +39,40 @@ def label_all(folder: Path, scenes: Path, url: str, key: str) -> None:
             work = labeller(ledger, begun, teacher)
             try:
                 await work_through(ledger, begun, found, work, Limits(AT_ONCE))
+            finally:
+                await teacher.close()
+
+    asyncio.run(run())
+
+
+def fail_all(folder: Path, scenes: Path, service: str, teacher_url: str, key: str) -> None:
+    """What `looktwice failures` does with an endpoint as its teacher."""
+
+    async def run() -> None:
+        inference, sample = Inference(n=2), Sample(threshold=1.0)
+        teacher = OpenAiTeacher(OpenAiSettings(f"{teacher_url}/v1", "some-vlm", key))
+        with Ledger(folder) as ledger:
+            async with AsyncPlannerClient(service, PATIENCE) as planner:
+                (card, *_) = await planner.models()
+                model = ModelName(name=card.name, revision=card.revision)
+                inferred = ledger.run("inference", inference_config(model, inference))
+                await work_through(
+                    ledger,
+                    inferred,
+                    rollout_jobs(inferred, scenes, lambda _: None),
+                    lambda job: infer(planner, job.subject, model, inference),
+                    Limits(AT_ONCE),
+                )
+            begun = ledger.run("feedback", feedback_config(inferred, teacher, sample.threshold))
+            chosen = sampled(ledger, inferred, sample)
+            try:
+                await work_through(
+                    ledger,
+                    begun,
+                    feedback_jobs(ledger, inferred, begun, chosen, scenes),
+                    writer(ledger, begun, teacher, inference.version, sample.threshold),
+                    Limits(AT_ONCE),
+                )
             finally:
                 await teacher.close()
 

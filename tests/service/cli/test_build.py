@@ -24,8 +24,8 @@ from model.driving.scene_store import read_scenes, write_scenes
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.network.checkpoint import read_config
 from model.network.settings import VlaSettings
-from service.cli.build import _progress
 from service.cli.commands import app
+from service.cli.stages import progress_bar
 from service.settings import Settings
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer
 from tests.service.cli.builds import ran, told
@@ -207,7 +207,7 @@ def test_waiting_is_told_beside_the_bar_alone(capsys: pytest.CaptureFixture[str]
             raise refusal
         return "done"
 
-    with _progress(Run("id", "rollout", {}), 1, quiet=False):
+    with progress_bar(Run("id", "rollout", {}), 1, quiet=False):
         assert asyncio.run(patiently(answer, 10.0)) == "done"
     told = capsys.readouterr()
     assert told.out == ""
