@@ -51,6 +51,13 @@ export async function reflect(scene, text, controls, signal) {
   return { ...body, draws };
 }
 
+// Trajectories of a bundled scene, judged: rows of x, y, z, heading in, a verdict with facts for each out.
+export const feedback = (sceneId, trajectories, said, signal) => post("/v1/feedback", {
+  scene_id: sceneId,
+  trajectories: trajectories.map((rows) => rows.map(([x, y, , heading]) => [x, y, heading])),
+  said,
+}, signal).then((body) => body.feedback);
+
 // A labelled scene per scene in the file. Parquet is read by the service, JSON here.
 export async function scenesOfFile(file) {
   if (!file.name.toLowerCase().endsWith(".json")) {

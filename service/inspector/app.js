@@ -4,10 +4,11 @@ import * as api from "./api.js";
 import { drawBirdseye } from "./birdseye.js";
 import { showCameras } from "./cameras.js";
 import { byId, element } from "./dom.js";
+import { asked, canBeJudged, forgetFeedback, showFeedback } from "./feedback.js";
 import { showDraw } from "./timeline.js";
 import { averageError } from "./times.js";
 
-const state = { view: null, draws: [], chosen: 0, running: null, opened: new Map(), inputs: [] };
+const state = { view: null, draws: [], chosen: 0, judged: null, running: null, opened: new Map(), inputs: [] };
 
 const say = (text) => { byId("status").textContent = text; };
 
@@ -28,7 +29,7 @@ async function attempt(work) {
 }
 
 function redraw() {
-  if (state.view) drawBirdseye(state.view, state.draws, state.chosen);
+  if (state.view) drawBirdseye(state.view, state.draws, state.chosen, state.judged);
 }
 
 function forgetDraws() {
@@ -36,11 +37,28 @@ function forgetDraws() {
   state.running = null;
   state.draws = [];
   state.chosen = 0;
+  forgetJudgement();
   byId("draws").hidden = true;
   byId("timeline").replaceChildren();
   byId("plan-title").textContent = "Plan";
   byId("link").hidden = true;
   for (const empty of document.querySelectorAll(".empty")) empty.hidden = false;
+}
+
+// Only of a bundled scene the service knows what happens next.
+function forgetJudgement() {
+  state.judged = null;
+  forgetFeedback();
+  byId("why").hidden = state.opened.has(byId("scene").value) || !canBeJudged(state.draws[state.chosen]);
+}
+
+async function judge() {
+  const draw = state.draws[state.chosen];
+  const answer = await api.feedback(byId("scene").value, ...asked(draw), state.running?.signal);
+  if (state.draws[state.chosen] !== draw) return; // another one was chosen meanwhile
+  state.judged = { draft: answer[0], chosen: answer.at(-1) };
+  showFeedback(state.judged);
+  redraw();
 }
 
 function showView(view) {
@@ -236,6 +254,7 @@ function choose(index) {
   });
   byId("plan-title").textContent = `Plan of draw ${state.draws[index].index}`;
   showDraw(state.draws[index]);
+  forgetJudgement();
   if (state.draws[index].plan) byId("proposal").value = state.draws[index].plan.text;
   redraw();
   attempt(() => showDraft(state.draws[index]));
@@ -251,6 +270,7 @@ function listen() {
     event.preventDefault();
     attempt(lookTwice);
   });
+  byId("why").addEventListener("click", () => attempt(judge));
   byId("thinking").addEventListener("change", showThreshold);
   byId("with-threshold").addEventListener("change", replan);
   byId("threshold").addEventListener("input", replan);

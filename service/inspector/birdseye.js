@@ -8,7 +8,8 @@ const BEHIND_M = 14;
 const NOW = 15; // row of the present in an agent's track
 const SECOND = 10; // rows
 
-export function drawBirdseye(view, draws, chosen) {
+// Of a draw that was judged, what is wrong is red, what was driven green, and what a second look made of it blue.
+export function drawBirdseye(view, draws, chosen, judged = null) {
   const canvas = byId("birdseye");
   const ratio = window.devicePixelRatio || 1;
   const { clientWidth: width, clientHeight: height } = canvas;
@@ -33,12 +34,12 @@ export function drawBirdseye(view, draws, chosen) {
   for (const agent of view.agents) agentFuture(map, agent);
   for (const agent of view.agents) if (agent.poses[NOW]) box(map, agent.poses[NOW], agent, tint(agent), 1);
   draws.forEach((draw, index) => index !== chosen && line(map, start(draw.trajectory), "draw", 2, [], 0.5));
-  if (view.future) line(map, start(view.future), "expert", 2.5, [7, 5]);
+  if (view.future) line(map, start(view.future), "expert", judged ? 3.5 : 2.5, judged ? [] : [7, 5]);
   const draft = draws[chosen]?.draft_trajectory;
-  if (draft) line(map, start(draft), "draft", 3, [9, 5]);
-  if (draws[chosen]) chosenDraw(map, draws[chosen]);
+  if (draft) line(map, start(draft), judged && !judged.draft.correct ? "wrong" : "draft", 3, judged ? [] : [9, 5]);
+  if (draws[chosen]) chosenDraw(map, draws[chosen], judged && !judged.chosen.correct ? "wrong" : draft ? "refined" : "chosen");
   box(map, [0, 0, 0], EGO, "ego", 1);
-  canvas.setAttribute("aria-label", describe(view, draws, chosen));
+  canvas.setAttribute("aria-label", describe(view, draws, chosen, judged));
 }
 
 const start = (rows) => [[0, 0], ...rows];
@@ -109,20 +110,20 @@ function agentFuture(map, agent) {
 }
 
 // With a dot at every whole second at which it has a pose.
-function chosenDraw(map, draw) {
+function chosenDraw(map, draw, name) {
   const { pen, at, color } = map;
-  line(map, start(draw.trajectory), "chosen", 3.5);
+  line(map, start(draw.trajectory), name, 3.5);
   timesOf(draw).forEach((seconds, row) => {
     if (Math.abs(seconds - Math.round(seconds)) > 1e-6) return;
     pen.beginPath();
     pen.arc(...at(draw.trajectory[row]), 3.5, 0, 2 * Math.PI);
-    Object.assign(pen, { fillStyle: color("panel"), strokeStyle: color("chosen"), lineWidth: 2 });
+    Object.assign(pen, { fillStyle: color("panel"), strokeStyle: color(name), lineWidth: 2 });
     pen.fill();
     pen.stroke();
   });
 }
 
-function describe(view, draws, chosen) {
+function describe(view, draws, chosen, judged) {
   const parts = [`The scene from above with ${view.agents.length} agents`];
   if (draws[chosen]) {
     const [x, y] = draws[chosen].trajectory.at(-1);
@@ -134,5 +135,6 @@ function describe(view, draws, chosen) {
       parts.push(`its draft ended ${Math.hypot(dx - x, dy - y).toFixed(1)} m from there`);
     }
   }
+  if (judged) parts.push(`by its score the chosen one is ${judged.chosen.correct ? "correct" : "wrong"}`);
   return parts.join("; ");
 }

@@ -24,6 +24,7 @@ from model.driving.pdm.scoring import (
     PROGRESS,
     TIME_TO_COLLISION,
 )
+from model.driving.plan import PlanError, parse_plan
 
 NAME: Final = "rules"
 REVISION: Final = "1"
@@ -42,11 +43,19 @@ SHORT: Final = {
 _SAFETY: Final = (COLLISIONS, DRIVABLE, DIRECTION, LIGHTS)
 _EFFICIENCY: Final = (TIME_TO_COLLISION, PROGRESS, LANE_KEEPING, COMFORT, EXTENDED_COMFORT)
 _LONGITUDINAL: Final = {
-    "stop": r"stop|halt|wait|stand",
-    "decelerate": r"decelerat|slow|brak|yield",
+    "stop": r"(?:stop|stopping|halt|wait)\b",
+    "decelerate": r"decelerat|slow(?:ing)? down|slowing|brak(?:e|ing)\b(?! light)|ease off|yield",
     "accelerate": r"accelerat|speed(?:ing)? up|go faster",
     "maintain speed": r"(?:keep|maintain|hold)\w* (?:the |my |this |a |its )?(?:\w+ )?(?:speed|velocity)",
 }
+_PLANNED: Final = {
+    "Accelerate": "accelerate",
+    "Decelerate": "decelerate",
+    "Keep Speed": "maintain speed",
+    "Wait": "stop",
+}
+"""Words of the plan language."""
+_HORIZON_TICKS: Final = round(HORIZON_S * 10)
 _SEEN: Final = {
     "vehicle": r"vehicle|car\b|cars\b|truck|van\b|bus\b|leader|traffic|cut.?in|oncoming",
     "pedestrian": r"pedestrian|person|people|walker|child",
@@ -82,9 +91,9 @@ def critique(judged: JudgedPlan) -> Feedback:
 def _meta_action(judged: JudgedPlan) -> Iterator[str]:
     course, truth = judged.course, judged.true_course
     yield f"The plan is to {course.longitudinal} and {course.lateral}: {_way(course)}."
-    meant = _meant(judged.think) or _meant(judged.words)
-    if meant is not None and meant != course.longitudinal:
-        yield f"Its words ask to {meant}, and the trajectory does not do that."
+    meant = _meant(judged)
+    if meant and course.longitudinal not in meant:
+        yield f"Its words ask to {' or to '.join(meant)}, and the trajectory does not do that."
     if truth is None:
         yield "No ground truth is known to compare it with."
         return
@@ -299,11 +308,16 @@ def _fact(judged: JudgedPlan, name: str) -> Fact | None:
     return next((fact for fact in judged.facts if fact.sub_score == name), None)
 
 
-def _meant(text: str | None) -> str | None:
-    """The last thing about speed that a text asks for, as a high-level action."""
-    found = [
-        (each.start(), action)
+def _meant(judged: JudgedPlan) -> tuple[str, ...]:
+    """What reasoning and plan ask for within the horizon, as high-level actions of speed; all they name."""
+    found = {
+        action
         for action, pattern in _LONGITUDINAL.items()
-        for each in re.finditer(rf"\b(?:{pattern})", text or "", re.IGNORECASE)
-    ]
-    return max(found)[1] if found else None
+        if re.search(rf"\b(?:{pattern})", judged.think or "", re.IGNORECASE)
+    }
+    try:
+        track = () if judged.words is None else parse_plan(judged.words).longitudinal or ()
+    except PlanError:
+        track = ()
+    found |= {_PLANNED[each.word] for each in track if each.start < _HORIZON_TICKS and each.word in _PLANNED}
+    return tuple(action for action in _LONGITUDINAL if action in found)

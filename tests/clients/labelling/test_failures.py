@@ -151,12 +151,15 @@ def test_killed_at_any_moment_it_goes_on_where_it_was(tmp_path: Path) -> None:
     assert 0 <= len(teacher.answered) - len(wrong) <= KILLS * AT_ONCE
 
 
+def response(score: float) -> dict[str, Any]:
+    return {"draws": [{"plan": None, "think": None, "trajectory": [], "score": score, "is_partial": False}]}
+
+
 def inferred_ledger(folder: Path, scores: list[float]) -> tuple[Ledger, Run]:
     ledger = Ledger(folder)
     run = ledger.run("inference", inference_config(MODEL, Inference(n=1)))
     for number, score in enumerate(scores):
-        draws = [{"plan": None, "think": None, "trajectory": [], "score": score, "is_partial": False}]
-        ledger.finish(run, f"key-{number:03d}", f"scene-{number:03d}", {"draws": draws})
+        ledger.finish(run, f"key-{number:03d}", f"scene-{number:03d}", response(score))
     return ledger, run
 
 
@@ -175,8 +178,7 @@ def test_a_sample_takes_so_many_of_each_kind_and_is_not_shuffled_by_more_scenes(
         assert kinds(Sample(0.0)).count(False) == 0
         before = set(sampled(ledger, run, few))
         assert before != set(sampled(ledger, run, replace(few, seed=1)))
-        draws = [{"plan": None, "think": None, "trajectory": [], "score": 0.0, "is_partial": False}]
-        ledger.finish(run, "key-100", "scene-100", {"draws": draws})
+        ledger.finish(run, "key-100", "scene-100", response(0.0))
         assert len(before & set(sampled(ledger, run, few))) >= 11
     with pytest.raises(ValueError, match="threshold"):
         Sample(threshold=1.5)

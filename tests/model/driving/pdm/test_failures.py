@@ -163,10 +163,10 @@ def test_facts_are_the_sub_scores_below_1_and_feedback_speaks_of_nothing_else(se
             assert all(f"{SHORT[name]} is" in told.safety_failure + told.efficiency_failure for name in named)
 
 
-def judged_leader(think: str | None = None, truth: Array | None = None) -> Feedback:
+def judged_leader(think: str | None = None, truth: Array | None = None, words: str | None = None) -> Feedback:
     world = road(tracks=(replace(standing("7", 20.0), kind="vehicle"),))
     scores = score(world, straight(8)[None], "v1.1")
-    (plan,) = judged_plans(world, straight(8)[None], scores, Others(), said=[Said(think=think)], truth=truth)
+    (plan,) = judged_plans(world, straight(8)[None], scores, Others(), said=[Said(words, think)], truth=truth)
     return critique(plan)
 
 
@@ -178,7 +178,18 @@ def test_the_think_process_is_held_against_what_fails() -> None:
     speaks = judged_leader("A car stands ahead, so I brake.")
     assert "does not draw the conclusion" in speaks.think_process
     assert "ask to decelerate, and the trajectory does not" in speaks.meta_action
+    # Of several actions that are named the trajectory does one.
+    both = judged_leader("A car stands ahead. I keep my speed and brake later.").meta_action
+    assert "does not do that" not in both
     assert "Brake before" in speaks.correction
+
+
+def test_a_plan_in_words_counts_as_far_as_it_is_judged() -> None:
+    track = "- longitudinal\n  - 0.0s-{0}s: Keep Speed\n  - {0}s-6.4s: Accelerate\n"
+    lie = "- longitudinal\n  - 0.0s-6.4s: Wait\n"
+    assert "does not do that" not in judged_leader(words=track.format("4.5")).meta_action
+    assert "does not do that" not in judged_leader(words="not of the plan language: brake").meta_action
+    assert "ask to stop, and" in judged_leader(words=lie).meta_action
 
 
 def test_the_meta_action_is_held_against_the_ground_truth() -> None:
