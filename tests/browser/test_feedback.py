@@ -16,6 +16,7 @@ from tests.browser.test_inspector import near, pixels, plan
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, serve
+from tests.sockets import PATIENCE_S
 
 WRONG_RGB = (211, 32, 32)  # --wrong of the light theme
 TRUTH_RGB = (22, 128, 60)  # --expert
@@ -27,6 +28,9 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     path = tmp_path_factory.mktemp("scenes") / "scenes.parquet"
     write_scenes(path, [labelled("slow-leader")])
     with serve(ScriptedEngine(), Settings(bundled_scenes=path)) as running:
+        # The process that scores begins with the first request.
+        stand = {"scene_id": "slow-leader", "trajectories": [[[0.0, 0.0, 0.0]] * 8]}
+        assert running.http.post("/v1/feedback", json=stand).status_code == 200
         yield running
 
 
@@ -45,7 +49,9 @@ def test_a_wrong_first_plan_is_red_and_told_why_beside_what_came_of_it(inspector
     assert not near(before, WRONG_RGB).any()
     inspector.get_by_role("button", name=WHY).click()
     panel = inspector.locator("#feedback-panel")
-    expect(panel.get_by_role("heading", name=re.compile("First plan is wrong: score 0"))).to_be_visible()
+    expect(panel.get_by_role("heading", name=re.compile("First plan is wrong: score 0"))).to_be_visible(
+        timeout=PATIENCE_S * 1000
+    )
     expect(panel.get_by_role("heading", name=re.compile("After the second look is"))).to_be_visible()
     expect(panel).to_contain_text("Actionable correction:")
     expect(panel).to_contain_text("the vehicle #1")
@@ -65,8 +71,10 @@ def test_feedback_is_of_the_chosen_draw_only(inspector: Page, served: Served) ->
     plan(inspector)
     inspector.get_by_role("button", name=WHY).click()
     panel = inspector.locator("#feedback-panel")
-    expect(panel.get_by_role("heading", name=re.compile("The plan is (wrong|correct)"))).to_be_visible()
-    inspector.get_by_role("radio", name="draw 1").check()
+    expect(panel.get_by_role("heading", name=re.compile("The plan is (wrong|correct)"))).to_be_visible(
+        timeout=PATIENCE_S * 1000
+    )
+    inspector.locator("#draws input:not(:checked)").first.check()
     expect(panel.locator(".scores")).to_have_count(0)
     assert not near(pixels(inspector, "#birdseye"), WRONG_RGB).any()
     served.engine.times_s = tuple(round(0.2 * place, 1) for place in range(1, 33))
@@ -81,7 +89,7 @@ def test_of_an_opened_file_nothing_is_asked(inspector: Page, tmp_path: Path) -> 
     file = tmp_path / "own.parquet"
     write_scenes(file, [labelled("own")])
     inspector.get_by_label("Open a scene file").set_input_files(file)
-    expect(inspector.locator("#status")).to_contain_text("own")
+    expect(inspector.get_by_role("status")).to_contain_text("Scene own", timeout=PATIENCE_S * 1000)
     plan(inspector)
     expect(inspector.locator("#draws tbody tr")).to_have_count(6)
     expect(inspector.get_by_role("button", name=WHY)).to_be_hidden()
