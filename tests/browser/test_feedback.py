@@ -85,11 +85,11 @@ def test_feedback_is_of_the_chosen_draw_only(inspector: Page, served: Served) ->
         served.engine.times_s = TEN_HZ_S
 
 
-def test_of_an_opened_file_nothing_is_asked(inspector: Page, tmp_path: Path) -> None:
-    file = tmp_path / "own.parquet"
-    write_scenes(file, [labelled("own")])
+def test_of_an_opened_file_nothing_is_asked(inspector: Page, served: Served, tmp_path: Path) -> None:
+    file = tmp_path / "own.json"
+    file.write_text(served.http.get("/v1/scenes/slow-leader").text.replace("slow-leader", "own"))
     inspector.get_by_label("Open a scene file").set_input_files(file)
-    expect(inspector.get_by_role("status")).to_contain_text("Scene own", timeout=PATIENCE_S * 1000)
+    expect(inspector.get_by_role("status")).to_contain_text("Scene own")
     plan(inspector)
     expect(inspector.locator("#draws tbody tr")).to_have_count(6)
     expect(inspector.get_by_role("button", name=WHY)).to_be_hidden()
