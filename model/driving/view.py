@@ -102,10 +102,10 @@ def view_of(scene: Scene, surroundings: Surroundings) -> View:
     lane = _own_lane(surroundings.lane_lines) if scene.route is None else _from_here(scene.route)
     known = [(agent, track) for agent in surroundings.agents if (track := track_of(agent)) is not None]
     tracks = [track for _, track in known]
-    sights = [_sight(track, _speed_ms(agent), lane) for agent, track in known if _visible(track, tracks)]
-    bend, bend_m = _bend(lane)
+    sights = [_sight(track, _speed_ms(agent), lane) for agent, track in known if visible(track, tracks)]
+    bend, bend_m = bend_along(lane)
     lines = [line.astype(np.float64) for line in surroundings.lane_lines if len(line) > 1]
-    turns, beside = _turns(lines, lane), _beside(lines)
+    turns, beside = _turns(lines, lane), beside_of(lines)
     return View(present_speed(scene.history), _nearest_first(sights), bend, bend_m, turns, beside)
 
 
@@ -121,12 +121,12 @@ def view_along(history: FloatArray, route: FloatArray | None, tracks: Sequence[T
     sights = [
         _sight(track, track.speed_ms * float(np.cos(track.heading_rad)), lane)
         for track in tracks
-        if _visible(track, tracks)
+        if visible(track, tracks)
     ]
-    return View(present_speed(history), _nearest_first(sights), *_bend(lane))
+    return View(present_speed(history), _nearest_first(sights), *bend_along(lane))
 
 
-def _visible(track: Track, others: Sequence[Track]) -> bool:
+def visible(track: Track, others: Sequence[Track]) -> bool:
     """Whether front cameras show it: near enough, in their field of view, not behind a vehicle."""
     if not track.x_m > EGO_LENGTH_M / 2:
         return False
@@ -205,14 +205,15 @@ def _left_of(lane: Array, point: Array) -> float:
 
 def bend_of(way: npt.NDArray[np.floating]) -> tuple[Bend | None, float]:
     """Which way a way [k, 2] from the ego bends within reach, and where it begins to, in m."""
-    return _bend(_from_here(way))
+    return bend_along(_from_here(way))
 
 
 def _from_here(way: npt.NDArray[np.floating]) -> Array:
     return np.concatenate([np.zeros((1, 2)), np.asarray(way, np.float64)])
 
 
-def _bend(lane: Array) -> tuple[Bend | None, float]:
+def bend_along(lane: Array) -> tuple[Bend | None, float]:
+    """The same of a line [k, 2] that begins beside the ego."""
     steps = np.diff(lane, axis=0)
     behind = np.cumsum(np.linalg.norm(steps, axis=1)) - np.linalg.norm(steps, axis=1)
     turned = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
@@ -242,7 +243,7 @@ def _turns(lines: list[Array], lane: Array) -> frozenset[Bend]:
     return frozenset(found)
 
 
-def _beside(lines: list[Array]) -> frozenset[Bend]:
+def beside_of(lines: list[Array]) -> frozenset[Bend]:
     """Sides on which a line runs beside the ego, the same way, a lane away."""
     found: set[Bend] = set()
     for line in lines:
