@@ -66,7 +66,8 @@ class LaneGraph:
     """
 
     def __init__(self, lane_lines: Sequence[FloatArray]) -> None:
-        self.lines = tuple(line.astype(np.float64) for line in lane_lines if len(line) > 1)
+        lines = (_joined([line.astype(np.float64)]) for line in lane_lines)
+        self.lines = tuple(line for line in lines if len(line) > 1)
         self._follows = _follows(self.lines)
 
     def follows(self, lane: int) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""The chain of thought that a labelled scene teaches, by rule (ELF-VLA, supplement, section 7.2).
+"""The thoughts that a labelled scene teaches, by rule (ELF-VLA, supplement, section 7.2).
 
 Who is told of must be visible in the front cameras now. What they do next is what they did: that is the truth
 which a model learns to predict. Thresholds are ours, as the paper publishes none.
@@ -26,6 +26,7 @@ from model.driving.thoughts import (
     EDGE_FARTHEST_M,
     EDGE_STEP_M,
     Beside,
+    Crosser,
     Crossing,
     Edges,
     Leader,
@@ -79,7 +80,7 @@ class _Placed:
 
 
 def thoughts_of(labelled: LabelledScene) -> Thoughts | None:
-    """The chain of thought of a scene's expert.
+    """The thoughts of a scene's expert.
 
     None where the scene has no annotated road, or the expert drives on no lane: then nothing can be said.
     """
@@ -228,7 +229,7 @@ def _crossing(placed: Iterable[_Placed], way: Way, speed_ms: float) -> Crossing 
 
 def _crosses(each: _Placed, way: Way, speed_ms: float) -> tuple[float, Crossing] | None:
     """When the agent comes into the ego's way, and what there is to tell of it."""
-    kind = "pedestrian" if each.track.kind == "pedestrian" else "vehicle"
+    kind: Crosser = "pedestrian" if each.track.kind == "pedestrian" else "vehicle"
     if each.in_lane:
         if each.along_ms > -STANDING_MS or kind == "pedestrian" or not each.along_m > 0:
             return None
@@ -237,11 +238,11 @@ def _crosses(each: _Placed, way: Way, speed_ms: float) -> tuple[float, Crossing]
             return None
         return meets_s, Crossing(kind, "oncoming", _told_m(each.gap_m), first=False)
     future = each.agent.future[:, :2].astype(np.float64)
-    future = future[np.isfinite(future[:, 0])]
-    if not len(future):
+    there = np.isfinite(future[:, 0])
+    if not there.any():
         return None
-    along_m, left_m = way.frame.places(future).T
-    there_s = STEP_S * np.arange(1, len(future) + 1)
+    along_m, left_m = way.frame.places(future[there]).T
+    there_s = STEP_S * (1 + np.flatnonzero(there))
     ours_s = along_m / speed_ms
     half_m = (EGO_WIDTH_M + each.track.width_m) / 2
     reach = (along_m > EGO_LENGTH_M / 2) & (along_m < CROSSES_WITHIN_M)

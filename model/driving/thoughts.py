@@ -1,4 +1,4 @@
-"""A chain of thought as facts, and the sentences that it is written in.
+"""Thoughts as facts, and the sentences that they are written in: ELF-VLA's chain of thought.
 
 The order is that of ELF-VLA's prompt (supplement, figure 6): the road's boundaries, then only the agents that
 may affect the ego, then what it does next. Agents are the three kinds of section 7.2: CIPO-1 leads in the own
@@ -31,7 +31,7 @@ _OTHER_SIDE: Final[Mapping[str, Side]] = {"left": "right", "right": "left"}
 
 
 class ThoughtError(ValueError):
-    """A text that is no chain of thought, or facts that there are no words for; the text says why."""
+    """A text that does not tell thoughts, or facts that there are no words for; the text says why."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Road:
 
 @dataclass(frozen=True)
 class Thoughts:
-    """A chain of thought; raises `ThoughtError` for facts that there are no words for.
+    """What leads to what the ego does next; raises `ThoughtError` for facts that there are no words for.
 
     Attributes:
         edges: of the road.
@@ -179,7 +179,7 @@ class Word:
     then: tuple[Words, ...] = ()
 
 
-Words = Mapping[str, Word]
+Words = dict[str, Word]
 """The texts that a decision is between."""
 
 
@@ -270,7 +270,7 @@ SENTENCES: Final = (
         ),
     ),
 )
-"""A chain of thought: all of these sentences, in this order."""
+"""Thoughts are all of these sentences, in this order."""
 
 
 def joined(texts: tuple[str, ...]) -> str:
@@ -281,7 +281,7 @@ def joined(texts: tuple[str, ...]) -> str:
         for sentence in SENTENCES
     ]
     if rest := list(left):
-        raise ThoughtError(f"nothing is behind a chain of thought, as is {rest[0]!r}")
+        raise ThoughtError(f"nothing may follow the last sentence, as does {rest[0]!r}")
     return SPACE.join(written)
 
 
@@ -294,12 +294,12 @@ def decisions(text: str) -> tuple[str, ...]:
             found += reader.decisions(words)
         reader.expect(END)
     if rest := text[reader.place :]:
-        raise ThoughtError(f"nothing is behind a chain of thought, as is {rest[:40]!r}")
+        raise ThoughtError(f"nothing may follow the last sentence, as does {rest[:40]!r}")
     return tuple(found)
 
 
 def read_thoughts(text: str) -> Thoughts:
-    """The facts of a chain of thought, the inverse of ``str``; raises `ThoughtError`."""
+    """The facts of a text, the inverse of ``str``; raises `ThoughtError`."""
     left = iter(decisions(text))
     meanings = [
         meaning for sentence in SENTENCES for words in sentence.words for meaning in _meant(words, left)

@@ -29,6 +29,7 @@ ROUTE_SPACING_M: Final = 4.0
 
 MAX_POSITION_M: Final = 1000.0
 """No pose within 6.4 s is farther away than this: 156 m/s would be needed."""
+_ACCELERATION_STEPS: Final = 10
 _PRESENT_TOLERANCE: Final = 1e-3
 _SAME_TIME_S: Final = 1e-6
 
@@ -157,6 +158,16 @@ def from_ego_frame(poses: npt.ArrayLike, present: npt.ArrayLike) -> npt.NDArray[
 def present_speed(history: FloatArray) -> float:
     """Signed forward speed in m/s at the present, from the last 0.3 s of a history [16, 4]."""
     return float(-history[-4, 0] / (3 * STEP_S))
+
+
+def present_acceleration(history: FloatArray) -> float:
+    """Change of the signed forward speed in m/s^2 over the last second of a history [16, 4]: its mean."""
+    last = history[-_ACCELERATION_STEPS - 1 :].astype(np.float64)
+    step, turned = np.diff(last[:, :2], axis=0), wrap_angle(np.diff(last[:, 3]))
+    heading = last[:-1, 3] + turned / 2
+    along = (step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading)) / STEP_S
+    times = STEP_S * (np.arange(_ACCELERATION_STEPS) - (_ACCELERATION_STEPS - 1) / 2)
+    return float(along @ times / (times @ times))
 
 
 def speeds(trajectory: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:

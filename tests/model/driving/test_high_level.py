@@ -99,6 +99,8 @@ def test_direction_is_told_against_the_lanes(
 def test_off_all_lanes_nothing_is_told() -> None:
     assert action_of(sideways(0.0), LaneGraph(())) is None
     assert action_of(sideways(0.0), LaneGraph((straight(8.0),))) is None
+    # A lane without any length is none.
+    assert action_of(sideways(0.0), LaneGraph((straight(0.0, 1.0, 1.01),))) is None
     # Nor is somebody on a lane who drives against it.
     assert action_of(sideways(0.0), LaneGraph((straight(0.0)[::-1],))) is None
 

@@ -12,6 +12,7 @@ from model.driving.high_level import HighLevelAction
 from model.driving.reasoning import edges_of, thoughts_of
 from model.driving.scene import LabelledScene
 from model.driving.thoughts import Crossing, Edges, Leader, Merging, Obstacle, Road, Thoughts
+from model.driving.trajectory import FloatArray
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene, rectangle
 from tests.model.driving.roads import arc, mirrored_scene, straight
 
@@ -50,7 +51,7 @@ def test_an_empty_road() -> None:
         ((rectangle(20, -5, 50, 5),), Edges(0.0, 0.0)),
     ],
 )
-def test_edges_are_told_in_half_metres(rings: tuple[np.ndarray, ...], edges: Edges) -> None:  # type: ignore[type-arg]
+def test_edges_are_told_in_half_metres(rings: tuple[FloatArray, ...], edges: Edges) -> None:
     assert edges_of(rings) == edges
 
 
@@ -69,6 +70,14 @@ def test_edges_are_told_in_half_metres(rings: tuple[np.ndarray, ...], edges: Edg
 )
 def test_cipo_1_leads_in_the_own_lane(somebody: Agent, leader: Leader | None) -> None:
     assert thoughts(somebody).leader == leader
+
+
+def test_the_time_of_a_crossing_counts_where_a_track_has_gaps() -> None:
+    walker = agent(32.0, -4.5, 1.5, np.pi / 2, "pedestrian")
+    poses = walker.poses.copy()
+    poses[20:30] = np.nan
+    seen, gap = thoughts(walker).crossing, thoughts(replace(walker, poses=poses)).crossing
+    assert seen == gap is not None
 
 
 def test_of_two_ahead_the_nearer_leads() -> None:

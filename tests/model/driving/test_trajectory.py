@@ -16,12 +16,13 @@ from model.driving.trajectory import (
     check_trajectory,
     constant_turn_rate,
     constant_velocity,
+    present_acceleration,
     present_speed,
     speeds,
     to_ego_frame,
     wrap_angle,
 )
-from tests.model.driving.drives import drive
+from tests.model.driving.drives import MIDDLES_S, drive
 
 
 @pytest.mark.parametrize("speed", [0.0, 12.5, -2.0])
@@ -137,3 +138,10 @@ def test_a_route_that_leads_nowhere_is_refused() -> None:
         with pytest.raises(GeometryError, match="leads nowhere"):
             check_route(stands)
     assert check_route(np.stack([np.zeros(20), 4.0 * np.arange(20)], axis=1)).shape == (20, 2)
+
+
+@pytest.mark.parametrize("acceleration_ms2", [-3.0, 0.0, 1.5])
+def test_the_present_acceleration(acceleration_ms2: float) -> None:
+    for yaw_rate in (0.0, 0.2):
+        _, history = drive(9.0 + acceleration_ms2 * MIDDLES_S, yaw_rate)
+        assert present_acceleration(history) == pytest.approx(acceleration_ms2, abs=0.02)
