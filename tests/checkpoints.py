@@ -14,6 +14,7 @@ from model.driving.scene import CLIP_FRAMES, FRONT_TELE, FRONT_WIDE, Clip, Scene
 from model.network.checkpoint import save, write_code_embeddings
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus, nano_phrases
+from model.network.numbers import needed_numbers, write_number_embeddings
 from model.network.settings import VlaSettings
 from model.network.vla import LookTwiceVla, nano_config
 from model.network.vocabulary import Vocabulary, build_nano_tokenizer
@@ -33,7 +34,9 @@ def write_untrained(folder: Path, *, narrow: bool = False, settings: VlaSettings
     """
     histories, futures = made_up_motions(400)
     codec = TrajectoryCodec.fit(histories, futures, size=CODEC_SIZE)
-    vocabulary = Vocabulary(build_nano_tokenizer(nano_corpus(), CODEC_SIZE, phrases=nano_phrases()))
+    numbers = needed_numbers(settings)
+    tokenizer = build_nano_tokenizer(nano_corpus(), CODEC_SIZE, phrases=nano_phrases(), numbers=numbers)
+    vocabulary = Vocabulary(tokenizer)
     config = nano_config(vocabulary, replace(settings, codec_size=CODEC_SIZE))
     config.text_config.num_hidden_layers = 2
     config.text_config.layer_types = config.text_config.layer_types[:2]
@@ -48,6 +51,7 @@ def write_untrained(folder: Path, *, narrow: bool = False, settings: VlaSettings
         torch.manual_seed(0)
         model = LookTwiceVla(config)
         write_code_embeddings(model, codec, vocabulary)
+        write_number_embeddings(model, vocabulary, set(numbers))
         if narrow:
             network: Any = model
             embeddings = network.get_input_embeddings().weight.detach()

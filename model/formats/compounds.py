@@ -19,6 +19,7 @@ from model.formats.pieces import (
     Sequence,
     Shorthand,
     Value,
+    children,
     repeatable,
 )
 
@@ -80,6 +81,11 @@ class Number(Compound):
         if not 0 <= round(steps) < len(self.texts) or abs(steps - round(steps)) > _OFF_GRID:
             raise FormatError(f"{value} is none of {self.low} to {self.high} in steps of {self.step}")
         return (self.texts[round(steps)],) if self.spelling == DIGITS else ((round(steps),),)
+
+    def nearest(self, number: float) -> float:
+        """The number of the grid that is nearest to a number; the first or the last one beyond its ends."""
+        steps = round((min(max(number, self.low), self.high) - self.low) / self.step)
+        return float(self.texts[steps])
 
     @cached_property
     def texts(self) -> tuple[str, ...]:
@@ -145,3 +151,11 @@ class RepeatRest(Shorthand):
         between = Literal(repeat.between if self.done else "")
         more = Sequence((between, repeat.piece, RepeatRest(repeat, self.done + 1)))
         return more if self.done < repeat.at_least else Maybe(more)
+
+
+def number_alphabets(piece: Piece) -> dict[str, int]:
+    """The alphabets that the numbers within ``piece`` are codes of, with how many numbers each has."""
+    if isinstance(piece, Number):
+        return {} if piece.spelling == DIGITS else {piece.spelling: len(piece.texts)}
+    within = (piece.piece,) if isinstance(piece, Repeat) else children(piece)
+    return {name: size for each in within for name, size in number_alphabets(each).items()}

@@ -314,7 +314,8 @@ def repeatable(piece: Piece) -> None:
     _refuse_sections(piece, "a repeat")
 
 
-def _children(piece: Piece) -> collections.abc.Sequence[Piece]:
+def children(piece: Piece) -> collections.abc.Sequence[Piece]:
+    """The pieces that ``piece`` is declared with; none of a shorthand that stands for others."""
     match piece:
         case Section(_, body) | Record(body):
             return (body,)
@@ -332,7 +333,7 @@ def _children(piece: Piece) -> collections.abc.Sequence[Piece]:
 def walk(piece: Piece) -> Iterator[Piece]:
     """``piece`` and the pieces within it, those that its shorthands stand for apart."""
     yield piece
-    for child in _children(piece):
+    for child in children(piece):
         yield from walk(child)
 
 
@@ -361,6 +362,6 @@ def _check_names(piece: Piece, above: frozenset[str]) -> frozenset[str]:
     if isinstance(piece, Choice):
         return above.union(*(_check_names(option.then, above) for option in piece.options))
     if isinstance(piece, Sequence | Maybe):
-        for child in _children(piece):
+        for child in children(piece):
             above = _check_names(child, above)
     return above

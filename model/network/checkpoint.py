@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, cast
@@ -22,10 +22,11 @@ from model.engines.engine import ModelCard
 from model.network.card import CheckpointError, read_card, weight_files, weights_revision, write_card
 from model.network.codec import CodecError, TrajectoryCodec
 from model.network.inputs import InputBuilder
+from model.network.numbers import needed_numbers, write_number_embeddings
 from model.network.repository import write_repository
 from model.network.settings import SettingsError, VlaSettings
 from model.network.vla import LookTwiceVla, VlaConfig, nano_config, padded_size, parameters_of, with_settings
-from model.network.vocabulary import Vocabulary, VocabularyError, expand_tokenizer
+from model.network.vocabulary import Vocabulary, VocabularyError, add_numbers, expand_tokenizer
 
 _PUBLISHED_NAMES: Final = {
     r"^visual\.": "model.visual.",
@@ -82,6 +83,7 @@ def create_nano(
         torch.manual_seed(seed)
         model = LookTwiceVla(config)
         write_code_embeddings(model, codec, vocabulary)
+        write_number_embeddings(model, vocabulary, set(needed_numbers(model.settings)))
     save(folder, model, vocabulary, codec)
 
 
@@ -206,6 +208,7 @@ def expand_stock(
     try:
         tokenizer = AutoTokenizer.from_pretrained(source, local_files_only=True)
         expand_tokenizer(tokenizer, codec.size)
+        add_numbers(tokenizer, needed_numbers(settings))
         vocabulary = Vocabulary(tokenizer)
         fitted = replace(
             settings,
@@ -225,7 +228,43 @@ def expand_stock(
         rows = max(padded_size(vocabulary), config.text_config.vocab_size)
         model.resize_token_embeddings(rows, mean_resizing=False)
         write_code_embeddings(model, codec, vocabulary)
+        write_number_embeddings(model, vocabulary, set(needed_numbers(fitted)))
     save(target, model, vocabulary, codec, details={"expanded_from": source.name})
+
+
+def with_formats(loaded: Loaded, formats: Sequence[str], *, seed: int = 0) -> Loaded:
+    """A checkpoint that may write more response formats, to be trained on them; changed in place.
+
+    Numbers that they write as tokens are added to its tokenizer, behind all others: what it writes in its own
+    formats stays the same to the token.
+
+    Args:
+        loaded: the checkpoint.
+        formats: beside its own.
+        seed: of the new weights.
+
+    Raises:
+        FamilyError: there is no such format.
+    """
+    settings = replace(loaded.settings, formats=tuple(dict.fromkeys((*loaded.settings.formats, *formats))))
+    vocabulary, model = loaded.vocabulary, loaded.model
+    sizes = needed_numbers(settings)
+    if new := set(sizes) - set(vocabulary.alphabets):
+        add_numbers(vocabulary.tokenizer, sizes)
+        vocabulary = Vocabulary(vocabulary.tokenizer)
+        embeddings: Any = model.get_input_embeddings()
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            rows = max(padded_size(vocabulary), len(embeddings.weight))
+            model.resize_token_embeddings(rows, mean_resizing=False)
+            write_number_embeddings(model, vocabulary, new)
+    with_settings(model.config, settings, vocabulary)
+    return replace(
+        loaded,
+        vocabulary=vocabulary,
+        inputs=InputBuilder(vocabulary, settings),
+        card=replace(loaded.card, formats=settings.formats),
+    )
 
 
 @torch.no_grad()

@@ -6,8 +6,10 @@ Special tokens are spelt as in CF-VLA sections 7 and 8; the route's markers and 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -70,6 +72,8 @@ _QWEN_WORDS: Final = (
 # A nano model's words besides: where a meta-action begins, "  - 0.5s-", and a time alone. Both are read and
 # written thousands of times; in single digits they make three quarters of a response's tokens.
 _PLAN_WORDS: Final = r"  - \d\.\ds-|\d\.\d"
+_NUMBER: Final = re.compile(r"<\|([a-z_]+)_(\d{4})\|>")
+"""The spelling of a number of an alphabet; see `number_token`."""
 _ENCODE_CACHE: Final = 4096
 
 
@@ -96,6 +100,7 @@ class Vocabulary:
         if missing:
             raise VocabularyError(f"the tokenizer lacks {', '.join(missing)}")
         self.codec_size = self._count_codes()
+        self._numbers = self._find_numbers()
         self._free: dict[bool, npt.NDArray[np.bool_]] = {}
         self._encode = lru_cache(_ENCODE_CACHE)(self._encode_now)
 
@@ -132,8 +137,11 @@ class Vocabulary:
 
     @cached_property
     def alphabets(self) -> Mapping[str, tuple[range, ...]]:
-        """Named alphabets of codes: for each codebook the ids of its tokens."""
-        return {TRAJECTORY: tuple(map(self.code_ids, range(CODES)))}
+        """Named alphabets of codes: for each codebook the ids of its tokens.
+
+        Those of the trajectory codes, and those of numbers that the checkpoint writes as one token each.
+        """
+        return {TRAJECTORY: tuple(map(self.code_ids, range(CODES))), **self._numbers}
 
     def free_text_ids(self, *, multiline: bool = False) -> npt.NDArray[np.bool_]:
         """Mask bool [len(self)] of tokens that free text may hold.
@@ -153,6 +161,16 @@ class Vocabulary:
     def _encode_now(self, text: str) -> tuple[int, ...]:
         return tuple(self._backend.encode(text, add_special_tokens=False).ids)
 
+    def _find_numbers(self) -> dict[str, tuple[range]]:
+        sizes = Counter(found[1] for token in self._ids if (found := _NUMBER.fullmatch(token)))
+        alphabets = {}
+        for name, size in sizes.items():
+            first = self._ids.get(number_token(name, 0), -1)
+            if any(self._ids.get(number_token(name, number)) != first + number for number in range(size)):
+                raise VocabularyError(f"the numbers of {name!r} must be {size} tokens side by side")
+            alphabets[name] = (range(first, first + size),)
+        return alphabets
+
     def _count_codes(self) -> int:
         size = 0
         while code_token(0, size) in self._ids:
@@ -171,8 +189,17 @@ def code_token(stage: int, code: int) -> str:
     return f"<|traj_{stage}_{code:03d}|>"
 
 
+def number_token(alphabet: str, number: int) -> str:
+    """The spelling of a number of an alphabet, counted from the least, e.g. ``<|x_m_0123|>``."""
+    return f"<|{alphabet}_{number:04d}|>"
+
+
 def build_nano_tokenizer(
-    corpus: Iterable[str], codec_size: int, size: int = 3072, phrases: Iterable[str] = ()
+    corpus: Iterable[str],
+    codec_size: int,
+    size: int = 3072,
+    phrases: Iterable[str] = (),
+    numbers: Mapping[str, int] = MappingProxyType({}),
 ) -> PreTrainedTokenizerFast:
     """A byte-level BPE tokenizer trained on ``corpus``, with all markers and 6 x ``codec_size`` codes.
 
@@ -182,6 +209,7 @@ def build_nano_tokenizer(
         size: ordinary tokens, at least the 256 bytes; fewer when the corpus has no more repeated parts.
         phrases: runs of text that count as one word, so that a corpus that holds them makes each a single
             token. A decimal and the beginning of a meta-action are such words too, phrases or not.
+        numbers: sizes of alphabets of numbers.
     """
     backend = Tokenizer(models.BPE())
     words = [re.escape(phrase) for phrase in sorted(phrases, key=len, reverse=True)]
@@ -206,6 +234,7 @@ def build_nano_tokenizer(
     )
     _add(tokenizer, QWEN_TOKENS, special=True)
     expand_tokenizer(tokenizer, codec_size)
+    add_numbers(tokenizer, numbers)
     result: PreTrainedTokenizerFast = tokenizer
     return result
 
@@ -219,6 +248,13 @@ def expand_tokenizer(tokenizer: Any, codec_size: int) -> int:
     _add(tokenizer, codes, special=False)
     _add(tokenizer, TRACK_TOKENS, special=True)
     return len(tokenizer) - before
+
+
+def add_numbers(tokenizer: Any, sizes: Mapping[str, int]) -> None:
+    """Add alphabets of numbers to a tokenizer in place, behind all its tokens; those that it has are kept."""
+    tokens = [number_token(name, number) for name, size in sizes.items() for number in range(size)]
+    # Not special, as codes are not.
+    _add(tokenizer, tokens, special=False)
 
 
 def _add(tokenizer: Any, tokens: Iterable[str], *, special: bool) -> None:

@@ -18,7 +18,7 @@ from torch.utils.data import Dataset
 from model.driving.reflection_store import read_reflections
 from model.driving.scene import LabelledScene
 from model.network.attention import MATMUL_ATTENTION
-from model.network.checkpoint import Loaded, create_nano, load, save
+from model.network.checkpoint import Loaded, create_nano, load, save, with_formats
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus, nano_phrases
 from model.network.settings import NANO_SETTINGS
@@ -88,7 +88,7 @@ def run(
     Args:
         recipe: what to do.
         scenes: training scenes, a file or folder.
-        source: the checkpoint to start from.
+        source: the checkpoint to start from; formats of the recipe that it does not write are added to its.
         target: the checkpoint to write.
         settings: see there.
         validation: scenes to report open-loop errors on while training with pictures.
@@ -104,6 +104,8 @@ def run(
         wants = "needs reflections" if reflections is None else "takes no reflections"
         raise ValueError(f"recipe {recipe.name} {wants}")
     loaded = load(source)
+    if new := [task for task in recipe.tasks if task not in loaded.settings.formats]:
+        loaded = with_formats(loaded, new, seed=recipe.seed)
     stages = list(loaded.card.details.get("stages", []))
     if vision_source is not None:
         vision = load(vision_source)

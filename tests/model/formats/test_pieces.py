@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from model.driving.plan import GROUPS, WORDS, parse_plan
 from model.families.trajectory_codes import CODES, TRAJECTORY
-from model.formats.compounds import MAX_REPEATS, Number, Repeat
+from model.formats.compounds import MAX_REPEATS, Number, Repeat, number_alphabets
 from model.formats.cursor import CompiledFormat, Cursor
 from model.formats.pieces import (
     Choice,
@@ -173,6 +173,18 @@ def test_numbers_spell_what_their_grid_needs() -> None:
     assert Number(-1, 1, 0.5).texts == ("-1.0", "-0.5", "0.0", "0.5", "1.0")
     assert Number(0, 20, 10).texts == ("0", "10", "20")
     assert Number(0.25, 0.75, 0.25).texts == ("0.25", "0.50", "0.75")
+
+
+def test_the_nearest_number_of_a_grid() -> None:
+    grid = Number(-1.0, 2.0, 0.1)
+    assert [grid.nearest(number) for number in (0.26, -0.04, -7, 7, 0.3)] == [0.3, 0.0, -1.0, 2.0, 0.3]
+    assert str(grid.nearest(-0.01)) == "0.0"
+
+
+def test_alphabets_of_numbers_are_told() -> None:
+    tenth = Number(-1.0, 1.0, 0.1, "tenth", name="tenth")
+    within = Section("answer", Repeat(Record(Sequence((Literal("("), tenth, Literal(")")))), 3))
+    assert number_alphabets(Choice((Option("a", within), Option("b", Number(0, 9, 1))))) == {"tenth": 21}
 
 
 NUMBER = compile_(Section("speed", Sequence((Number(0, 120, 1), Literal(" km/h")))))

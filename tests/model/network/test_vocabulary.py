@@ -54,6 +54,28 @@ def test_free_text_writes_english_but_no_markers(vocabulary: Vocabulary) -> None
         assert not mask[vocabulary.encode(token)[0]]
 
 
+def test_numbers_are_tokens_behind_all_others() -> None:
+    plain = build_nano_tokenizer(["a b"], 4, size=260)
+    before = Vocabulary(plain)
+    with_numbers = build_nano_tokenizer(["a b"], 4, size=260, numbers={"x_m": 21, "turn_rad": 3})
+    after = Vocabulary(with_numbers)
+    assert set(before.alphabets) == {"trajectory"}
+    assert after.alphabets["x_m"] == (range(len(before), len(before) + 21),)
+    assert after.alphabets["turn_rad"] == (range(len(before) + 21, len(before) + 24),)
+    assert after.decode([len(before) + 7]) == "<|x_m_0007|>"
+    assert [after.decode([id]) for id in range(len(before))] == [
+        before.decode([id]) for id in range(len(before))
+    ]
+    assert not after.free_text_ids()[len(before) :].any()
+
+
+def test_numbers_must_lie_side_by_side() -> None:
+    tokenizer = build_nano_tokenizer(["a b"], 4, size=260, numbers={"x_m": 2})
+    tokenizer.add_tokens(["<|other|>", "<|x_m_0002|>"])
+    with pytest.raises(VocabularyError, match="the numbers of 'x_m' must be 3 tokens side by side"):
+        Vocabulary(tokenizer)
+
+
 def test_digits_are_single_tokens(vocabulary: Vocabulary) -> None:
     assert len(vocabulary.encode("2026")) == 4
 
