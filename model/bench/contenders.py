@@ -174,7 +174,7 @@ class Transformers(Contender):
         model: Any = loaded.model
         with torch.inference_mode():
             prompts = [
-                model.encode_prompt_embeddings(loaded.inputs.build(request.scene, format))
+                model.encode_prompt_embeddings(loaded.inputs.build(request.scene, format, request.attempt))
                 for request in requests
             ]
             embeddings = torch.stack([prompt.embeddings for prompt in prompts]).repeat_interleave(n, 0)

@@ -14,7 +14,7 @@ from model.engines.engine import Controls, DrawFinished, PlanRequest
 from model.engines.sampling import probabilities, uniform
 from model.engines.torch.batch import Batch, Feed
 from model.engines.torch.decoder import Decoder
-from model.engines.torch.runner import Prompt, Runner
+from model.engines.torch.runner import Asked, Prompt, Runner
 from model.formats.text import parse
 from model.network.checkpoint import load
 
@@ -95,7 +95,7 @@ def _margin(exact: Runner, request: PlanRequest, draw: int, written: Sequence[in
     cursor = exact.formats[request.format].start()
     for token in written:
         cursor = cursor.advance(token)
-    [prompt] = exact.begin_prompts([(request.scene, request.format, 0)])
+    [prompt] = exact.begin_prompts([Asked(request.scene, request.format, 0)])
     assert isinstance(prompt, Prompt)
     exact.feed_prompts([(prompt, exact.prompt_tokens)])
     feed = Feed(0, prompt, 0, [prompt.last_token, *written], [(len(written), cursor.allowed().ids)])

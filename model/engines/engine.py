@@ -12,6 +12,7 @@ from typing import Any, Literal, Protocol
 from model.driving.plan import Plan
 from model.driving.scene import Scene
 from model.driving.trajectory import TEN_HZ_S, FloatArray, at_10_hz
+from model.families.family import Attempt
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
@@ -118,6 +119,7 @@ class PlanRequest:
         scene: what the car sees.
         format: a response format the checkpoint was trained on.
         controls: what the caller decides.
+        attempt: to be refined; needed exactly where the format's family refines one.
         live: tell of free text as it is written (`TextWritten`), not only when its section is finished.
     """
 
@@ -125,6 +127,7 @@ class PlanRequest:
     scene: Scene
     format: str = "cf_vla"
     controls: Controls = field(default_factory=Controls)
+    attempt: Attempt | None = None
     live: bool = False
 
 

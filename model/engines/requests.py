@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 
 from model.driving.plan import Plan
-from model.driving.trajectory import check_trajectory
+from model.driving.trajectory import GeometryError, check_trajectory
 from model.engines.engine import Draw, ModelCard, PlanRequest, RequestError
 from model.engines.reason_mask import ReasonMask
 from model.engines.response import Response
@@ -30,8 +30,8 @@ def begin(
         families, formats: of the checkpoint, by name.
 
     Raises:
-        RequestError: it can never be served: an unknown format, a missing camera, or a prefill that the
-            format cannot write.
+        RequestError: it can never be served: an unknown format, a missing camera, a prefill that the format
+            cannot write, or an attempt that its family does not refine.
     """
     if request.format not in formats:
         known = ", ".join(formats)
@@ -39,6 +39,7 @@ def begin(
     family = families[request.format]
     if request.controls.prefill is not None and family.first_plan is None:
         raise RequestError(f"prefill: responses in format {request.format!r} have no plan to be given")
+    _check_attempt(request, family)
     try:
         start = formats[request.format].start(given_plans(request, family))
     except FormatError as error:
@@ -47,6 +48,17 @@ def begin(
     if missing := [camera for camera in card.cameras if camera not in cameras]:
         raise RequestError(f"the scene lacks camera {', '.join(missing)}, which this checkpoint needs")
     return start
+
+
+def _check_attempt(request: PlanRequest, family: Family) -> None:
+    if family.refines != (request.attempt is not None):
+        wants = "refines an attempt, and the request has none" if family.refines else "refines no attempt"
+        raise RequestError(f"attempt: format {request.format!r} {wants}")
+    if request.attempt is not None:
+        try:
+            check_trajectory(request.attempt.trajectory, family.times_s)
+        except GeometryError as error:
+            raise RequestError(f"attempt: {error}") from error
 
 
 def given_plans(request: PlanRequest, family: Family) -> dict[str, Plan]:

@@ -8,6 +8,8 @@ from model.driving.images import encode_jpeg
 from model.driving.scene import CLIP_FRAMES, Clip, Scene
 from model.driving.trajectory import HISTORY_STEPS
 from model.engines.engine import Controls, Engine, ModelCard, PlanRequest
+from model.families.family import Attempt
+from model.families.registry import family_named
 
 
 def grey_scene(card: ModelCard) -> Scene:
@@ -21,6 +23,14 @@ def grey_scene(card: ModelCard) -> Scene:
 async def warm_up(engine: Engine) -> None:
     """Plan once for a grey scene in every format."""
     for format in engine.card.formats:
-        request = PlanRequest(f"warm-up {format}", grey_scene(engine.card), format, Controls(n=1))
+        family = family_named(format)
+        standing = np.zeros((len(family.times_s), 4), np.float32)
+        request = PlanRequest(
+            f"warm-up {format}",
+            grey_scene(engine.card),
+            format,
+            Controls(n=1),
+            Attempt(standing, "Drive on.") if family.refines else None,
+        )
         async for _ in engine.submit(request):
             pass

@@ -60,7 +60,9 @@ def standard_variants(
 ) -> list[Variant]:
     """The open-loop table's rows for a checkpoint that writes ``formats`` and takes ``inputs``."""
     no_branch = replace(controls, thinking="adaptive", think_threshold=None)
-    families = sorted(map(family_named, formats), key=lambda family: family.first_plan is not None)
+    # Scenes bring no attempt to be refined.
+    families = [family for family in map(family_named, formats) if not family.refines]
+    families.sort(key=lambda family: family.first_plan is not None)
     variants = []
     given = [("", False, False), (" + route", True, False), (" + route + tracks", True, True)]
     for suffix, route, tracks in given if "tracks" in inputs else given[:2]:

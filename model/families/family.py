@@ -8,6 +8,7 @@ from functools import cached_property
 
 from model.driving.phrases import ReflectionLanguage
 from model.driving.plan import Plan
+from model.driving.thoughts import Thoughts
 from model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, check_times
 from model.formats.pieces import Format, Values, choices
 
@@ -32,16 +33,31 @@ class Branch:
 
 
 @dataclass(frozen=True, eq=False)
+class Attempt:
+    """An answer that was given to a scene before, to be refined.
+
+    Attributes:
+        trajectory: float32 [t, 4], the draft, at the times of the family that refines it.
+        feedback: what is said of it.
+    """
+
+    trajectory: FloatArray
+    feedback: str
+
+
+@dataclass(frozen=True, eq=False)
 class Situation:
     """What text inputs are made of: what a scene and an example of training both know.
 
     Attributes:
         history: float32 [16, 4].
         route: float32 [20, 2]; None where the prompt has none.
+        attempt: given exactly to families that refine one.
     """
 
     history: FloatArray
     route: FloatArray | None = None
+    attempt: Attempt | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +86,8 @@ class Reading:
         codes: the trajectory codes that it was decoded from, if any.
         plan: the first one, or the one that the caller gave.
         branch: the option that was taken.
-        reflection: what is wrong with the first plan, in words.
+        reflection: what is wrong with the first plan, in words; without a plan, the thoughts that lead to the
+            trajectory.
         revised_plan: what takes its place.
     """
 
@@ -106,12 +123,14 @@ class Lesson:
         codes: the expert's trajectory codes.
         future: float32 [64, 4], the expert's trajectory at 10 Hz.
         reflection: on a plan of the model's own, if any.
+        thoughts: that lead to what the expert does; None where the scene's annotations do not tell.
     """
 
     plan: Plan
     codes: tuple[int, ...]
     future: FloatArray
     reflection: Reflection | None = None
+    thoughts: Thoughts | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,11 +146,12 @@ class Family:
         times_s: of the poses of its trajectories, 64 at 10 Hz unless it says otherwise.
         first_plan: the section of the plan that it writes first, and that callers may give.
         branch: where it may take a second look, which is a reflection, a revised plan, or both.
-        reflection: the section where it says what is wrong with its first plan.
+        reflection: the section where it says what is wrong with its first plan, or thinks without one.
         revised_plan: the section of the plan that takes the first one's place.
         teach: the values of the response that a labelled scene teaches; None where nothing is trained.
         title: what tables of measures call it; its name without one.
         dialects: other formats of the same name, for checkpoints whose reflections are written otherwise.
+        refines: whether its prompts hold an `Attempt`, which every request then has to bring.
 
     Raises:
         FamilyError: the format lacks a section or the branch that is declared, or times do not ascend.
@@ -150,6 +170,7 @@ class Family:
     teach: Callable[[Lesson], Values] | None = None
     title: str | None = None
     dialects: Mapping[ReflectionLanguage, Format] = field(default_factory=dict)
+    refines: bool = False
 
     def __post_init__(self) -> None:
         declared = (

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from model.driving.images import decode_image
 from model.driving.scene import Scene
 from model.driving.trajectory import FloatArray
-from model.families.family import Situation, TextInputs
+from model.families.family import Attempt, Situation, TextInputs
 from model.families.registry import family_named
 from model.formats.cursor import CompiledFormat
 from model.network.patches import normalise, patchify, resize
@@ -79,18 +79,19 @@ class InputBuilder:
         """int64 [cameras, 3]."""
         return np.array([self.settings.grid] * len(self.settings.cameras), np.int64)
 
-    def build(self, scene: Scene, format: str) -> ModelInputs:
-        """The inputs of ``scene`` for a response in ``format``.
+    def build(self, scene: Scene, format: str, attempt: Attempt | None = None) -> ModelInputs:
+        """The inputs of ``scene`` for a response in ``format``, which may refine an attempt.
 
         Raises:
             SceneError: a camera is missing.
             ImageError: a picture cannot be decoded.
-            FamilyError: an unknown format.
+            FamilyError: an unknown format, or one that refines an attempt where there is none.
             FormatError: its family says of the scene what its prompt cannot say.
         """
         route, tracks = self.way(scene), self.tracks(scene)
+        situation = Situation(scene.history, route, attempt)
         return ModelInputs(
-            prompt=self.prompt(format, Situation(scene.history, route), tracks=tracks is not None),
+            prompt=self.prompt(format, situation, tracks=tracks is not None),
             patches=np.concatenate([self.patches(pictures) for pictures in self.slices(scene)]),
             video_grid_thw=self.video_grid_thw,
             history=scene.history,

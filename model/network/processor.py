@@ -8,6 +8,7 @@ import torch
 from transformers import BatchFeature, ProcessorMixin
 
 from model.driving.scene import Scene
+from model.families.family import Attempt
 from model.network.inputs import InputBuilder
 from model.network.settings import CONFIG_KEY, VlaSettings
 from model.network.vocabulary import Vocabulary
@@ -29,7 +30,7 @@ class LookTwiceProcessor(ProcessorMixin):
         self.looktwice = looktwice or {}
         self.inputs = InputBuilder(Vocabulary(tokenizer), VlaSettings.from_dict(self.looktwice))
 
-    def __call__(self, scene: Scene, format: str = "cf_vla") -> BatchFeature:
+    def __call__(self, scene: Scene, format: str = "cf_vla", attempt: Attempt | None = None) -> BatchFeature:
         """One scene as tensors with a batch of one, for the network's `forward`.
 
         Keys are ``input_ids`` and ``attention_mask`` [1, t], ``pixel_values_videos`` [p, 1176],
@@ -39,7 +40,7 @@ class LookTwiceProcessor(ProcessorMixin):
         Raises:
             SceneError, ImageError, FamilyError: as `InputBuilder.build`.
         """
-        built = self.inputs.build(scene, format)
+        built = self.inputs.build(scene, format, attempt)
         ids = torch.from_numpy(built.prompt.ids.copy())[None]
         given = {"history": built.history, "route": built.route, "tracks": built.tracks}
         return BatchFeature(

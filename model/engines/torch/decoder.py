@@ -32,7 +32,7 @@ from model.engines.torch.drafter import Drafter
 from model.engines.torch.integrity import check
 from model.engines.torch.request import Phase, Request, Tree
 from model.engines.torch.rows import Row
-from model.engines.torch.runner import ROWS_A_TREE, Runner
+from model.engines.torch.runner import ROWS_A_TREE, Asked, Runner
 from model.engines.torch.scheduler import Scheduler
 from model.engines.torch.shortcuts import Shortcuts
 
@@ -273,7 +273,8 @@ class Decoder:
         scenes = []
         for tree in trees:
             assert tree.kv_row is not None
-            scenes.append((tree.request.plan_request.scene, tree.request.plan_request.format, tree.kv_row))
+            asked = tree.request.plan_request
+            scenes.append(Asked(asked.scene, asked.format, tree.kv_row, asked.attempt))
         events: list[StepEvent] = []
         for tree, begun in zip(trees, self._runner.begin_prompts(scenes), strict=True):
             if tree.request.phase is Phase.ENDED:

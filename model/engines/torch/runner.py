@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +41,7 @@ from model.engines.torch.layout import (
 from model.engines.torch.memory import IntArray, Memory, SlotMapping
 from model.engines.torch.packed import Attention, PackedDecoder, Rotation
 from model.engines.torch.vision import Encoded, VisionEncoder
-from model.families.family import Family, Situation
+from model.families.family import Attempt, Family, Situation
 from model.families.registry import families_of
 from model.formats.cursor import CompiledFormat
 from model.network.checkpoint import Loaded
@@ -50,6 +50,15 @@ ROWS_A_TREE: Final = 12
 """Rows, drafts among them, that share a KV row at first."""
 USUAL_TOKENS: Final = 128
 """Of a response. A KV row has room for so many of each of its rows; what outgrows it takes another one."""
+
+
+class Asked(NamedTuple):
+    """All that decides a prompt, and the KV row that it goes to."""
+
+    scene: Scene
+    format: str
+    kv_row: int
+    attempt: Attempt | None = None
 
 
 @dataclass(eq=False)
@@ -186,23 +195,23 @@ class Runner:
         """Make the kernels of passes with up to so many tokens."""
         self._decoder.warm_up(sorted({bucket(count) for count in range(1, tokens + 1)}))
 
-    def begin_prompts(self, scenes: Sequence[tuple[Scene, str, int]]) -> list[Prompt | Exception]:
+    def begin_prompts(self, asked: Sequence[Asked]) -> list[Prompt | Exception]:
         """Begin to prefill scenes, their pictures encoded all at once.
 
         Of each prompt its KV row holds what is known already. A scene that cannot be made into inputs (a
         missing camera, a damaged picture) gets its exception.
 
         Args:
-            scenes: with format and KV row.
+            asked: scenes with all that decides their prompts.
         """
-        pictures = self._vision.encode([scene for scene, _, _ in scenes])
+        pictures = self._vision.encode([each.scene for each in asked])
         begun: list[Prompt | Exception] = []
-        for (scene, format, kv_row), encoded in zip(scenes, pictures, strict=True):
+        for each, encoded in zip(asked, pictures, strict=True):
             if isinstance(encoded, Exception):
                 begun.append(encoded)
                 continue
             try:
-                begun.append(self._begin_prompt(scene, format, kv_row, encoded))
+                begun.append(self._begin_prompt(each, encoded))
             except Exception as error:  # one scene that cannot be embedded must not end the others
                 begun.append(error)
         return begun
@@ -322,10 +331,11 @@ class Runner:
         rotation = self._rotation.at(positions.to(device))
         return self._decoder(embeddings, rotation, attention, wanted.to(device) if len(wanted) else None)
 
-    def _begin_prompt(self, scene: Scene, format: str, kv_row: int, encoded: Encoded) -> Prompt:
-        loaded = self.loaded
+    def _begin_prompt(self, asked: Asked, encoded: Encoded) -> Prompt:
+        loaded, (scene, format, kv_row, attempt) = self.loaded, asked
         route, tracks = loaded.inputs.way(scene), loaded.inputs.tracks(scene)
-        prompt = loaded.inputs.prompt(format, Situation(scene.history, route), tracks=tracks is not None)
+        situation = Situation(scene.history, route, attempt)
+        prompt = loaded.inputs.prompt(format, situation, tracks=tracks is not None)
         embedded = loaded.model.embed_prompt(prompt, encoded.tokens, scene.history, route, tracks)
         shown = format.encode() + encoded.digest
         rotation = self._decoder.rotation(embedded.position_ids)

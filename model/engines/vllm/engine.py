@@ -24,6 +24,7 @@ from model.engines.requests import begin
 from model.engines.vllm.decoding import Decoding, VllmPrompt
 from model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
 from model.engines.warm_up import warm_up
+from model.families.family import Attempt
 from model.families.registry import families_of
 from model.formats.cursor import Active, CompiledFormat, Cursor, Rest
 from model.formats.grammar_export import to_lark
@@ -155,8 +156,8 @@ class VllmEngine:
         )
         self._running[request.request_id] = decoding
         try:
-            scene, format = request.scene, request.format
-            prompt = await self._pictures.run(lambda: self.prompt(scene, format), scene.pictures)
+            scene, format, attempt = request.scene, request.format, request.attempt
+            prompt = await self._pictures.run(lambda: self.prompt(scene, format, attempt), scene.pictures)
             async with aclosing(decoding.events(prompt)) as events:
                 async for event in events:
                     yield event
@@ -168,15 +169,15 @@ class VllmEngine:
         if decoding := self._running.get(request_id):
             decoding.fail(EngineError("the request was cancelled"))
 
-    def prompt(self, scene: Scene, format: str) -> VllmPrompt:
-        """A scene as vLLM takes it.
+    def prompt(self, scene: Scene, format: str, attempt: Attempt | None = None) -> VllmPrompt:
+        """A scene as vLLM takes it, with the attempt that is to be refined.
 
         Raises:
             RequestError: the scene cannot be made into inputs (a missing camera).
             ImageError: a picture is damaged.
         """
         try:
-            inputs = self._parts.inputs.build(scene, format)
+            inputs = self._parts.inputs.build(scene, format, attempt)
         except ImageError:
             raise
         except ValueError as error:

@@ -78,7 +78,7 @@ def reference(
 def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> tuple[Draw, Shares]:
     model: Any = loaded.model
     controls = request.controls
-    inputs = loaded.inputs.build(request.scene, request.format)
+    inputs = loaded.inputs.build(request.scene, request.format, request.attempt)
     prompt = model.encode_prompt_embeddings(inputs)
     cache = DynamicCache(config=model.config)
     logits = model(
