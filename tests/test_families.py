@@ -1,4 +1,4 @@
-"""Only CF-VLA's own folder names its sections and branch words; everybody else asks the family."""
+"""Only a family's own folder names its sections and words; everybody else asks the family."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import ast
 from collections.abc import Iterator
 
 from model.families.cf_vla import CF_VLA
+from model.families.elf_vla import ELF_VLA
 from tests.test_architecture import ROOT, modules
 
 assert CF_VLA.branch is not None
@@ -63,6 +64,23 @@ def test_nobody_else_names_sections_and_branch_words() -> None:
         if not place.startswith(HOME):
             counts[place] = named(path.read_text(), SECTIONS if place.startswith(ROOMS) else frozenset())
     assert {path: count for path, count in counts.items() if count} == OTHERWISE
+
+
+ELF_VLA_WORDS = ("<think>", "</think>", "<answer>", "</answer>")
+
+
+def test_nobody_else_names_sections_and_words_of_elf_vla() -> None:
+    sections = frozenset(ELF_VLA.format.sections())
+    found = {
+        str(path.relative_to(ROOT)): text
+        for _, path in modules()
+        if (room := str(path.relative_to(ROOT))).startswith(ROOMS)
+        and not room.startswith("model/families/elf_vla/")
+        for text in literals(path.read_text())
+        if text in sections or any(word in text for word in ELF_VLA_WORDS)
+    }
+    # What a branch of CF-VLA's is counted as.
+    assert found == {"service/metrics.py": "think"}
 
 
 def test_literals_are_counted_and_docstrings_are_not() -> None:

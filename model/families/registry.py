@@ -15,13 +15,14 @@ from typing import Final
 
 from model.driving.phrases import ReflectionLanguage
 from model.families.cf_vla import CF_VLA
+from model.families.elf_vla import ELF_VLA, ELF_VLA_REFINE
 from model.families.family import Family, FamilyError
 from model.families.traj_only import TRAJ_ONLY
 
 GROUP: Final = "looktwice.families"
 """The entry points that declare families."""
 
-_OURS: Final = {family.name: family for family in (CF_VLA, TRAJ_ONLY)}
+_OURS: Final = {family.name: family for family in (CF_VLA, TRAJ_ONLY, ELF_VLA, ELF_VLA_REFINE)}
 
 
 @cache

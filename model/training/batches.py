@@ -149,12 +149,13 @@ class ResponseDataset(Dataset[Sample]):
         examples, index = self._examples, item.index
         history, future = examples.history[index], examples.future[index]
         route, tracks = np.nan_to_num(examples.route[index]), examples.tracks[index]
-        plan = examples.plan(index)
+        plan, thoughts = examples.plan(index), examples.thought(index)
         tracks = tracks.copy() if item.route else without_route(tracks)
         if item.mirror:
             history, future, route = history * _MIRROR, future * _MIRROR, route * _MIRROR[:2]
             tracks[:, MIRRORED] *= -1
             plan = plan.mirrored()
+            thoughts = None if thoughts is None else thoughts.mirrored()
         if item.blur:
             history = steady_history(present_speed(history))
         vector = self._codec.vectors(history[None], future[None])[0]
@@ -163,12 +164,13 @@ class ResponseDataset(Dataset[Sample]):
             found = [mirrored(each) for each in found]
         reflections: Sequence[Reflection | None] = found or [None]
         soft = [self._soft.draw(vector, self._random) for _ in reflections]
+        lessons = [
+            Lesson(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts)
+            for drawn, reflection in zip(soft, reflections, strict=True)
+        ]
         return Sample(
             prompt=self._prompt(item, Situation(history, route if item.route else None)),
-            responses=[
-                self._target(item.task, Lesson(plan, tuple(drawn.codes.tolist()), future, reflection))
-                for drawn, reflection in zip(soft, reflections, strict=True)
-            ],
+            responses=[self._target(item.task, lesson) for lesson in lessons],
             seen=self._vision.tokens(index, item.mirror) if self._vision is not None else None,
             patches=self._patches(item) if self._pictures and self._vision is None else None,
             history=history,

@@ -19,8 +19,10 @@ from model.driving.facts import scene_facts
 from model.driving.hashing import hash_of
 from model.driving.labeller import expert_plan
 from model.driving.plan import Plan, plan_from_bins
+from model.driving.reasoning import thoughts_of
 from model.driving.scene import CLIP_FRAMES, LabelledScene
 from model.driving.scene_store import read_scenes, scene_files
+from model.driving.thoughts import Thoughts, read_thoughts
 from model.driving.tracks import tracks_of
 from model.driving.trajectory import FloatArray
 from model.driving.whole_files import written_whole
@@ -28,7 +30,7 @@ from model.network.inputs import InputBuilder
 from model.network.track_features import track_features
 from model.training.dense import coarse, no_target, relative_motion
 
-CACHE_VERSION: Final = 3
+CACHE_VERSION: Final = 4
 DENSE_FAR_M: Final = 200.0
 """Ranges beyond are all the same to a dense target."""
 
@@ -50,6 +52,7 @@ class Examples:
         dense_motion: float16 [N, cameras, 2, 24, 48], speed of agents relative to the ego, forward and to the
             left in the ego frame, divided by `SPEED_SCALE_MS`; 0 where no agent is.
         facts: float32 [N, facts].
+        thoughts: str [N], the expert's; empty where annotations do not tell it.
         episode: int64 [N], the simulator's seed.
         scene_id: str [N].
     """
@@ -65,6 +68,7 @@ class Examples:
     dense_range_log: npt.NDArray[np.float16]
     dense_motion: npt.NDArray[np.float16]
     facts: FloatArray
+    thoughts: npt.NDArray[np.str_]
     episode: npt.NDArray[np.int64]
     scene_id: npt.NDArray[np.str_]
 
@@ -75,6 +79,11 @@ class Examples:
         """One encoded picture."""
         first, last = self.picture_spans[index, camera, frame]
         return self.pictures[first:last].tobytes()
+
+    def thought(self, index: int) -> Thoughts | None:
+        """The expert's thoughts; None where they are not known."""
+        text = str(self.thoughts[index])
+        return read_thoughts(text) if text else None
 
     def plan(self, index: int) -> Plan:
         """The expert's plan."""
@@ -110,6 +119,7 @@ class Examples:
             )
             columns["dense_motion"].append([relative_motion(target, labelled) for target in cells])
             columns["facts"].append(scene_facts(labelled))
+            columns["thoughts"].append(str(thoughts_of(labelled) or ""))
             columns["episode"].append(labelled.seed)
             columns["scene_id"].append(scene.scene_id)
         types: dict[str, Any] = {"picture_spans": np.int64, "plan_bins": np.int8, "dense_classes": np.uint8}
@@ -118,6 +128,7 @@ class Examples:
             "dense_motion": np.float16,
             "episode": np.int64,
             "scene_id": np.str_,
+            "thoughts": np.str_,
         }
         arrays = {
             name: np.asarray(values, types.get(name, np.float32))

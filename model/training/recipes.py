@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 from model.families.cf_vla.targets import NANO_WEIGHTS, PAPER_WEIGHTS
+from model.families.elf_vla import targets as elf_vla
 from model.training.targets import SectionWeights
 
 Goal = Literal["ground", "read", "respond"]
@@ -116,8 +117,18 @@ NANO: Final[Mapping[str, Recipe]] = {
         replace(_NANO, name="meta-act"),
         replace(_NANO, name="counterfactual", steps=3000, learning_rate=2.5e-4, reflections="learned"),
     )
+} | {
+    # Without trajectory codes there is neither their error to learn from, nor the head beside them.
+    "elf-sft": replace(
+        _NANO,
+        name="elf-sft",
+        tasks={"elf_vla": 1.0},
+        weights=elf_vla.WEIGHTS,
+        error_weight=0.0,
+        head_weight=0.0,
+    )
 }
-"""The stages of the shipped checkpoint, and the control of its last one."""
+"""The stages of the shipped checkpoint, the control of its last one, and ELF-VLA's second stage."""
 
 PAPER: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe

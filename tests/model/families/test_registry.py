@@ -60,7 +60,11 @@ def test_an_installed_package_declares_its_own(install: Callable[[str], None]) -
 @pytest.mark.parametrize(
     ("line", "name", "message"),
     [
-        ("poem = verses:POEM", "novel", "no model family 'novel'; known are cf_vla, poem, traj_only"),
+        (
+            "poem = verses:POEM",
+            "novel",
+            "no model family 'novel'; known are cf_vla, elf_vla, elf_vla_refine, poem, traj_only",
+        ),
         ("cf_vla = verses:POEM", "cf_vla", "'cf_vla' is declared more than once: .*verses:POEM"),
         ("ode = verses:POEM", "ode", "no family of that name"),
         ("ode = verses:ODE", "ode", "cannot be loaded: .*ODE"),

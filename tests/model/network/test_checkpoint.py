@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from transformers import (
 
 from model.families.family import Situation
 from model.network.card import CARD_FILE, CheckpointError, weights_revision
-from model.network.checkpoint import Loaded, create_nano, expand_stock, load, save
+from model.network.checkpoint import Loaded, create_nano, expand_stock, load, save, with_formats
 from model.network.codec import CODEC_FILE, TrajectoryCodec
+from model.network.inputs import InputBuilder
 from model.network.settings import VlaSettings
 from model.network.vocabulary import QWEN_TOKENS, Vocabulary, build_nano_tokenizer
 from tests.model.network.conftest import made_up_scene
@@ -60,6 +62,31 @@ def test_seed_decides_the_weights(
     create_nano(tmp_path / "other", small_codec, vocabulary, seed=4)
     assert weights_revision(tmp_path / "same") == weights_revision(nano_folder)
     assert weights_revision(tmp_path / "other") != weights_revision(nano_folder)
+
+
+def test_more_formats_leave_what_it_writes_as_it_is(nano_folder: Path, tmp_path: Path) -> None:
+    before, wider = load(nano_folder), with_formats(load(nano_folder), ["elf_vla", "cf_vla"])
+    assert wider.card.formats == wider.settings.formats == ("cf_vla", "traj_only", "elf_vla")
+    save(tmp_path, wider.model, wider.vocabulary, wider.codec)
+    again = load(tmp_path)
+    assert again.settings == wider.settings
+    written = slice(len(before.vocabulary))
+    torch.testing.assert_close(logits_of(again)[..., written], logits_of(before)[..., written])
+
+
+def test_numbers_as_tokens_begin_near_their_neighbours(nano_folder: Path) -> None:
+    loaded = load(nano_folder)
+    phrased = replace(
+        loaded, inputs=InputBuilder(loaded.vocabulary, replace(loaded.settings, reflection="phrases"))
+    )
+    wider = with_formats(phrased, ["elf_vla"])
+    assert set(wider.vocabulary.alphabets) == {"trajectory", "x_m", "y_m", "heading_rad"}
+    [ids] = wider.vocabulary.alphabets["x_m"]
+    embeddings: Any = wider.model.get_input_embeddings()
+    rows = torch.nn.functional.normalize(embeddings.weight[ids.start : ids.stop].detach(), dim=1)
+    alike = (rows @ rows.T).numpy()
+    assert alike.diagonal(1).mean() > 0.9 > 0.7 > alike.diagonal(200).mean()
+    assert alike.diagonal(1).max() < 0.99
 
 
 def test_saved_in_half_and_loaded(nano: Loaded, tmp_path: Path) -> None:

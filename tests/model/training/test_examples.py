@@ -8,6 +8,7 @@ import numpy as np
 
 from model.driving.images import decode_image
 from model.driving.labeller import expert_plan
+from model.driving.reasoning import thoughts_of
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.driving.scene_store import write_scenes
 from model.training.dense import UNLABELLED, coarse
@@ -25,11 +26,18 @@ def test_examples_hold_what_the_scenes_hold() -> None:
         assert examples.picture(index, 1, 3) == labelled.scene.clip(FRONT_TELE).images[3]
         assert decode_image(examples.picture(index, 0, 0)).ndim == 3
         assert examples.plan(index) == expert_plan(labelled)
+        assert examples.thought(index) == thoughts_of(labelled) is not None
         assert np.array_equal(examples.future[index], labelled.future)
         assert np.isnan(examples.route[index]).all() == (labelled.scene.route is None)
         assert np.array_equal(examples.dense_classes[index, 0], coarse(labelled.dense[0]).classes)
         metres = np.expm1(examples.dense_range_log[index, 1].astype(np.float32))
         assert np.allclose(metres, coarse(labelled.dense[1]).range_m, atol=0.2)
+
+
+def test_thoughts_are_known_where_annotations_tell_them() -> None:
+    examples = Examples.from_scenes([replace(SCENES[0], lane_lines=()), SCENES[1]], CAMERAS)
+    assert examples.thought(0) is None
+    assert examples.thought(1) == thoughts_of(SCENES[1])
 
 
 def test_scenes_without_dense_targets_are_examples_too() -> None:

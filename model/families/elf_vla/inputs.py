@@ -1,0 +1,82 @@
+"""What ELF-VLA's prompts say of a scene (supplement, figures 6 and 7), in words and numbers."""
+
+from __future__ import annotations
+
+from typing import Final, Literal, get_args
+
+from model.driving.trajectory import FloatArray, present_acceleration, present_speed
+from model.families.elf_vla.format import TIMES_S, poses, told_poses
+from model.families.family import FamilyError, Situation, TextInputs
+from model.formats import pieces
+from model.formats.compounds import Number
+from model.formats.pieces import Choice, Format, FreeText, Option, Section, Sequence, Value, Values
+
+Command = Literal["left", "straight", "right", "unknown"]
+
+COMMAND_AFTER: Final = 4
+"""The point of a route, 20 m ahead, that decides on the command: NAVSIM's commands look as far."""
+COMMAND_M: Final = 2.0
+"""Metres to a side there that are a turn, in NAVSIM too: a lane's bend of 100 m radius leads as far."""
+MAX_FEEDBACK_TOKENS: Final = 512
+"""The five sections of figure 8b take some 350 of Qwen's tokens."""
+
+_SPEED_MS: Final = Number(-20.0, 60.0, 0.1)
+_ACCELERATION_MS2: Final = Number(-15.0, 15.0, 0.1)
+_PAST_STEPS: Final = (0, 5, 10)
+"""Rows of a history 1.5 s, 1 s and 0.5 s ago. The last row, now, is where the ego frame begins."""
+
+
+def command_of(route: FloatArray | None) -> Command:
+    """Which way a route [20, 2] leads next, as navigation says it."""
+    if route is None:
+        return "unknown"
+    left_m = float(route[COMMAND_AFTER, 1])
+    if abs(left_m) < COMMAND_M:
+        return "straight"
+    return "left" if left_m > 0 else "right"
+
+
+def _base(situation: Situation) -> dict[str, Value]:
+    history = situation.history
+    return {
+        "command": command_of(situation.route),
+        "velocity": _SPEED_MS.nearest(present_speed(history)),
+        "acceleration": _ACCELERATION_MS2.nearest(present_acceleration(history)),
+        "past": told_poses(history[list(_PAST_STEPS)]),
+    }
+
+
+def describe(situation: Situation) -> Values:
+    """The base inputs."""
+    return Values.of(_base(situation))
+
+
+def describe_attempt(situation: Situation) -> Values:
+    """The base inputs, and the attempt; raises `FamilyError` without one."""
+    attempt = situation.attempt
+    if attempt is None:
+        raise FamilyError("there is no attempt to be refined: give a draft and feedback on it")
+    return Values.of(
+        _base(situation) | {"draft": told_poses(attempt.trajectory), "feedback": attempt.feedback}
+    )
+
+
+def _line(name: str, start: str, piece: pieces.Piece, end: str = "\n") -> Section:
+    return Section(name, Sequence((pieces.Literal(start), piece, pieces.Literal(end))))
+
+
+_BASE: Final = (
+    _line("command", "Command: ", Choice(tuple(map(Option, get_args(Command))))),
+    _line("velocity", "Velocity: ", _SPEED_MS, " m/s\n"),
+    _line("acceleration", "Acceleration: ", _ACCELERATION_MS2, " m/s2\n"),
+    _line("past", "Historical trajectory: ", poses(len(_PAST_STEPS))),
+)
+_ATTEMPT: Final = (
+    _line("draft", "Draft: ", poses(len(TIMES_S))),
+    _line("feedback", "<feedback>", FreeText("</feedback>", MAX_FEEDBACK_TOKENS, multiline=True)),
+)
+
+BASE: Final = TextInputs(Format("elf_vla inputs", Sequence(_BASE)), describe)
+WITH_ATTEMPT: Final = TextInputs(
+    Format("elf_vla_refine inputs", Sequence((*_BASE, *_ATTEMPT))), describe_attempt
+)

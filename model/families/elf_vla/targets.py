@@ -1,0 +1,23 @@
+"""What a labelled scene teaches ELF-VLA, and how much each of its sections weighs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+from model.driving.trajectory import TEN_HZ_S, at_times
+from model.families.elf_vla.format import ANSWER, THINK, TIMES_S, told_poses
+from model.families.family import FamilyError, Lesson
+from model.formats.pieces import Values
+
+WEIGHTS: Final[Mapping[str, float]] = MappingProxyType({THINK: 1.0, ANSWER: 1.0})
+"""The paper weighs all tokens of a response alike."""
+
+
+def teach(lesson: Lesson) -> Values:
+    """The expert's thoughts and poses; raises `FamilyError` for scenes that say nothing to think of."""
+    if lesson.thoughts is None:
+        raise FamilyError("no thoughts: the scene lacks agents, lanes or road, or its expert is on no lane")
+    poses = at_times(lesson.future, TEN_HZ_S, TIMES_S)
+    return Values.of({THINK: str(lesson.thoughts), ANSWER: told_poses(poses)})
