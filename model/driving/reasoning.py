@@ -22,9 +22,8 @@ from model.driving.lead import LANE_HALF_WIDTH_M
 from model.driving.phrases import FARTHEST_M, STEP_M, Side, State
 from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, LabelledScene
 from model.driving.seen import SLOWER_BY_MS, STANDING_MS
+from model.driving.sentences import EDGE_FARTHEST_M, EDGE_STEP_M
 from model.driving.thoughts import (
-    EDGE_FARTHEST_M,
-    EDGE_STEP_M,
     Beside,
     Crosser,
     Crossing,

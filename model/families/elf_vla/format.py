@@ -7,8 +7,8 @@ from typing import Final, cast
 
 import numpy as np
 
-from model.driving.thoughts import END, SPACE, ThoughtError, Word, Words, decisions, joined
-from model.driving.thoughts import SENTENCES as OF_THOUGHTS
+from model.driving import sentences
+from model.driving.sentences import END, SPACE, ThoughtError, Word, Words, decisions, joined
 from model.driving.trajectory import FloatArray, wrap_angle
 from model.formats.compounds import DIGITS, Number, Repeat
 from model.formats.pieces import (
@@ -32,7 +32,7 @@ ANSWER: Final = "answer"
 TIMES_S: Final = tuple(0.5 * step for step in range(1, 9))
 """NAVSIM's: eight poses within 4 s."""
 MAX_THINK_TOKENS: Final = 320
-"""Of free text: the sentences of `model.driving.thoughts` take about a third of it in Qwen's tokens."""
+"""Of free text: the sentences of `model.driving.sentences` take about a third of it in Qwen's tokens."""
 
 _NUMBERS: Final = {
     "x_m": Number(-20.0, 140.0, 0.1, name="x_m"),
@@ -90,14 +90,14 @@ def _then(word: Word) -> Piece:
 
 @dataclass(frozen=True)
 class _Sentences(Compound):
-    """Thoughts in the sentences of `model.driving.thoughts`; their value is their text."""
+    """Thoughts in the sentences of `model.driving.sentences`; their value is their text."""
 
     name: str | None = None
 
     def expand(self) -> Piece:
         """All sentences, each decision a choice."""
         parts = list[Piece]()
-        for number, sentence in enumerate(OF_THOUGHTS):
+        for number, sentence in enumerate(sentences.SENTENCES):
             parts.append(Literal((SPACE if number else "") + sentence.start))
             parts += [_in_words(words) for words in sentence.words]
             parts.append(Literal(END))
@@ -133,5 +133,5 @@ def free_text(name: str) -> Format:
 
 
 def phrases(name: str) -> Format:
-    """For small checkpoints: thoughts in the sentences of `model.driving.thoughts`, one token each number."""
+    """For small checkpoints: thoughts in `model.driving.sentences`, one token each number."""
     return _elf_vla(name, Sequence((SENTENCES, Literal("</think>"))), tokens=True)

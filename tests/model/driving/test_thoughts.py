@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from model.driving.high_level import HighLevelAction
 from model.driving.phrases import FARTHEST_M, STEP_M
+from model.driving.sentences import ThoughtError, decisions, joined
 from model.driving.thoughts import (
     Crossing,
     Edges,
@@ -15,10 +16,7 @@ from model.driving.thoughts import (
     Merging,
     Obstacle,
     Road,
-    ThoughtError,
     Thoughts,
-    decisions,
-    joined,
     read_thoughts,
 )
 from tests.model.driving.test_high_level import ACTIONS
