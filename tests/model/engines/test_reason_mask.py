@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def phrased(resampling_checkpoint: Path) -> Loaded:
     return exactly(load(resampling_checkpoint, dtype=torch.float64))
 
 
-def tracked(name: str, scene: int, **controls: object) -> PlanRequest:
+def tracked(name: str, scene: int, **controls: Any) -> PlanRequest:
     asked = request(name, scene, **controls)
     return replace(asked, scene=replace(asked.scene, tracks=TRACKS))
 
