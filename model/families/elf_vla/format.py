@@ -32,7 +32,7 @@ ANSWER: Final = "answer"
 TIMES_S: Final = tuple(0.5 * step for step in range(1, 9))
 """NAVSIM's: eight poses within 4 s."""
 MAX_THINK_TOKENS: Final = 320
-"""Of free text: the sentences of `model.driving.sentences` take about a third of it in Qwen's tokens."""
+"""Of free text; the sentences of `model.driving.sentences` are shorter."""
 
 _NUMBERS: Final = {
     "x_m": Number(-20.0, 140.0, 0.1, name="x_m"),

@@ -14,11 +14,11 @@ from model.formats.pieces import Choice, Format, FreeText, Option, Section, Sequ
 Command = Literal["left", "straight", "right", "unknown"]
 
 COMMAND_AFTER: Final = 4
-"""The point of a route, 20 m ahead, that decides on the command: NAVSIM's commands look as far."""
+"""The point of a route, 20 m ahead, that decides on the command."""
 COMMAND_M: Final = 2.0
-"""Metres to a side there that are a turn, in NAVSIM too: a lane's bend of 100 m radius leads as far."""
+"""Metres to a side there that are a turn: a lane's bend of 100 m radius leads as far."""
 MAX_FEEDBACK_TOKENS: Final = 512
-"""The five sections of figure 8b take some 350 of Qwen's tokens."""
+"""Room for the five sections of figure 8b."""
 
 _SPEED_MS: Final = Number(-20.0, 60.0, 0.1)
 _ACCELERATION_MS2: Final = Number(-15.0, 15.0, 0.1)
