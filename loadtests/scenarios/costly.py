@@ -6,7 +6,7 @@ import signal
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -50,7 +50,8 @@ def costly(setup: Setup, own: OwnService | None = None, server_pid: int | None =
         ValueError: there are no scenes, or no such process.
     """
     pid = server_pid if own is None else own.process.pid
-    with nullcontext() if pid is None else MemoryWatch(pid, _WATCH_EVERY_S) as memory:
+    with ExitStack() as stack:
+        memory = None if pid is None else stack.enter_context(MemoryWatch(pid, _WATCH_EVERY_S))
         result = hostile(setup, COSTLY, "costly")
         stopped = None if own is None else _stopped(setup, own)
     more: dict[str, Any] = {}
