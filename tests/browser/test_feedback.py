@@ -30,7 +30,8 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with serve(ScriptedEngine(), Settings(bundled_scenes=path)) as running:
         # The process that scores begins with the first request.
         stand = {"scene_id": "slow-leader", "trajectories": [[[0.0, 0.0, 0.0]] * 8]}
-        assert running.http.post("/v1/feedback", json=stand).status_code == 200
+        begun = running.http.post("/v1/feedback", json=stand, timeout=4 * PATIENCE_S)
+        assert begun.status_code == 200
         yield running
 
 
