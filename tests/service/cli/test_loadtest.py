@@ -36,8 +36,9 @@ def test_scripts_find_what_they_rely_on(tmp_path: Path) -> None:
             served.url, "--rate", "4", "--seconds", "6", *mix, "--lag-limit-ms", "5000", "--json",
             "--report", str(report),
         )  # fmt: skip
-    assert done.returncode == 0, done.stderr + done.stdout
     told: dict[str, Any] = json.loads(done.stdout)
+    # On a busy machine an answer may come after its phase, and then the run does not count.
+    assert done.returncode == (0 if told["valid"] else 1), done.stderr + done.stdout
     assert {"offered_rps", "achieved_rps", "latency_s", "errors", "rejected", "goodput", "by_branch"} <= set(
         told
     )
