@@ -1,0 +1,223 @@
+"""Pictures as codes: 98 numbers of 0 to 999 for a camera's picture of 224 x 112 pixels.
+
+An encoder of small convolutions writes four numbers for each patch of 16 x 16 pixels. Finite scalar
+quantisation (https://arxiv.org/abs/2309.15505) rounds them to 8, 5, 5 and 5 levels, which together are one
+code. There is no codebook to learn or to collapse. A decoder paints the picture again. It has no adversary to
+please, so that pictures are soft where the codes do not say enough.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from model.driving.images import decode_image
+from model.driving.whole_files import written_whole
+
+FRAME_WIDTH: Final = 224
+FRAME_HEIGHT: Final = 112
+LEVELS: Final = (8, 5, 5, 5)
+CODEBOOK_SIZE: Final = math.prod(LEVELS)
+CODE_ROWS, CODE_COLUMNS = FRAME_HEIGHT // 16, FRAME_WIDTH // 16
+CODES: Final = CODE_ROWS * CODE_COLUMNS
+"""Codes of a picture, row by row from the upper left."""
+WEIGHTS_FILE: Final = "visual_codes.safetensors"
+_VERSION: Final = 1
+_WEIGHTS: Final = np.cumprod((1, *LEVELS[:-1])).astype(np.int64)
+"""What a level counts in a code: the first changes fastest."""
+_INSIDE: Final = 1e-3
+"""Keeps the outermost levels reachable: tanh itself reaches its bounds nowhere."""
+
+IntArray = npt.NDArray[np.int64]
+Frame = npt.NDArray[np.uint8]
+
+
+class VisualCodesError(ValueError):
+    """Codes, a picture or a file that cannot be used; the text says why."""
+
+
+def frame_of(encoded: bytes) -> Frame:
+    """An encoded picture as uint8 RGB [112, 224, 3]; raises `ImageError` for one that is not acceptable."""
+    picture = decode_image(encoded)
+    size = (FRAME_WIDTH, FRAME_HEIGHT)
+    if picture.shape[1::-1] == size:
+        return picture
+    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX), np.uint8)
+
+
+def levels_of(codes: npt.ArrayLike) -> IntArray:
+    """The levels int64 [..., 4] of codes [...]; raises `VisualCodesError` for a number that is no code."""
+    numbers = np.asarray(codes)
+    if not np.issubdtype(numbers.dtype, np.integer):
+        raise VisualCodesError(f"codes are whole numbers, not {numbers.dtype}")
+    if ((numbers < 0) | (numbers >= CODEBOOK_SIZE)).any():
+        raise VisualCodesError(f"codes lie in 0..{CODEBOOK_SIZE - 1}, got {numbers.min()}..{numbers.max()}")
+    levels: IntArray = numbers.astype(np.int64)[..., None] // _WEIGHTS % np.array(LEVELS)
+    return levels
+
+
+def codes_of(levels: npt.ArrayLike) -> IntArray:
+    """The codes int64 [...] of levels [..., 4]: `levels_of` undone; raises `VisualCodesError`."""
+    numbers = np.asarray(levels)
+    if numbers.shape[-1:] != (len(LEVELS),) or not np.issubdtype(numbers.dtype, np.integer):
+        raise VisualCodesError(f"levels are whole numbers [..., {len(LEVELS)}]")
+    if ((numbers < 0) | (numbers >= np.array(LEVELS))).any():
+        raise VisualCodesError(f"levels lie below {', '.join(map(str, LEVELS))}, and from 0 on")
+    codes: IntArray = (numbers.astype(np.int64) * _WEIGHTS).sum(axis=-1)
+    return codes
+
+
+def bounded(free: Tensor) -> Tensor:
+    """Numbers [..., 4] squeezed to where their levels lie: 0 to one less than there are."""
+    most = torch.tensor(LEVELS, dtype=free.dtype, device=free.device) - 1
+    return most / 2 * (1 + (1 + _INSIDE) * torch.tanh(free))
+
+
+def quantised(free: Tensor) -> Tensor:
+    """The levels of numbers [..., 4], as floats; gradients pass as if nothing had been rounded."""
+    squeezed = bounded(free)
+    return squeezed + (squeezed.round() - squeezed).detach()
+
+
+class VisualCodes(nn.Module):
+    """The tokenizer of pictures: `encode` and `decode` for use, `forward` for training.
+
+    Args:
+        width: channels in the middle; half as many at twice the resolution.
+    """
+
+    def __init__(self, width: int = 192) -> None:
+        super().__init__()
+        half, fine = width // 2, width // 6
+        self.width = width
+        self.encoder = nn.Sequential(
+            nn.PixelUnshuffle(8),
+            nn.Conv2d(3 * 64, half, 1),
+            _Block(half),
+            nn.Conv2d(half, width, 2, stride=2),
+            _Block(width),
+            _Block(width),
+        )
+        self.settled = nn.LayerNorm(width)
+        self.exit = nn.Linear(width, len(LEVELS))
+        # Numbers that already differ by whole levels: otherwise all patches have one code for long.
+        nn.init.normal_(self.exit.weight, std=width**-0.5)
+        self.entry = nn.Conv2d(len(LEVELS), width, 3, padding=1)
+        self.place = nn.Parameter(torch.zeros(1, width, CODE_ROWS, CODE_COLUMNS))
+        """What is usually where: the sky above, the bonnet below."""
+        self.decoder = nn.Sequential(
+            *(_Block(width) for _ in range(4)),
+            nn.Conv2d(width, 4 * half, 1),
+            nn.PixelShuffle(2),
+            _Block(half),
+            _Block(half),
+            nn.Conv2d(half, 4 * fine, 3, padding=1),
+            nn.PixelShuffle(2),
+            _Block(fine),
+            nn.Conv2d(fine, 3 * 16, 3, padding=1),
+            nn.PixelShuffle(4),
+        )
+
+    def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
+        """Pictures float [b, 3, 112, 224] in 0..1 painted again, and their levels [b, 4, 7, 14]."""
+        levels = quantised(self.free(pictures)).movedim(-1, 1)
+        return self.paint(levels), levels
+
+    def free(self, pictures: Tensor) -> Tensor:
+        """What stands before quantisation [b, 7, 14, 4], for pictures float [b, 3, 112, 224] in 0..1."""
+        free: Tensor = self.exit(self.settled(self.encoder(pictures - 0.5).movedim(1, -1)))
+        return free
+
+    def paint(self, levels: Tensor) -> Tensor:
+        """The pictures [b, 3, 112, 224] of levels [b, 4, 7, 14]; about 0..1, not clipped."""
+        middle = (torch.tensor(LEVELS, dtype=levels.dtype, device=levels.device) - 1)[:, None, None] / 2
+        painted: Tensor = self.decoder(self.entry(levels / middle - 1) + self.place) + 0.5
+        return painted
+
+    @torch.inference_mode()
+    def encode(self, frame: Frame) -> IntArray:
+        """The codes int64 [98] of a picture uint8 [112, 224, 3].
+
+        Pictures are encoded one by one, so that a picture's codes do not depend on its company.
+
+        Raises:
+            VisualCodesError: a picture of another size or type; see `frame_of`.
+        """
+        if frame.shape != (FRAME_HEIGHT, FRAME_WIDTH, 3) or frame.dtype != np.uint8:
+            shape = [FRAME_HEIGHT, FRAME_WIDTH, 3]
+            raise VisualCodesError(f"a picture must be uint8 {shape}, got {frame.dtype} {list(frame.shape)}")
+        squeezed = bounded(self.free(batch_of([frame]).to(self.place.device))[0])
+        levels = squeezed.round().to(torch.int64).cpu().numpy()
+        return codes_of(levels).ravel()
+
+    @torch.inference_mode()
+    def decode(self, codes: npt.ArrayLike) -> Frame:
+        """The picture uint8 [112, 224, 3] of codes [98]; raises `VisualCodesError` for any others."""
+        numbers = np.asarray(codes)
+        if numbers.shape != (CODES,):
+            raise VisualCodesError(f"a picture has {CODES} codes, got {list(numbers.shape)}")
+        grid = levels_of(numbers).reshape(CODE_ROWS, CODE_COLUMNS, len(LEVELS))
+        levels = torch.from_numpy(grid).movedim(-1, 0)[None].to(self.place)
+        painted = (self.paint(levels)[0].clamp(0, 1) * 255).round().to(torch.uint8)
+        return painted.movedim(0, -1).cpu().numpy()
+
+    def save(self, folder: Path, details: Mapping[str, object]) -> None:
+        """Write ``visual_codes.safetensors`` into ``folder``; ``details`` tell how it was made."""
+        about = {"version": _VERSION, "width": self.width, "levels": LEVELS, "details": dict(details)}
+        state = {name: value.contiguous() for name, value in self.state_dict().items()}
+        with written_whole(folder / WEIGHTS_FILE) as temporary:
+            save_file(state, temporary, metadata={"looktwice": json.dumps(about)})
+
+
+def load_visual_codes(folder: Path) -> VisualCodes:
+    """Read what `VisualCodes.save` wrote; raises `VisualCodesError`."""
+    path = folder / WEIGHTS_FILE
+    if not path.is_file():
+        raise VisualCodesError(f"{folder} has no {WEIGHTS_FILE}: `looktwice train visual-codes` makes one")
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads((file.metadata() or {}).get("looktwice", "{}"))
+        if about.get("version") != _VERSION or tuple(about.get("levels", ())) != LEVELS:
+            raise VisualCodesError(
+                f"{path} has version {about.get('version')} and levels {about.get('levels')}; "
+                f"this LookTwice reads {_VERSION} with {list(LEVELS)}"
+            )
+        codes = VisualCodes(about["width"])
+        codes.load_state_dict(load_file(path))
+    except (SafetensorError, json.JSONDecodeError, KeyError, RuntimeError) as error:
+        raise VisualCodesError(f"{path} is damaged: {error}") from error
+    return codes.eval()
+
+
+def batch_of(frames: list[Frame]) -> Tensor:
+    """Pictures uint8 [112, 224, 3] as float32 [b, 3, 112, 224] in 0..1."""
+    return torch.from_numpy(np.stack(frames)).movedim(-1, 1).float() / 255
+
+
+class _Block(nn.Module):
+    """Looks around in each channel, then mixes the channels of each place; added to what came in."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.around = nn.Conv2d(width, width, 5, padding=2, groups=width)
+        self.norm = nn.LayerNorm(width)
+        self.wide = nn.Linear(width, 2 * width)
+        self.narrow = nn.Linear(2 * width, width)
+
+    def forward(self, grid: Tensor) -> Tensor:
+        """[b, width, h, w] to the same."""
+        seen = self.norm(self.around(grid).movedim(1, -1))
+        mixed: Tensor = self.narrow(F.gelu(self.wide(seen), approximate="tanh"))
+        return grid + mixed.movedim(-1, 1)
