@@ -15,7 +15,7 @@ from model.families.cf_vla.targets import NANO_WEIGHTS, PAPER_WEIGHTS
 from model.families.elf_vla import targets as elf_vla
 from model.training.targets import SectionWeights
 
-Goal = Literal["ground", "read", "respond"]
+Goal = Literal["ground", "read", "respond", "code"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,8 @@ class Recipe:
     Attributes:
         name: as the command line gives it.
         goal: ``ground`` trains the vision tower alone, ``read`` what to do about tracks or, with pictures,
-            about what was gathered from them, ``respond`` trains everything on responses.
+            about what was gathered from them, ``respond`` trains everything on responses, ``code`` the
+            codes of pictures alone.
         pictures: whether responses are learned with pictures.
         tasks: share of the examples for each response format.
         route_share: share of the examples whose route is given.
@@ -85,6 +86,11 @@ _NANO: Final = Recipe(
     error_weight=0.5,
     head_weight=0.25,
 )
+
+VISUAL_CODES: Final = Recipe(
+    "visual-codes", "code", steps=6000, batch_size=16, learning_rate=1e-3, warmup_steps=200
+)
+"""Of the codes of pictures, which start from nothing; see `model.training.visual_codes`."""
 
 _READ: Final = Recipe(
     "read",

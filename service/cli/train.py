@@ -20,7 +20,8 @@ def train(
         typer.Argument(
             help="create, language, ground, traj-only, meta-act, counterfactual, multi-round; "
             "ladder: all of it, then rollouts, labels and training round by round, and the table; "
-            "blind, teacher: the small planners of the tables, without pictures."
+            "blind, teacher: the small planners of the tables, without pictures; "
+            "visual-codes: pictures as codes, for models that imagine."
         ),
     ],
     scenes: Annotated[Path, typer.Option(help="Training scenes: a file or a folder.")],
@@ -72,10 +73,11 @@ def train(
     from model.network.allocator import keep_freed_memory
     from model.network.precision import bfloat16_is_fast
     from model.network.small_planner import DRIVING_KINDS
-    from model.training.recipes import NANO, PAPER
+    from model.training.recipes import NANO, PAPER, VISUAL_CODES
     from model.training.run import RunSettings, create, run
     from model.training.small import SmallSettings
     from model.training.trainer import LOG_FILE
+    from model.training.visual_codes import train_visual_codes
     from service.cli.ladder import climb
     from service.cli.small_rounds import train_small_in_rounds
 
@@ -93,6 +95,24 @@ def train(
                 recipe, scenes, codec_from, target, settings, validation, rounds, round_episodes
             )
             return
+        if recipe == VISUAL_CODES.name:
+            if source is not None:
+                raise ValueError("codes of pictures start from nothing: leave --from out")
+            learned = replace(
+                VISUAL_CODES,
+                steps=steps or VISUAL_CODES.steps,
+                batch_size=batch_size or VISUAL_CODES.batch_size,
+                learning_rate=learning_rate or VISUAL_CODES.learning_rate,
+                seed=seed,
+            )
+            # Convolutions are faster in float32 on CPUs, even where matrices are not.
+            figures = train_visual_codes(
+                learned, scenes, target, validation, bf16=bf16 or False, use_cpu=not gpu
+            )
+            for name, value in figures.items():
+                typer.echo(f"{name} {value:.3f}")
+            training_curves(target / LOG_FILE, target / "curves.png")
+            return
         if recipe == "ladder":
             if test is None:
                 raise ValueError("give the scenes for the table: --test FOLDER")
@@ -107,7 +127,7 @@ def train(
             return
         recipes = PAPER if paper else NANO
         if recipe not in recipes:
-            known = ", ".join(["create", "ladder", *DRIVING_KINDS, *recipes])
+            known = ", ".join(["create", "ladder", *DRIVING_KINDS, VISUAL_CODES.name, *recipes])
             raise ValueError(f"unknown recipe {recipe!r}; known are {known}")
         if source is None:
             raise ValueError("give the checkpoint to start from: --from FOLDER")
