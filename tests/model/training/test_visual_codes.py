@@ -44,8 +44,8 @@ def road(seed: int) -> bytes:
     draw = ImageDraw.Draw(picture)
     draw.rectangle((0, 40, 224, 112), fill=(90, 130, 70))
     draw.polygon([(112, 40), (200, 112), (24, 112)], fill=(110, 110, 110))
-    x, y = random.integers(80, 140), random.integers(50, 80)
-    draw.rectangle((x, y, x + 20, y + 12), fill=tuple(random.integers(0, 256, 3)))
+    x, y = int(random.integers(80, 140)), int(random.integers(50, 80))
+    draw.rectangle((x, y, x + 20, y + 12), fill=tuple(map(int, random.integers(0, 256, 3))))
     return encode_png(np.asarray(picture))
 
 
