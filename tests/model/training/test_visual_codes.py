@@ -71,11 +71,11 @@ def test_pictures_are_learned(scenes: Path, tmp_path: Path) -> None:
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     measured = [row for row in rows if "psnr_db" in row]
     assert [row["step"] for row in measured] == [20, 40, 60]
-    assert measured[-1]["psnr_db"] > measured[0]["psnr_db"]
     # What is written is what was measured last.
     assert figures["psnr_db"] == pytest.approx(measured[-1]["psnr_db"])
-    clips = clips_of(filmed_scene(index) for index in range(2))
-    assert picture_figures(load_visual_codes(tmp_path), clips)["psnr_db"] > 13
+    clips = list(clips_of(filmed_scene(index) for index in range(2)))
+    untrained = picture_figures(VisualCodes(24), clips)["psnr_db"]
+    assert picture_figures(load_visual_codes(tmp_path), clips)["psnr_db"] > untrained + 2
     # Three pictures side by side, each above what became of it.
     with Image.open(tmp_path / SHEET_FILE) as sheet:
         assert sheet.size == (3 * 228 - 4, 2 * 112 + 4)
