@@ -75,6 +75,8 @@ def show_inspector(url: str, scene_id: str, draw: int, path: Path) -> None:
         expect(page.locator("#draws tbody tr")).to_have_count(DRAWS)
         expect(page.get_by_role("status")).to_contain_text("draws in")
         page.locator("#draws input[type=radio]").nth(draw).check()
+        # The bird's-eye view stays in sight on the way down to the draws.
+        page.evaluate("scrollTo(0, 0)")
         page.wait_for_load_state("networkidle")
         shown = revision()
         expect(page.locator("#model")).to_contain_text(re.compile(re.escape(shown)))
