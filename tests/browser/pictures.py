@@ -1,7 +1,8 @@
 """`make pictures`: the README's pictures, of the bundled checkpoint, each with its name and revision inside.
 
-They show the bundled scene, at seed 0, whose second look ends nearest to the expert's way; where there is no
-second look, the first scene.
+They show the bundled scene and the seed, of a few, whose second look helps most: it brings the trajectory
+nearer to the expert's than the first plan alone would, and the parts of its draw agree. Without one, the
+first scene.
 """
 
 from __future__ import annotations
@@ -18,10 +19,13 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from playwright.sync_api import expect, sync_playwright
 
+from clients.answers import PlannedDraw
 from clients.planner import Patience, PlannerClient
 from clients.wire import Controls
 from model.bundled import CHECKPOINT, SCENES
-from model.driving.scene import LabelledScene
+from model.driving.facts import LANE_WIDTH_M
+from model.driving.route_frame import RouteFrame
+from model.driving.scene import LabelledScene, Scene
 from model.driving.scene_store import read_scenes
 from model.engines.torch.engine import TorchEngine
 from model.network.card import read_card
@@ -32,7 +36,7 @@ from tests.service.serving import serve
 FOLDER: Final = Path(__file__).parents[2] / "docs" / "pictures"
 PLAN, INSPECTOR = FOLDER / "plan.png", FOLDER / "inspector.png"
 KEY: Final = "looktwice-checkpoint"
-DRAWS, SEED = 6, 0
+DRAWS, SEEDS = 6, range(8)
 _PATIENCE_MS: Final = 180_000
 """For a busy machine; a screenshot of the whole page takes seconds on one that rests."""
 
@@ -51,27 +55,45 @@ def stamped(source: Path, target: Path) -> None:
         picture.save(target, pnginfo=told, optimize=True)
 
 
-def chosen(planner: PlannerClient, scenes: list[LabelledScene]) -> tuple[int, int]:
-    """Which scene, and which of its draws."""
-    found = [(np.inf, 0, 0)]
+def chosen(planner: PlannerClient, scenes: list[LabelledScene]) -> tuple[int, int, int]:
+    """Which scene, which seed, and which of its draws."""
+    found = [(0.0, 0, 0, 0)]
     for place, labelled in enumerate(scenes):
-        answer = planner.plan(labelled.scene, Controls(n=DRAWS, seed=SEED))
-        for number, draw in enumerate(answer.draws):
-            if draw.thinking is not None:
-                apart_m = np.linalg.norm(draw.trajectory[:, :2] - labelled.future[:, :2], axis=1)
-                found.append((float(apart_m.mean()), place, number))
-    _, place, number = min(found)
-    return place, number
+        for seed in SEEDS:
+            looked, direct = (
+                planner.plan(labelled.scene, Controls(n=DRAWS, seed=seed, thinking=thinking)).draws
+                for thinking in ("adaptive", "never")
+            )
+            for number, (draw, before) in enumerate(zip(looked, direct, strict=True)):
+                if draw.thinking is not None and draw.consistent and lanes_agree(draw, labelled.scene):
+                    farther_m = ade_m(draw, labelled) - ade_m(before, labelled)
+                    found.append((farther_m, place, seed, number))
+    _, place, seed, number = min(found)
+    return place, seed, number
 
 
-def show_inspector(url: str, scene_id: str, draw: int, path: Path) -> None:
+def ade_m(draw: PlannedDraw, labelled: LabelledScene) -> float:
+    """How far a draw's trajectory is from the expert's on average."""
+    return float(np.linalg.norm(draw.trajectory[:, :2] - labelled.future[:, :2], axis=1).mean())
+
+
+def lanes_agree(draw: PlannedDraw, scene: Scene) -> bool:
+    """Whether the trajectory leaves the route's lane exactly where the plan changes lanes."""
+    assert scene.route is not None
+    left_m = RouteFrame(scene.route).places(draw.trajectory[-1:, :2])[0, 1]
+    plan = draw.revised_plan or draw.plan
+    changes = plan is not None and any("Change" in action.word for action in plan.lane or ())
+    return bool(abs(left_m) > LANE_WIDTH_M / 2) == changes
+
+
+def show_inspector(url: str, scene_id: str, seed: int, draw: int, path: Path) -> None:
     """The page with a draw of a scene's plan chosen."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         page = browser.new_page(viewport={"width": 1360, "height": 950})
         page.set_default_timeout(_PATIENCE_MS)
         expect.set_options(timeout=_PATIENCE_MS)
-        page.goto(f"{url}/#scene={scene_id}&thinking=adaptive&n={DRAWS}&temperature=1&seed={SEED}&deadline=")
+        page.goto(f"{url}/#scene={scene_id}&thinking=adaptive&n={DRAWS}&temperature=1&seed={seed}&deadline=")
         expect(page.locator("#draws tbody tr")).to_have_count(DRAWS)
         expect(page.get_by_role("status")).to_contain_text("draws in")
         page.locator("#draws input[type=radio]").nth(draw).check()
@@ -92,14 +114,14 @@ def main() -> None:
             serve(TorchEngine(CHECKPOINT), Settings(bundled_scenes=SCENES)) as served,
             PlannerClient(served.url, Patience(timeout_s=120)) as planner,
         ):
-            place, draw = chosen(planner, scenes)
+            place, seed, draw = chosen(planner, scenes)
             scene_id = scenes[place].scene.scene_id
-            show_inspector(served.url, scene_id, draw, folder / "inspector.png")
-        plan = [sys.executable, "-m", "service.cli", "plan", "--skip", str(place), "--seed", str(SEED)]
+            show_inspector(served.url, scene_id, seed, draw, folder / "inspector.png")
+        plan = [sys.executable, "-m", "service.cli", "plan", "--skip", str(place), "--seed", str(seed)]
         subprocess.run([*plan, "--n", str(DRAWS), "--out", kept], check=True, stdout=subprocess.DEVNULL)
         stamped(folder / f"{scene_id}.png", PLAN)
         stamped(folder / "inspector.png", INSPECTOR)
-    print(f"{PLAN}\n{INSPECTOR}\nscene {scene_id}, draw {draw}, {revision()}")
+    print(f"{PLAN}\n{INSPECTOR}\nscene {scene_id}, seed {seed}, draw {draw}, {revision()}")
 
 
 if __name__ == "__main__":
