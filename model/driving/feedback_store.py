@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from model.driving.parquet_rows import write_rows
+from model.driving.parquet_rows import read_rows, write_rows
 
 FEEDBACK_VERSION: Final = "1"
 _VERSION_KEY: Final = b"looktwice.feedback_version"
@@ -95,17 +94,7 @@ def read_feedback(path: Path) -> Iterator[FeedbackRow]:
         FeedbackFileError: see the class.
     """
     try:
-        file = pq.ParquetFile(path, page_checksum_verification=True)
-    except (pa.ArrowException, OSError) as error:
-        raise FeedbackFileError(f"{path} is not a whole Parquet file: {error}") from error
-    version = (file.schema_arrow.metadata or {}).get(_VERSION_KEY, b"").decode()
-    if version != FEEDBACK_VERSION:
-        raise FeedbackFileError(
-            f"{path} holds no feedback of version {FEEDBACK_VERSION} (found {version or 'none'})"
-        )
-    try:
-        for group in range(file.num_row_groups):
-            rows: list[dict[str, Any]] = file.read_row_group(group).to_pylist()
-            yield from (FeedbackRow(**row) for row in rows)
-    except (pa.ArrowException, OSError, TypeError) as error:
+        for row in read_rows(path, _VERSION_KEY, FEEDBACK_VERSION, "feedback", FeedbackFileError):
+            yield FeedbackRow(**row)
+    except TypeError as error:
         raise FeedbackFileError(f"{path} is damaged: {error}") from error

@@ -1,8 +1,8 @@
-"""Rows into a Parquet file that is whole or not there."""
+"""Rows into a Parquet file that is whole or not there, and out of one of a known version."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -31,3 +31,30 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]], schema: pa.Schema,
             writer.write_table(pa.Table.from_pylist(some, schema=schema))
             count += len(some)
     return count
+
+
+def read_rows(
+    path: Path, version_key: bytes, version: str, holds: str, error: type[ValueError]
+) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a file, group by group.
+
+    Args:
+        path: of the file.
+        version_key: of its metadata.
+        version: that must stand there.
+        holds: what its rows are, in messages.
+        error: raised where the file is missing, damaged, or of another version.
+    """
+    try:
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+    except (pa.ArrowException, OSError) as problem:
+        raise error(f"{path} is not a whole Parquet file: {problem}") from problem
+    found = (file.schema_arrow.metadata or {}).get(version_key, b"").decode()
+    if found != version:
+        raise error(f"{path} holds no {holds} of version {version} (found {found or 'none'})")
+    for group in range(file.num_row_groups):
+        try:
+            rows: list[dict[str, Any]] = file.read_row_group(group).to_pylist()
+        except (pa.ArrowException, OSError) as problem:
+            raise error(f"{path} is damaged: {problem}") from problem
+        yield from rows

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from model.driving.parquet_rows import write_rows
+from model.driving.parquet_rows import read_rows, write_rows
 from model.driving.plan import Plan, PlanError, parse_plan
 
 REFLECTION_VERSION: Final = "2"
@@ -79,20 +78,8 @@ def read_reflections(path: Path) -> Iterator[LabelledReflection]:
         ReflectionFileError: see the class.
     """
     try:
-        file = pq.ParquetFile(path, page_checksum_verification=True)
-    except (pa.ArrowException, OSError) as error:
-        raise ReflectionFileError(f"{path} is not a whole Parquet file: {error}") from error
-    version = (file.schema_arrow.metadata or {}).get(_VERSION_KEY, b"").decode()
-    if version != REFLECTION_VERSION:
-        raise ReflectionFileError(
-            f"{path} holds no reflections of version {REFLECTION_VERSION} (found {version or 'none'})"
-        )
-    try:
-        for group in range(file.num_row_groups):
-            for row in file.read_row_group(group).to_pylist():
-                yield _from_row(row)
-    except (pa.ArrowException, OSError) as error:
-        raise ReflectionFileError(f"{path} is damaged: {error}") from error
+        for row in read_rows(path, _VERSION_KEY, REFLECTION_VERSION, "reflections", ReflectionFileError):
+            yield _from_row(row)
     except (PlanError, TypeError) as error:
         raise ReflectionFileError(f"{path} holds a row that is no reflection: {error}") from error
 
