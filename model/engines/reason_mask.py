@@ -7,7 +7,8 @@ the scene's tracks tell or, without any, the facts that the network reads from t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property, partial
 from typing import Protocol
 
 import numpy as np
@@ -47,9 +48,9 @@ def reason_mask_of(
     if request.controls.reasons == "any" or family.reflection is None or not in_phrases(family.format):
         return None
     if scene.tracks is not None:
-        reasons = reasons_tracked(scene.history, scene.route, scene.tracks)
+        reasons = partial(reasons_tracked, scene.history, scene.route, scene.tracks)
     elif facts is not None:
-        reasons = reasons_read(scene.history, scene.route, facts)
+        reasons = partial(reasons_read, scene.history, scene.route, facts)
     else:
         return None
     return ReasonMask(reasons, family.reflection, vocabulary)
@@ -59,14 +60,20 @@ class ReasonMask:
     """Which words a reflection may choose, given the statements that it may make.
 
     Args:
-        reasons: the statements.
+        reasons: works out the statements, which takes a millisecond; asked once, at the first reflection.
         section: where reflections are written.
         vocabulary: of the tokens.
     """
 
-    def __init__(self, reasons: Iterable[Statement], section: str, vocabulary: Vocabulary) -> None:
-        self.statements = tuple(sorted(map(str, reasons)))
-        self._section, self._vocabulary = section, vocabulary
+    def __init__(
+        self, reasons: Callable[[], Iterable[Statement]], section: str, vocabulary: Vocabulary
+    ) -> None:
+        self._reasons, self._section, self._vocabulary = reasons, section, vocabulary
+
+    @cached_property
+    def statements(self) -> tuple[str, ...]:
+        """That may be made, in the order of the alphabet."""
+        return tuple(sorted(map(str, self._reasons())))
 
     def leaves(self, cursor: Cursor, written: Sequence[Token]) -> BoolArray | None:
         """bool [k]: which of the tokens that a cursor allows remain; None where all do.

@@ -98,7 +98,7 @@ def test_every_walk_ends_and_states_nothing_else(
 ) -> None:
     body = Section("why", Sequence((Phrases(), Text("\n"))))
     compiled = CompiledFormat(Format("walk", body), phrased.vocabulary)
-    mask = ReasonMask(reasons, "why", phrased.vocabulary)
+    mask = ReasonMask(lambda: reasons, "why", phrased.vocabulary)
     cursor, written = compiled.start(), list[Token]()
     for turn in turns:
         run, cursor = cursor.forced()
@@ -120,7 +120,7 @@ def test_where_nothing_is_in_view_nothing_is_said(phrased: Loaded) -> None:
         Format("walk", Section("why", Sequence((Phrases(), Text("\n"))))), phrased.vocabulary
     )
     start = compiled.start()
-    left = ReasonMask((), "why", phrased.vocabulary).leaves(start, [])
+    left = ReasonMask(tuple, "why", phrased.vocabulary).leaves(start, [])
     assert left is not None
     (token,) = start.allowed().ids[left]
     assert NOTHING.startswith(phrased.vocabulary.decode([int(token)]))
