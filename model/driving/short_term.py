@@ -40,7 +40,7 @@ MISSION_GOALS: Final[tuple[MissionGoal, ...]] = get_args(MissionGoal)
 _GOAL_POINT: Final = 4
 """The point of a route that decides on the goal, 20 m ahead."""
 _GOAL_M: Final = 2.0
-"""Metres to a side there that make a turn."""
+"""Metres to a side there that make a turn: a lane's bend of 100 m radius leads as far."""
 _FEWEST: Final = 8
 """Scenes of a goal that its ideal step is fitted on, at least."""
 

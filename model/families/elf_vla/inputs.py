@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final, Literal, get_args
 
+from model.driving.short_term import mission_goal
 from model.driving.trajectory import FloatArray, present_acceleration, present_speed
 from model.families.elf_vla.format import TIMES_S, poses, told_poses
 from model.families.family import FamilyError, Situation, TextInputs
@@ -13,10 +14,6 @@ from model.formats.pieces import Choice, Format, FreeText, Option, Section, Sequ
 
 Command = Literal["left", "straight", "right", "unknown"]
 
-COMMAND_AFTER: Final = 4
-"""The point of a route, 20 m ahead, that decides on the command."""
-COMMAND_M: Final = 2.0
-"""Metres to a side there that are a turn: a lane's bend of 100 m radius leads as far."""
 MAX_FEEDBACK_TOKENS: Final = 512
 """Room for the five sections of figure 8b."""
 
@@ -30,10 +27,8 @@ def command_of(route: FloatArray | None) -> Command:
     """Which way a route [20, 2] leads next, as navigation says it."""
     if route is None:
         return "unknown"
-    left_m = float(route[COMMAND_AFTER, 1])
-    if abs(left_m) < COMMAND_M:
-        return "straight"
-    return "left" if left_m > 0 else "right"
+    goal = mission_goal(route)
+    return "straight" if goal == "forward" else goal
 
 
 def _base(situation: Situation) -> dict[str, Value]:
