@@ -142,17 +142,19 @@ def run(
     if trainer.is_world_process_zero():
         _inherit_log(target / LOG_FILE, [source, *([vision_source] if vision_source else [])])
     trainer.train(resume_from_checkpoint=last_whole_state(target / "state"))
-    if not trainer.is_world_process_zero():
-        return
-    loaded.model.train(False)
-    save(
-        target,
-        loaded.model,
-        loaded.vocabulary,
-        loaded.codec,
-        dtype=torch.bfloat16,
-        details={"stages": [*stages, _about(recipe, examples, on_examples)]},
-    )
+    if trainer.is_world_process_zero():
+        loaded.model.train(False)
+        save(
+            target,
+            loaded.model,
+            loaded.vocabulary,
+            loaded.codec,
+            dtype=torch.bfloat16,
+            details={"stages": [*stages, _about(recipe, examples, on_examples)]},
+        )
+    # gloo's threads drop what they gathered a moment later, and need the interpreter for it: a process that
+    # ends before that is aborted. So nobody ends before the checkpoint is written.
+    trainer.accelerator.wait_for_everyone()
 
 
 def vision_parts(vla: LookTwiceVla) -> list[nn.Module]:
