@@ -134,7 +134,7 @@ class PlannerClient:
         controls: wire.Controls = wire.Controls(),
         *,
         prefill: Plan | None = None,
-        format: str = "cf_vla",
+        format: str | None = None,
         request_id: str | None = None,
     ) -> PlanResult:
         """Plan for ``scene``.
@@ -143,7 +143,7 @@ class PlannerClient:
             scene: what the car sees.
             controls: draws, thinking, sampling, deadline.
             prefill: the first plan, to be continued instead of one the model writes.
-            format: a response format the model writes.
+            format: a response format the model writes; its first where None.
             request_id: shows up in the service's log; made there when None.
 
         Raises:
@@ -185,7 +185,7 @@ class PlannerClient:
         plan: Plan,
         controls: wire.ReflectControls = wire.ReflectControls(),
         *,
-        format: str = "cf_vla",
+        format: str | None = None,
         request_id: str | None = None,
     ) -> ReflectResult:
         """Have ``plan``, from whatever planner, looked at.
@@ -194,7 +194,7 @@ class PlannerClient:
             scene: what the car sees.
             plan: to keep or to revise.
             controls: draws, thinking, sampling, deadline.
-            format: a response format the model writes.
+            format: a response format the model writes; its first where None.
             request_id: shows up in the service's log; made there when None.
 
         Raises:
@@ -302,7 +302,7 @@ class AsyncPlannerClient:
         controls: wire.Controls = wire.Controls(),
         *,
         prefill: Plan | None = None,
-        format: str = "cf_vla",
+        format: str | None = None,
         request_id: str | None = None,
     ) -> PlanResult:
         """Plan for ``scene``; see `PlannerClient.plan`."""
@@ -333,7 +333,7 @@ class AsyncPlannerClient:
         plan: Plan,
         controls: wire.ReflectControls = wire.ReflectControls(),
         *,
-        format: str = "cf_vla",
+        format: str | None = None,
         request_id: str | None = None,
     ) -> ReflectResult:
         """Have ``plan`` looked at; see `PlannerClient.reflect`."""

@@ -15,7 +15,7 @@ def plan_request(
     controls: wire.Controls = wire.Controls(),
     *,
     prefill: Plan | None = None,
-    format: str = "cf_vla",
+    format: str | None = None,
 ) -> wire.PlanRequest:
     """The body of POST /v1/plan for ``scene``."""
     if prefill is not None:
@@ -28,7 +28,7 @@ def reflect_request(
     plan: Plan,
     controls: wire.ReflectControls = wire.ReflectControls(),
     *,
-    format: str = "cf_vla",
+    format: str | None = None,
 ) -> wire.ReflectRequest:
     """The body of POST /v1/reflect for ``plan`` in ``scene``."""
     return wire.ReflectRequest(scene=wire_scene(scene), plan=str(plan), controls=controls, format=format)

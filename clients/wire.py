@@ -266,10 +266,10 @@ class PlanRequest(Asked):
 
     scene: Scene
     controls: Controls = Controls()
-    format: str = Field(
-        default="cf_vla",
+    format: str | None = Field(
+        default=None,
         max_length=40,
-        description="Response format; GET /v1/models lists what the model writes.",
+        description="Response format; GET /v1/models lists them, the default first.",
     )
     stream: bool = Field(default=False, description="Answer with server-sent events, as draws are written.")
 
@@ -382,10 +382,10 @@ class ReflectRequest(Asked):
     scene: Scene
     plan: PlanGiven = Field(description="The plan to be looked at, from any planner: bullet text, or tracks.")
     controls: ReflectControls = ReflectControls()
-    format: str = Field(
-        default="cf_vla",
+    format: str | None = Field(
+        default=None,
         max_length=40,
-        description="Response format; GET /v1/models lists what the model writes.",
+        description="Response format; GET /v1/models lists them, the default first.",
     )
     stream: bool = Field(default=False, description="Answer with server-sent events, as draws are written.")
 

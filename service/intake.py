@@ -57,7 +57,7 @@ def engine_request(
     """
     if not card.formats:
         raise at(UNKNOWN_FORMAT, "/format", "this service runs without a model; it only scores")
-    if asked.format not in card.formats:
+    if format_of(asked, card) not in card.formats:
         raise at(UNKNOWN_FORMAT, "/format", f"{card.name} writes {', '.join(card.formats)}")
     cameras = [clip.camera for clip in asked.scene.clips]
     if missing := [camera for camera in card.cameras if camera not in cameras]:
@@ -70,7 +70,12 @@ def engine_request(
         given = asked.controls.prefill
         prefill = None if given is None else plan_of(given, "/controls/prefill")
         controls = _controls(asked.controls, prefill)
-    return PlanRequest(engine_id, scene_of(asked.scene), asked.format, controls, live=asked.stream)
+    return PlanRequest(engine_id, scene_of(asked.scene), format_of(asked, card), controls, live=asked.stream)
+
+
+def format_of(asked: wire.PlanRequest | wire.ReflectRequest, card: ModelCard) -> str:
+    """The response format of what was ``asked``: the model's first where none is named."""
+    return card.default_format if asked.format is None else asked.format
 
 
 def scene_of(asked: wire.Scene) -> Scene:

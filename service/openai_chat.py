@@ -105,7 +105,7 @@ class Extras(wire.Asked):
     bind: bool = False
     reasons: wire.Reasons = "in_view"
     logprobs: bool = False
-    format: str = Field(default="cf_vla", max_length=40)
+    format: str | None = Field(default=None, max_length=40)
 
 
 class ChatRequest(_Dialect):

@@ -14,6 +14,7 @@ import clients.wire as wire
 from service.answers import wire_branch
 from service.callers import while_connected
 from service.errors import validated
+from service.intake import format_of
 from service.openai_chat import (
     THINKING,
     ChatPlaces,
@@ -68,7 +69,7 @@ def openai_router(parts: Parts) -> APIRouter:
             if not chat.stream:
                 return JSONResponse(completion.whole(await while_connected(request, last(events))))
             return await streamed(
-                request, events, lambda told: _chunks(told, completion), asked.format, parts.metrics
+                request, events, lambda told: _chunks(told, completion), format_of(asked, card), parts.metrics
             )
         except ProblemError as problem:
             raise ChatPlaces(chat).problem(problem) from problem

@@ -20,6 +20,7 @@ from service.callers import while_connected
 from service.errors import problem_document, validated
 from service.examples import example_reflection, example_request
 from service.idempotency import NotKept
+from service.intake import format_of
 from service.openapi import PACKED, Responses, event_stream, payloads, problems
 from service.parts import Parts
 from service.payloads import packed, payload_route
@@ -203,7 +204,7 @@ async def _one(
             request,
             events,
             lambda told: server_sent(told, answer, arrival.request_id),
-            asked.format,
+            format_of(asked, parts.lifecycle.card),
             parts.metrics,
         )
 

@@ -49,7 +49,7 @@ def measure(checkpoint: Path, scenes: Sequence[Scene], n: int) -> list[Precision
     Without thinking: a response's tokens are then told by its text.
     """
     requests = [
-        PlanRequest(scene.scene_id, scene, controls=Controls(thinking="never", n=n, seed=seed))
+        PlanRequest(scene.scene_id, scene, "cf_vla", Controls(thinking="never", n=n, seed=seed))
         for seed, scene in enumerate(scenes)
     ]
     with torch.inference_mode():

@@ -40,6 +40,7 @@ class Workload:
             PlanRequest(
                 f"{number}-{place}-{step}",
                 moved(fresh(scenes[(number + place) % len(scenes)], 1000 * number + place), step),
+                "cf_vla",
                 controls=_seeded(controls, 1000 * number + place),
             )
             for place in range(self.scenes)

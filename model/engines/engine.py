@@ -125,7 +125,7 @@ class PlanRequest:
 
     request_id: str
     scene: Scene
-    format: str = "cf_vla"
+    format: str
     controls: Controls = field(default_factory=Controls)
     attempt: Attempt | None = None
     live: bool = False
@@ -235,7 +235,7 @@ class ModelCard:
         name: e.g. ``looktwice-nano``.
         revision: changes with the weights.
         engine: ``torch`` or ``vllm``.
-        formats: response formats it can write.
+        formats: response formats it can write; the first is that of requests that name none.
         cameras: cameras it looks at; a scene must have these.
         image_size: width, height in pixels that pictures are resized to.
         parameters: how many weights.
@@ -256,6 +256,11 @@ class ModelCard:
     prompt_tokens: int = 0
     input_tokens: Mapping[str, int] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def default_format(self) -> str:
+        """The format of requests that name none: the first; empty where there is none."""
+        return next(iter(self.formats), "")
 
 
 @dataclass(frozen=True)

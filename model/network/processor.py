@@ -30,8 +30,12 @@ class LookTwiceProcessor(ProcessorMixin):
         self.looktwice = looktwice or {}
         self.inputs = InputBuilder(Vocabulary(tokenizer), VlaSettings.from_dict(self.looktwice))
 
-    def __call__(self, scene: Scene, format: str = "cf_vla", attempt: Attempt | None = None) -> BatchFeature:
+    def __call__(
+        self, scene: Scene, format: str | None = None, attempt: Attempt | None = None
+    ) -> BatchFeature:
         """One scene as tensors with a batch of one, for the network's `forward`.
+
+        The prompt asks for a response in the format of that name, or in the checkpoint's first.
 
         Keys are ``input_ids`` and ``attention_mask`` [1, t], ``pixel_values_videos`` [p, 1176],
         ``video_grid_thw`` [cameras, 3], ``history`` [1, 16, 4] and, where scene and checkpoint have them,
@@ -40,7 +44,7 @@ class LookTwiceProcessor(ProcessorMixin):
         Raises:
             SceneError, ImageError, FamilyError: as `InputBuilder.build`.
         """
-        built = self.inputs.build(scene, format, attempt)
+        built = self.inputs.build(scene, format or self.inputs.settings.formats[0], attempt)
         ids = torch.from_numpy(built.prompt.ids.copy())[None]
         given = {"history": built.history, "route": built.route, "tracks": built.tracks}
         return BatchFeature(

@@ -29,6 +29,9 @@ def plan(
     limit: Annotated[int, typer.Option(help="Scenes to plan for, of each file.", min=1)] = 1,
     skip: Annotated[int, typer.Option(help="Scenes to pass over first.", min=0)] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
+    format: Annotated[
+        str | None, typer.Option(help="Response format; the checkpoint's first without it.")
+    ] = None,
     thinking: Annotated[str, typer.Option(help="adaptive, always or never.")] = "adaptive",
     n: Annotated[int, typer.Option(help="Draws per scene.", min=1)] = 6,
     temperature: Annotated[float, typer.Option(help="0 takes the likeliest words.")] = 1.0,
@@ -53,6 +56,7 @@ def plan(
                 checkpoint,
                 out,
                 as_json,
+                format,
                 {"route": route, "tracks": tracks},
                 {"thinking": thinking, "n": n, "temperature": temperature, "seed": seed},
             )
@@ -83,6 +87,7 @@ async def _plan(
     checkpoint: Path,
     out: Path,
     as_json: bool,
+    format: str | None,
     given: dict[str, bool],
     controls: dict[str, Any],
 ) -> None:
@@ -99,7 +104,9 @@ async def _plan(
     try:
         for scene in scenes:
             asked = scene.given(**given) if isinstance(scene, LabelledScene) else scene
-            request = PlanRequest(asked.scene_id, asked, controls=Controls(**controls))
+            request = PlanRequest(
+                asked.scene_id, asked, format or engine.card.default_format, Controls(**controls)
+            )
             draws = [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
             draws.sort(key=lambda draw: draw.index)
             picture = out / f"{asked.scene_id}.png"

@@ -105,7 +105,7 @@ def test_a_thousand_hot_draws_all_parse() -> None:
     hot = [Controls(n=40, temperature=1.5, seed=seed) for seed in (1, 2)]
     hot.append(Controls(n=4, temperature=1.5, thinking="always"))
     requests = [
-        PlanRequest(f"{labelled.scene.scene_id} {index}", labelled.scene, controls=controls)
+        PlanRequest(f"{labelled.scene.scene_id} {index}", labelled.scene, "cf_vla", controls=controls)
         for labelled in BUNDLED
         for index, controls in enumerate(hot)
     ]

@@ -36,7 +36,7 @@ def test_a_preset_plans_with_random_weights(untrained_checkpoint: Path, tmp_path
         engine = TorchEngine(tmp_path / "small", TorchSettings(rows=4))
         await engine.start()
         try:
-            request = PlanRequest("a", noisy_scene(), controls=Controls(n=2, thinking="never"))
+            request = PlanRequest("a", noisy_scene(), "cf_vla", controls=Controls(n=2, thinking="never"))
             return sum([isinstance(event, DrawFinished) async for event in engine.submit(request)])
         finally:
             await engine.stop()

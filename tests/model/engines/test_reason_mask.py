@@ -129,7 +129,10 @@ def test_where_nothing_is_in_view_nothing_is_said(phrased: Loaded) -> None:
 
 def test_who_knows_nothing_or_writes_no_phrases_is_not_masked(phrased: Loaded) -> None:
     vocabulary, facts = phrased.vocabulary, np.zeros(len(FACTS), np.float32)
-    asked, phrases = PlanRequest("a", noisy_scene(), controls=Controls()), CF_VLA.in_dialect("phrases")
+    asked, phrases = (
+        PlanRequest("a", noisy_scene(), "cf_vla", controls=Controls()),
+        CF_VLA.in_dialect("phrases"),
+    )
     tracked_one = replace(asked, scene=replace(asked.scene, tracks=()))
     assert reason_mask_of(asked, phrases, vocabulary, None) is None
     assert reason_mask_of(asked, phrases, vocabulary, facts) is not None

@@ -40,7 +40,7 @@ def settings(request: pytest.FixtureRequest) -> Iterator[TorchSettings]:
 
 
 async def draws(engine: TorchEngine, number: int, n: int) -> list[Bytes]:
-    asked = PlanRequest(f"{next(_IDS)}", _SCENES[number], controls=Controls(n=n, seed=number))
+    asked = PlanRequest(f"{next(_IDS)}", _SCENES[number], "cf_vla", controls=Controls(n=n, seed=number))
     told = [event.draw async for event in engine.submit(asked) if isinstance(event, DrawFinished)]
     return [bytes_of(draw) for draw in sorted(told, key=lambda draw: draw.index)]
 

@@ -74,7 +74,7 @@ def test_every_threshold_is_told_from_never_and_always_thinking(untrained_checkp
 
             async def draws(**controls: object) -> list[Draw]:
                 asked = Controls(n=6, seed=3, **controls)  # type: ignore[arg-type]
-                return await plan(engine, PlanRequest(str(controls), noisy_scene(), controls=asked))
+                return await plan(engine, PlanRequest(str(controls), noisy_scene(), "cf_vla", controls=asked))
 
             never, always = await draws(thinking="never"), await draws(thinking="always")
             probabilities = sorted(draw.think_probability or 0.0 for draw in never)
@@ -89,7 +89,7 @@ def test_every_threshold_is_told_from_never_and_always_thinking(untrained_checkp
 def test_leaving_early_frees_the_rows(untrained_checkpoint: Path) -> None:
     async def test() -> None:
         async with running(untrained_checkpoint, rows=2) as engine:
-            waiting = PlanRequest("slow", noisy_scene(), controls=Controls(n=2, thinking="always"))
+            waiting = PlanRequest("slow", noisy_scene(), "cf_vla", controls=Controls(n=2, thinking="always"))
             async for _ in (events := engine.submit(waiting)):
                 break
             passes = engine.counts.passes
@@ -150,7 +150,7 @@ def test_an_id_is_used_once_at_a_time(untrained_checkpoint: Path) -> None:
 def test_cancelling_by_name_tells_who_waits(untrained_checkpoint: Path) -> None:
     async def test() -> None:
         async with running(untrained_checkpoint, rows=2) as engine:
-            request = PlanRequest("slow", noisy_scene(), controls=Controls(n=2, thinking="always"))
+            request = PlanRequest("slow", noisy_scene(), "cf_vla", controls=Controls(n=2, thinking="always"))
             waiting = asyncio.create_task(plan(engine, request))
             await asyncio.sleep(0.05)
             engine.cancel("slow")
@@ -197,7 +197,7 @@ def test_a_deadline_counts_from_submission(
 def test_stopping_tells_those_who_wait(untrained_checkpoint: Path) -> None:
     async def test() -> None:
         async with running(untrained_checkpoint) as engine:
-            request = PlanRequest("slow", noisy_scene(), controls=Controls(n=8, thinking="always"))
+            request = PlanRequest("slow", noisy_scene(), "cf_vla", controls=Controls(n=8, thinking="always"))
             waiting = asyncio.create_task(plan(engine, request))
             await asyncio.sleep(0.05)
             await engine.stop()

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -92,10 +92,10 @@ async def plans(engine: Engine, requests: list[PlanRequest]) -> list[list[Draw]]
     return await asyncio.gather(*(plan(engine, request) for request in requests))
 
 
-def greedy(name: str, scene: Scene, **controls: object) -> PlanRequest:
+def greedy(name: str, scene: Scene, **controls: Any) -> PlanRequest:
     # Behind vLLM only tracks tell what is in view.
     reasons: Reasons = "any" if scene.tracks is None else "in_view"
-    return PlanRequest(name, scene, controls=Controls(n=1, temperature=0.0, reasons=reasons, **controls))  # type: ignore[arg-type]
+    return PlanRequest(name, scene, "cf_vla", Controls(n=1, temperature=0.0, reasons=reasons, **controls))
 
 
 def mixed_scenes(count: int) -> list[Scene]:
@@ -156,7 +156,7 @@ def test_both_engines_write_the_same_with_a_resampler_and_tracks(
     ]
     requests = [greedy(scene.scene_id, scene) for scene in scenes]
 
-    live = PlanRequest("live", scenes[0], controls=Controls(n=2, thinking="always"), live=True)
+    live = PlanRequest("live", scenes[0], "cf_vla", controls=Controls(n=2, thinking="always"), live=True)
 
     async def texts(engine: Engine) -> tuple[list[str], list[Event]]:
         await engine.start()
@@ -202,7 +202,10 @@ def test_reflections_state_only_what_the_tracks_tell(
     assert [draw.text for [draw] in ours] == [draw.text for [draw] in theirs]
     for decision in ("least_error", "drawn"):
         controls = Controls(n=4, temperature=1.5, thinking="always", numbers=decision)
-        asked = [PlanRequest(f"{decision}-{k}", scene, controls=controls) for k, scene in enumerate(tracked)]
+        asked = [
+            PlanRequest(f"{decision}-{k}", scene, "cf_vla", controls=controls)
+            for k, scene in enumerate(tracked)
+        ]
         for draws in loop.run_until_complete(plans(vllm, asked)):
             for draw in draws:
                 assert draw.thinking is not None
@@ -245,7 +248,7 @@ def test_draws_are_valid_and_repeat_with_their_seed(
 ) -> None:
     def request(name: str, seed: int) -> PlanRequest:
         controls = Controls(n=6, temperature=1.5, seed=seed, numbers=numbers)
-        return PlanRequest(f"{numbers}-{name}", BUNDLED[2], controls=controls)
+        return PlanRequest(f"{numbers}-{name}", BUNDLED[2], "cf_vla", controls=controls)
 
     async def all_three() -> list[list[Draw]]:
         return [await plan(vllm, request(f"{k}", seed)) for k, seed in enumerate((3, 3, 4))]
@@ -266,7 +269,7 @@ def test_decisions_are_as_likely_as_training_says(
 ) -> None:
     controls = Controls(n=2, temperature=1.2, numbers=decision, codes=decision, logprobs=True)
     draws = loop.run_until_complete(
-        plan(vllm, PlanRequest(f"likely {decision}", BUNDLED[0], controls=controls))
+        plan(vllm, PlanRequest(f"likely {decision}", BUNDLED[0], "cf_vla", controls=controls))
     )
     loaded = load(CHECKPOINT)
     families = families_of(loaded.card.formats, loaded.settings.reflection)
@@ -283,7 +286,9 @@ def test_decisions_are_as_likely_as_training_says(
 
 
 def test_sections_come_before_their_draw(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
-    request = PlanRequest("stream", BUNDLED[3], controls=Controls(n=2, thinking="always"), live=True)
+    request = PlanRequest(
+        "stream", BUNDLED[3], "cf_vla", controls=Controls(n=2, thinking="always"), live=True
+    )
     events = loop.run_until_complete(events_of(vllm, request))
     assert isinstance(events[0], Started)
     for index in range(2):
@@ -297,7 +302,7 @@ def test_sections_come_before_their_draw(loop: asyncio.AbstractEventLoop, vllm: 
 
 def test_leaving_early_frees_vllm(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
     async def test() -> None:
-        request = PlanRequest("early", BUNDLED[4], controls=Controls(n=4, thinking="always"))
+        request = PlanRequest("early", BUNDLED[4], "cf_vla", controls=Controls(n=4, thinking="always"))
         async for _ in (events := vllm.submit(request)):
             break
         await events.aclose()
@@ -320,14 +325,14 @@ def test_bad_requests_fail_alone(loop: asyncio.AbstractEventLoop, vllm: VllmEngi
     damaged = replace(scene, clips=(Clip(scene.clips[0].camera, (b"\xff\xd8no",) * 4), *scene.clips[1:]))
 
     async def test() -> None:
-        good = asyncio.create_task(plan(vllm, PlanRequest("good", scene, controls=Controls(n=2))))
+        good = asyncio.create_task(plan(vllm, PlanRequest("good", scene, "cf_vla", controls=Controls(n=2))))
         for bad, message in (
-            (PlanRequest("a", damaged), "picture"),
-            (PlanRequest("b", replace(scene, clips=scene.clips[:1])), "lacks camera"),
+            (PlanRequest("a", damaged, "cf_vla"), "picture"),
+            (PlanRequest("b", replace(scene, clips=scene.clips[:1]), "cf_vla"), "lacks camera"),
             (PlanRequest("c", scene, "elf_vla"), "unknown format"),
-            (PlanRequest("d", scene, controls=Controls(deadline_ms=50)), "torch engine"),
-            (PlanRequest("e", scene, controls=Controls(bind=True)), "bind needs the torch engine"),
-            (PlanRequest("good", scene), "in use"),
+            (PlanRequest("d", scene, "cf_vla", controls=Controls(deadline_ms=50)), "torch engine"),
+            (PlanRequest("e", scene, "cf_vla", controls=Controls(bind=True)), "bind needs the torch engine"),
+            (PlanRequest("good", scene, "cf_vla"), "in use"),
         ):
             with pytest.raises((RequestError, ImageError), match=message):
                 await plan(vllm, bad)
