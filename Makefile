@@ -23,8 +23,9 @@ NOT_FAST := $(addprefix tests/service/,cli vllm test_connection.py test_fuzz.py 
 plan: $(VENV)/.serve
 	$(BIN)/looktwice plan
 
+# A file's tests stay together: they share servers and checkpoints.
 test: $(VENV)/.dev $(BIN)/promtool system-packages lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n logical --dist loadfile
 
 test-fast: $(VENV)/.dev
 	$(BIN)/python -m pytest -q $(FAST_TESTS) $(addprefix --ignore=,$(NOT_FAST))
