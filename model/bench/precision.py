@@ -10,12 +10,11 @@ import numpy as np
 import torch
 
 from model.driving.scene import Scene
-from model.engines.engine import Controls, DrawFinished, PlanRequest
+from model.engines.engine import Controls, PlanRequest
 from model.engines.sampling import probabilities, uniform
 from model.engines.torch.batch import Batch, Feed
-from model.engines.torch.decoder import Decoder
+from model.engines.torch.offline import draws_of
 from model.engines.torch.runner import Asked, Prompt, Runner
-from model.formats.text import parse
 from model.network.checkpoint import load
 
 _AT_ONCE = 8
@@ -44,10 +43,7 @@ Responses = dict[tuple[str, int], tuple[int, ...]]
 
 
 def measure(checkpoint: Path, scenes: Sequence[Scene], n: int) -> list[Precision]:
-    """Decode ``scenes`` with ``n`` draws each in float64, in float32, and with products in bfloat16.
-
-    Without thinking: a response's tokens are then told by its text.
-    """
+    """Decode ``scenes`` with ``n`` draws each in float64, in float32, and with products in bfloat16."""
     requests = [
         PlanRequest(scene.scene_id, scene, "cf_vla", Controls(thinking="never", n=n, seed=seed))
         for seed, scene in enumerate(scenes)
@@ -65,18 +61,9 @@ def measure(checkpoint: Path, scenes: Sequence[Scene], n: int) -> list[Precision
 
 
 def _decode(runner: Runner, requests: Sequence[PlanRequest]) -> Responses:
-    decoder = Decoder(runner)
-    for request in requests:
-        decoder.add(request)
-    formats = {request.request_id: request.format for request in requests}
-    responses: Responses = {}
-    while not decoder.idle:
-        for name, event in decoder.step():
-            if isinstance(event, DrawFinished):
-                format = runner.formats[formats[name]]
-                tokens = format.render(parse(format, event.draw.text))
-                responses[name, event.draw.index] = tuple(token.id for token in tokens)
-    return responses
+    return {
+        (name, draw.index): draw.ids for name, draws in draws_of(runner, requests).items() for draw in draws
+    }
 
 
 def _margins(

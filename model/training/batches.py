@@ -96,6 +96,7 @@ class ResponseDataset(Dataset[Sample]):
     """Renders `Item`s; the items of an epoch come from `TaskSampler`.
 
     Attributes:
+        formats: that the checkpoint writes, compiled.
         reflecting: the format of reflections, where the checkpoint writes any.
 
     Args:
@@ -130,7 +131,7 @@ class ResponseDataset(Dataset[Sample]):
         self._random = np.random.default_rng(seed)
         self._weights, self._pictures, self._vocabulary = weights, pictures, vocabulary
         self._families = families_of(inputs.settings.formats, inputs.settings.reflection)
-        self._formats = {
+        self.formats = {
             name: CompiledFormat(family.format, vocabulary) for name, family in self._families.items()
         }
         self.reflecting = next((name for name, family in self._families.items() if family.looks_twice), None)
@@ -182,7 +183,7 @@ class ResponseDataset(Dataset[Sample]):
         )
 
     def _target(self, task: str, lesson: Lesson) -> Target:
-        return make_target(self._families[task], self._formats[task], lesson, self._weights)
+        return make_target(self._families[task], self.formats[task], lesson, self._weights)
 
     def _prompt(self, item: Item, situation: Situation) -> list[int]:
         if self._pictures:

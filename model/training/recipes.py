@@ -13,9 +13,29 @@ from typing import Final, Literal
 
 from model.families.cf_vla.targets import NANO_WEIGHTS, PAPER_WEIGHTS
 from model.families.elf_vla import targets as elf_vla
+from model.training.rewards import RewardWeights
 from model.training.targets import SectionWeights
 
-Goal = Literal["ground", "read", "respond", "code"]
+Goal = Literal["ground", "read", "respond", "outcome", "code"]
+
+
+@dataclass(frozen=True)
+class OutcomeSettings:
+    """How a network learns from what comes of its own draws; see `model.training.outcomes`.
+
+    Attributes:
+        draws: of each scene, compared with each other.
+        temperature: that they are drawn at.
+        clip: see `policy_loss`.
+        imitation: weight of the loss on the expert's responses, beside that of the draws.
+        rewards: what counts.
+    """
+
+    draws: int = 8
+    temperature: float = 1.0
+    clip: float = 0.2
+    imitation: float = 0.01
+    rewards: RewardWeights = field(default_factory=RewardWeights)
 
 
 @dataclass(frozen=True)
@@ -25,13 +45,13 @@ class Recipe:
     Attributes:
         name: as the command line gives it.
         goal: ``ground`` trains the vision tower alone, ``read`` what to do about tracks or, with pictures,
-            about what was gathered from them, ``respond`` trains everything on responses, ``code`` the
-            codes of pictures alone.
+            about what was gathered from them, ``respond`` trains everything on responses, ``outcome`` on what
+            comes of own draws, ``code`` the codes of pictures alone.
         pictures: whether responses are learned with pictures.
         tasks: share of the examples for each response format.
         route_share: share of the examples whose route is given.
         weights: of sections in the loss.
-        steps, batch_size: how long.
+        steps, batch_size: how long; of ``outcome``, scenes are counted, each with all its draws.
         learning_rate, warmup_steps: cosine decay to zero behind a linear warm-up.
         vision_rate: the tower's learning rate, relative to the rest; 0 leaves the tower as it is.
         tracks_share, mirror_share, blur_share: shares of the examples with tracks, mirrored, and with no
@@ -40,6 +60,7 @@ class Recipe:
         head_weight: of a regression of the trajectory where its first code is written.
         reflections: what becomes of the reflections of a build: ``learned`` as counterfactual examples, or
             their ``scenes`` learned once more without them; None where there are none.
+        outcome: how own draws are judged; for that goal alone.
         seed: of order and initialisation.
     """
 
@@ -60,6 +81,7 @@ class Recipe:
     error_weight: float = 0.0
     head_weight: float = 0.0
     reflections: Literal["learned", "scenes"] | None = None
+    outcome: OutcomeSettings | None = None
     seed: int = 0
 
 
@@ -132,9 +154,23 @@ NANO: Final[Mapping[str, Recipe]] = {
         weights=elf_vla.WEIGHTS,
         error_weight=0.0,
         head_weight=0.0,
-    )
+    ),
+    "cf-rl": replace(
+        _NANO,
+        name="cf-rl",
+        goal="outcome",
+        steps=400,
+        batch_size=16,
+        learning_rate=2e-5,
+        warmup_steps=10,
+        tasks={"cf_vla": 1.0},
+        mirror_share=0.0,
+        blur_share=0.0,
+        head_weight=0.0,
+        outcome=OutcomeSettings(),
+    ),
 }
-"""The stages of the shipped checkpoint, the control of its last one, and ELF-VLA's second stage."""
+"""The stages of the shipped checkpoint, the control of its last one, ELF-VLA's second; outcome training."""
 
 PAPER: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe

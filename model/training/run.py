@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from torch.utils.data import Dataset
 
 from model.driving.reflection_store import read_reflections
 from model.driving.scene import LabelledScene
+from model.driving.scene_store import read_scenes
 from model.network.attention import MATMUL_ATTENTION
 from model.network.checkpoint import Loaded, create_nano, load, save, with_formats
 from model.network.codec import TrajectoryCodec
@@ -30,6 +31,7 @@ from model.training.examples import Examples, load_examples
 from model.training.grounding import GroundingDataset, GroundingLearner, collate_grounding
 from model.training.intents import IntentDataset, IntentLearner, Source, collate_intents, read_errors
 from model.training.learner import ResponseLearner
+from model.training.outcomes import OutcomeLearner, ScenePlaces, collate_places
 from model.training.recipes import Recipe
 from model.training.reflections import OnExamples, reflections_on
 from model.training.trainer import LOG_FILE, LearnerTrainer, Validate
@@ -120,7 +122,7 @@ def run(
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
     on_examples = None if reflections is None else reflections_on(examples, read_reflections(reflections))
-    learner, dataset, sampler, collator = _prepare(recipe, loaded, examples, on_examples, settings)
+    learner, dataset, sampler, collator = _prepare(recipe, loaded, scenes, examples, on_examples, settings)
     if isinstance(learner, IntentLearner) and validation:
         held_out = Examples.from_scenes(validation, loaded.settings.cameras)
         seen = open_vision(loaded, held_out, settings.cache, mirrored=False) if recipe.pictures else None
@@ -177,7 +179,12 @@ def last_whole_state(folder: Path) -> str | None:
 
 
 def _prepare(
-    recipe: Recipe, loaded: Loaded, examples: Examples, on_examples: OnExamples | None, settings: RunSettings
+    recipe: Recipe,
+    loaded: Loaded,
+    scenes: Path,
+    examples: Examples,
+    on_examples: OnExamples | None,
+    settings: RunSettings,
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
     if recipe.goal == "ground":
         grounding = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE)
@@ -202,6 +209,31 @@ def _prepare(
         reflections=() if on_examples is None else on_examples.reflections,
         seed=recipe.seed,
     )
+    for part in vision_parts(loaded.model):
+        part.requires_grad_(recipe.vision_rate > 0)
+    if loaded.model.resampler is not None:
+        loaded.model.resampler.intent.requires_grad_(True)
+    learner = ResponseLearner(
+        loaded.model,
+        loaded.vocabulary,
+        loaded.codec,
+        error_weight=recipe.error_weight,
+        head_weight=recipe.head_weight,
+        compiled=settings.compiled,
+    )
+    if recipe.outcome is not None:
+        [task] = recipe.tasks
+        judging = OutcomeLearner(
+            learner,
+            loaded,
+            responses,
+            list(read_scenes(scenes, dense=False)),
+            task,
+            recipe.outcome,
+            route_share=recipe.route_share,
+            tracks_share=recipe.tracks_share if loaded.settings.with_tracks else 0.0,
+        )
+        return judging, ScenePlaces(len(examples)), None, collate_places
     has_route = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
     sampler = TaskSampler(
         has_route,
@@ -217,18 +249,6 @@ def _prepare(
         mirror_share=recipe.mirror_share,
         blur_share=recipe.blur_share,
         mirror_reflected=loaded.settings.reflection == "phrases",
-    )
-    for part in vision_parts(loaded.model):
-        part.requires_grad_(recipe.vision_rate > 0)
-    if loaded.model.resampler is not None:
-        loaded.model.resampler.intent.requires_grad_(True)
-    learner = ResponseLearner(
-        loaded.model,
-        loaded.vocabulary,
-        loaded.codec,
-        error_weight=recipe.error_weight,
-        head_weight=recipe.head_weight,
-        compiled=settings.compiled,
     )
     return learner, responses, sampler, collate
 
@@ -247,6 +267,7 @@ def _inherit_log(log: Path, sources: Sequence[Path]) -> None:
 def _about(recipe: Recipe, examples: Examples, on_examples: OnExamples | None) -> Mapping[str, Any]:
     about = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     about |= {"tasks": dict(recipe.tasks), "weights": dict(recipe.weights)}
+    about["outcome"] = None if recipe.outcome is None else asdict(recipe.outcome)
     if on_examples is not None:
         thought = sum(bool(each.thinking) for each in on_examples.reflections)
         about |= {"reflections_count": thought, "right_plans_count": len(on_examples.reflections) - thought}

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from model.driving.scene import LabelledScene
-from model.engines.engine import Controls, DrawFinished, PlanRequest
-from model.engines.torch.decoder import Decoder, Failed
+from model.engines.engine import Controls, PlanRequest
+from model.engines.torch.offline import draws_of
 from model.engines.torch.runner import Runner
 from model.evaluation.open_loop import evaluate_draws
 from model.network.checkpoint import Loaded
@@ -35,21 +35,10 @@ def open_loop(
     with torch.inference_mode():
         for format in formats:
             for suffix, route, tracks in _GIVEN if loaded.settings.with_tracks else _GIVEN[:2]:
-                decoder = Decoder(Runner(loaded, _ROWS))
-                for labelled in scenes:
-                    scene = labelled.given(route=route, tracks=tracks)
-                    decoder.add(PlanRequest(scene.scene_id, scene, format, Controls(n=n)))
-                draws: dict[str, list[DrawFinished]] = {}
-                while not decoder.idle:
-                    for name, event in decoder.step():
-                        if isinstance(event, Failed):
-                            raise event.error
-                        if isinstance(event, DrawFinished):
-                            draws.setdefault(name, []).append(event)
-                results = [
-                    evaluate_draws(futures[name], [event.draw for event in finished])
-                    for name, finished in draws.items()
-                ]
+                given = [labelled.given(route=route, tracks=tracks) for labelled in scenes]
+                requests = [PlanRequest(scene.scene_id, scene, format, Controls(n=n)) for scene in given]
+                draws = draws_of(Runner(loaded, _ROWS), requests)
+                results = [evaluate_draws(futures[name], finished) for name, finished in draws.items()]
                 label = f"{format}{suffix}"
                 for measure in _MEASURES:
                     values = [getattr(result, measure) for result in results]
