@@ -48,7 +48,7 @@ from clients.answers import (
     told,
     unreachable,
 )
-from clients.requests import label_request, plan_request, reflect_request
+from clients.requests import attempt_at, label_request, plan_request, reflect_request
 from clients.wire_values import with_pictures
 from model.driving.outcome import Outcome
 from model.driving.plan import Plan
@@ -73,6 +73,7 @@ __all__ = [
     "ServiceBusy",
     "ServiceFailed",
     "Told",
+    "attempt_at",
     "label_request",
     "plan_request",
     "reflect_request",
@@ -135,6 +136,7 @@ class PlannerClient:
         *,
         prefill: Plan | None = None,
         format: str | None = None,
+        attempt: wire.Attempt | None = None,
         request_id: str | None = None,
     ) -> PlanResult:
         """Plan for ``scene``.
@@ -144,12 +146,13 @@ class PlannerClient:
             controls: draws, thinking, sampling, deadline.
             prefill: the first plan, to be continued instead of one the model writes.
             format: a response format the model writes; its first where None.
+            attempt: to be refined, by formats that do; see `attempt_at`.
             request_id: shows up in the service's log; made there when None.
 
         Raises:
             PlannerError: see its subclasses.
         """
-        asked = plan_request(scene, controls, prefill=prefill, format=format)
+        asked = plan_request(scene, controls, prefill=prefill, format=format, attempt=attempt)
         return plan_result(self._ask("/v1/plan", asked, request_id, controls.deadline_ms))
 
     def plan_batch(self, asked: Sequence[wire.PlanRequest]) -> list[PlanResult | PlannerProblem]:
@@ -303,10 +306,11 @@ class AsyncPlannerClient:
         *,
         prefill: Plan | None = None,
         format: str | None = None,
+        attempt: wire.Attempt | None = None,
         request_id: str | None = None,
     ) -> PlanResult:
         """Plan for ``scene``; see `PlannerClient.plan`."""
-        asked = plan_request(scene, controls, prefill=prefill, format=format)
+        asked = plan_request(scene, controls, prefill=prefill, format=format, attempt=attempt)
         return plan_result(await self._ask("/v1/plan", asked, request_id, controls.deadline_ms))
 
     async def plan_batch(self, asked: Sequence[wire.PlanRequest]) -> list[PlanResult | PlannerProblem]:

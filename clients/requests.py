@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from clients import wire
 from clients.wire_values import rows, wire_agents, wire_scene
 from model.driving.outcome import Outcome
 from model.driving.plan import Plan
 from model.driving.scene import Scene
+from model.driving.trajectory import TEN_HZ_S, FloatArray
 from model.driving.view import Surroundings
 
 
@@ -16,11 +19,18 @@ def plan_request(
     *,
     prefill: Plan | None = None,
     format: str | None = None,
+    attempt: wire.Attempt | None = None,
 ) -> wire.PlanRequest:
     """The body of POST /v1/plan for ``scene``."""
     if prefill is not None:
         controls = controls.model_copy(update={"prefill": str(prefill)})
-    return wire.PlanRequest(scene=wire_scene(scene), controls=controls, format=format)
+    return wire.PlanRequest(scene=wire_scene(scene), controls=controls, format=format, attempt=attempt)
+
+
+def attempt_at(trajectory: FloatArray, feedback: str, times_s: Sequence[float] = TEN_HZ_S) -> wire.Attempt:
+    """An attempt to be refined: a draft [t, 4] with poses at ``times_s``, and feedback on it."""
+    told = None if tuple(times_s) == TEN_HZ_S else list(times_s)
+    return wire.Attempt(trajectory=rows(trajectory), times_s=told, feedback=feedback)
 
 
 def reflect_request(

@@ -49,6 +49,8 @@ PART_SCHEME: Final = "cid:"
 REQUEST_PART: Final = "request"
 """The part of a multipart body that holds the JSON."""
 MAX_BATCH: Final = 64
+MAX_FEEDBACK_CHARACTERS: Final = 4_000
+"""Of feedback on a draft; a model's prompt may have room for less."""
 MAX_SEED: Final = 2**53 - 1
 """The largest integer that every JSON reader keeps exact."""
 
@@ -261,11 +263,32 @@ class Controls(ReflectControls):
     )
 
 
+class Attempt(Asked):
+    """An answer that was given to the scene before, and what is said of it."""
+
+    trajectory: Poses = Field(description="The draft: 64 poses, or one for each of times_s.")
+    times_s: TimesS = Field(
+        default=None, description="When its poses are, as the format has them; null for 64 at 10 Hz."
+    )
+    feedback: str = Field(
+        min_length=1,
+        max_length=MAX_FEEDBACK_CHARACTERS,
+        description="Any words, such as the `text` of POST /v1/feedback, as far as the prompt has room.",
+    )
+
+    _timed = model_validator(mode="after")(_check_times)
+
+
 class PlanRequest(Asked):
     """Body of POST /v1/plan."""
 
     scene: Scene
     controls: Controls = Controls()
+    attempt: Attempt | None = Field(
+        default=None,
+        description="To be refined; needed by formats that refine, which GET /v1/models lists, and refused "
+        "by others.",
+    )
     format: str | None = Field(
         default=None,
         max_length=40,
@@ -545,6 +568,9 @@ class ModelCard(Answered):
     revision: str = Field(description="Changes with the weights.")
     engine: str = Field(description="torch or vllm.")
     formats: list[str] = Field(description="Response formats it writes.")
+    refines: list[str] = Field(
+        default_factory=list, description="Of these, the ones that refine an attempt, which they need."
+    )
     cameras: list[str] = Field(description="Cameras it needs; a scene must have a clip of each.")
     image_size: Annotated[list[int], Field(min_length=2, max_length=2)] = Field(
         description="Width and height in pixels that pictures are resized to."

@@ -11,6 +11,7 @@ from model.driving.agreement import Agreement
 from model.driving.plan import Plan, plan_changes, plan_iou
 from model.driving.trajectory import TEN_HZ_S, agreed
 from model.engines.engine import Draw, ModelCard
+from model.families.registry import family_named
 from service.planning import Planned
 from service.problems import REFUSED, ProblemError
 
@@ -56,6 +57,7 @@ def model_card(card: ModelCard) -> wire.ModelCard:
         revision=card.revision,
         engine=card.engine,
         formats=list(card.formats),
+        refines=[name for name in card.formats if family_named(name).refines],
         cameras=list(card.cameras),
         image_size=list(card.image_size),
         parameters=card.parameters,

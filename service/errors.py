@@ -20,6 +20,7 @@ from service.problems import (
     BODY_TIMEOUT,
     BODY_TOO_LARGE,
     INTERNAL,
+    INVALID_ATTEMPT,
     INVALID_CLIP,
     INVALID_CONTROLS,
     INVALID_FEEDBACK,
@@ -58,6 +59,7 @@ _KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], Kind]]] = (
     (("expert_plan",), INVALID_PLAN),
     (("controls", "prefill"), INVALID_PLAN),
     (("controls",), INVALID_CONTROLS),
+    (("attempt",), INVALID_ATTEMPT),
     (("labels",), INVALID_LABELS),
     *(
         ((field,), INVALID_TRAJECTORY)

@@ -14,14 +14,19 @@ from model.driving.images import ImageError, check_image
 from model.driving.plan import GROUPS, TICKS, MetaAction, Plan, PlanError, parse_plan
 from model.driving.scene import Clip, Scene, SceneError, Track
 from model.driving.trajectory import (
+    TEN_HZ_S,
     FloatArray,
     GeometryError,
     check_history,
     check_route,
+    check_trajectory,
     wrap_angle,
 )
 from model.engines.engine import Controls, ModelCard, PlanRequest, RequestError
+from model.families.family import Attempt
+from model.families.registry import family_named
 from service.problems import (
+    INVALID_ATTEMPT,
     INVALID_CLIP,
     INVALID_CONTROLS,
     INVALID_HISTORY,
@@ -53,11 +58,12 @@ def engine_request(
         engine_id: unique among running requests, which a caller's request id need not be.
 
     Raises:
-        ProblemError: pictures, geometry, plan, controls, format or cameras that cannot be served.
+        ProblemError: pictures, geometry, plan, attempt, controls, format or cameras that cannot be served.
     """
+    format, attempt = format_of(asked, card), None
     if not card.formats:
         raise at(UNKNOWN_FORMAT, "/format", "this service runs without a model; it only scores")
-    if format_of(asked, card) not in card.formats:
+    if format not in card.formats:
         raise at(UNKNOWN_FORMAT, "/format", f"{card.name} writes {', '.join(card.formats)}")
     cameras = [clip.camera for clip in asked.scene.clips]
     if missing := [camera for camera in card.cameras if camera not in cameras]:
@@ -70,7 +76,8 @@ def engine_request(
         given = asked.controls.prefill
         prefill = None if given is None else plan_of(given, "/controls/prefill")
         controls = _controls(asked.controls, prefill)
-    return PlanRequest(engine_id, scene_of(asked.scene), format_of(asked, card), controls, live=asked.stream)
+        attempt = _attempt(asked.attempt, format)
+    return PlanRequest(engine_id, scene_of(asked.scene), format, controls, attempt, live=asked.stream)
 
 
 def format_of(asked: wire.PlanRequest | wire.ReflectRequest, card: ModelCard) -> str:
@@ -78,22 +85,52 @@ def format_of(asked: wire.PlanRequest | wire.ReflectRequest, card: ModelCard) ->
     return card.default_format if asked.format is None else asked.format
 
 
+def _attempt(asked: wire.Attempt | None, format: str) -> Attempt | None:
+    """What the format refines; raises `ProblemError` where it needs one, takes none, or has other times."""
+    family, pointer = family_named(format), "/attempt"
+    if asked is None:
+        if family.refines:
+            raise at(
+                INVALID_ATTEMPT,
+                pointer,
+                f"{format} refines an attempt, and there is none: send a draft and feedback on it",
+            )
+        return None
+    if not family.refines:
+        raise at(INVALID_ATTEMPT, pointer, f"{format} refines none; leave it out")
+    if tuple(asked.times_s or TEN_HZ_S) != family.times_s:
+        times = ", ".join(f"{time_s:g}" for time_s in family.times_s)
+        raise at(INVALID_ATTEMPT, f"{pointer}/times_s", f"{format} refines poses at {times} s")
+    try:
+        return Attempt(check_trajectory(asked.trajectory, family.times_s), asked.feedback)
+    except GeometryError as error:
+        raise at(INVALID_ATTEMPT, f"{pointer}/trajectory", str(error)) from None
+
+
 def scene_of(asked: wire.Scene) -> Scene:
     """A scene; raises `ProblemError` for pictures and geometry that cannot be accepted."""
-    history = _history(asked.history)
-    try:
-        route = None if asked.route is None else check_route(asked.route)
-    except GeometryError as error:
-        raise at(INVALID_ROUTE, "/scene/route", str(error)) from None
+    history, route = history_of(asked), route_of(asked)
     clips = tuple(
         Clip(clip.camera, tuple(_images(clip.images, f"/scene/clips/{number}/images")))
         for number, clip in enumerate(asked.clips)
     )
-    tracks = None if asked.tracks is None else tuple(map(_track, range(len(asked.tracks)), asked.tracks))
     try:
-        return Scene(asked.scene_id, clips, history, route, tracks)
+        return Scene(asked.scene_id, clips, history, route, tracks_of(asked))
     except SceneError as error:
         raise at(INVALID_CLIP, "/scene/clips", str(error)) from None
+
+
+def tracks_of(asked: wire.Scene) -> tuple[Track, ...] | None:
+    """Its tracks; raises `ProblemError` for one that cannot be."""
+    return None if asked.tracks is None else tuple(map(_track, range(len(asked.tracks)), asked.tracks))
+
+
+def route_of(asked: wire.Scene) -> FloatArray | None:
+    """Its route; raises `ProblemError` for one that leads nowhere."""
+    try:
+        return None if asked.route is None else check_route(asked.route)
+    except GeometryError as error:
+        raise at(INVALID_ROUTE, "/scene/route", str(error)) from None
 
 
 def _track(number: int, asked: wire.Track) -> Track:
@@ -114,10 +151,11 @@ def _images(given: Iterable[str | bytes], pointer: str) -> Iterable[bytes]:
         yield image
 
 
-def _history(rows: list[list[float]]) -> FloatArray:
+def history_of(asked: wire.Scene) -> FloatArray:
+    """Its history; raises `ProblemError` for one that no car can have driven."""
     pointer = "/scene/history"
     try:
-        history = check_history(rows)
+        history = check_history(asked.history)
     except GeometryError as error:
         raise at(INVALID_HISTORY, pointer, str(error)) from None
     steps = np.diff(history[:, :3], axis=0)

@@ -196,7 +196,7 @@ class ChatPlaces:
                 return f"/{name}"
             case ["controls" | "scene", *rest]:
                 return "/".join(["/looktwice", *rest])
-            case ["format", *_]:
+            case ["format" | "attempt", *_]:  # a chat has no attempt, but may name a format that needs one
                 return "/looktwice/format"
         return pointer
 

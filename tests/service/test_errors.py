@@ -87,6 +87,14 @@ def in_degrees(rows: Any) -> Any:
     return rows
 
 
+ATTEMPT: dict[str, Any] = {"trajectory": [[0.0] * 4] * 64, "feedback": "Wait."}
+FEEDBACK = ("invalid-attempt", "/attempt/feedback")
+
+
+def without(field: str) -> dict[str, Any]:
+    return {name: value for name, value in ATTEMPT.items() if name != field}
+
+
 def clip(**changes: Any) -> dict[str, Any]:
     first: dict[str, Any] = body()["scene"]["clips"][0]
     return first | changes
@@ -184,6 +192,22 @@ BAD_BODIES: list[tuple[str, Any, str, str]] = [
         body(prefill={"lateral": [{"start_s": 0.0, "end_s": 0.123, "word": "Straight"}]}),
         "invalid-plan",
         "/controls/prefill",
+    ),
+    ("an attempt that nothing refines", with_(ATTEMPT, "attempt"), "invalid-attempt", "/attempt"),
+    ("an attempt without feedback", with_(without("feedback"), "attempt"), *FEEDBACK),
+    ("empty feedback", with_(ATTEMPT | {"feedback": ""}, "attempt"), *FEEDBACK),
+    ("endless feedback", with_(ATTEMPT | {"feedback": "x" * 4_001}, "attempt"), *FEEDBACK),
+    (
+        "a NaN in a draft",
+        with_(ATTEMPT | {"trajectory": [[float("nan")] * 4] * 64}, "attempt"),
+        "invalid-attempt",
+        "/attempt/trajectory/0/0",
+    ),
+    (
+        "a draft of another length",
+        with_(ATTEMPT | {"times_s": [0.5, 1.0]}, "attempt"),
+        "invalid-attempt",
+        "/attempt",
     ),
     (
         "times beyond any horizon",
@@ -297,6 +321,7 @@ def test_types_are_stable() -> None:
         "unknown-format": 422,
         "request-refused": 422,
         "invalid-scene-file": 422,
+        "invalid-attempt": 422,
         "invalid-feedback": 422,
         "other-plan": 422,
         "feedback-refused": 502,

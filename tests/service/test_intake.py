@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from clients import wire
 from service.intake import MAX_STEP_CHANGE_M, engine_request
-from service.problems import INVALID_TRACKS, ProblemError
+from service.problems import INVALID_ATTEMPT, INVALID_TRACKS, ProblemError
 from tests.service.scripted_engine import CARD
 from tests.service.serving import body
 
@@ -67,6 +68,51 @@ def test_cameras_the_model_does_not_need_are_welcome() -> None:
     document["scene"]["clips"].append(document["scene"]["clips"][0] | {"camera": "back"})
     request = engine_request(wire.PlanRequest.model_validate(document), CARD, "id")
     assert [clip.camera for clip in request.scene.clips] == ["front_wide_120", "front_tele_30", "back"]
+
+
+REFINING = replace(CARD, formats=("elf_vla", "elf_vla_refine"))
+HALF_SECONDS = [0.5 * step for step in range(1, 9)]
+DRAFT = {"trajectory": [[4.0 * step, 0.0, 0.0, 0.0] for step in range(1, 9)], "times_s": HALF_SECONDS}
+
+
+def with_attempt(format: str, **attempt: Any) -> wire.PlanRequest:
+    document = body() | {"format": format}
+    return wire.PlanRequest.model_validate(document | ({"attempt": attempt} if attempt else {}))
+
+
+def test_an_attempt_reaches_a_format_that_refines_it() -> None:
+    asked = with_attempt("elf_vla_refine", **DRAFT, feedback="Wait.")
+    attempt = engine_request(asked, REFINING, "id").attempt
+    assert attempt is not None
+    assert (attempt.trajectory.tolist(), attempt.feedback) == (DRAFT["trajectory"], "Wait.")
+
+
+@pytest.mark.parametrize(
+    ("format", "attempt", "pointer", "message"),
+    [
+        ("elf_vla", DRAFT | {"feedback": "Wait."}, "/attempt", "elf_vla refines none"),
+        ("elf_vla_refine", {}, "/attempt", "elf_vla_refine refines an attempt, and there is none"),
+        (
+            "elf_vla_refine",
+            {"trajectory": [[0.0] * 4] * 64, "feedback": "Wait."},
+            "/attempt/times_s",
+            "poses at 0.5, 1, 1.5, 2, 2.5, 3, 3.5, 4 s",
+        ),
+        (
+            "elf_vla_refine",
+            DRAFT | {"trajectory": [[1001.0, 0.0, 0.0, 0.0]] * 8, "feedback": "Wait."},
+            "/attempt/trajectory",
+            "beyond ±1000",
+        ),
+    ],
+)
+def test_attempts_are_refused_where_they_do_not_belong(
+    format: str, attempt: dict[str, Any], pointer: str, message: str
+) -> None:
+    with pytest.raises(ProblemError, match=message) as caught:
+        engine_request(with_attempt(format, **attempt), REFINING, "id")
+    assert caught.value.kind is INVALID_ATTEMPT
+    assert caught.value.errors[0].pointer == pointer
 
 
 CAR = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final, Literal, get_args
 
+from model.driving.pdm.feedback import BEGIN, END
 from model.driving.short_term import mission_goal
 from model.driving.trajectory import FloatArray, present_acceleration, present_speed
 from model.families.elf_vla.format import TIMES_S, poses, told_poses
@@ -14,11 +15,13 @@ from model.formats.pieces import Choice, Format, FreeText, Option, Section, Sequ
 
 Command = Literal["left", "straight", "right", "unknown"]
 
-MAX_FEEDBACK_TOKENS: Final = 512
-"""Room for the five sections of figure 8b."""
+MAX_FEEDBACK_TOKENS: Final = 1024
+"""Room for the five sections of figure 8b, in the vocabularies of small checkpoints as well."""
 
 _SPEED_MS: Final = Number(-20.0, 60.0, 0.1)
 _ACCELERATION_MS2: Final = Number(-15.0, 15.0, 0.1)
+_PLAIN: Final = str.maketrans("\u00b2\u00b3", "23")
+"""Squares and cubes of units, which small vocabularies do not have."""
 _PAST_STEPS: Final = (0, 5, 10)
 """Rows of a history 1.5 s, 1 s and 0.5 s ago. The last row, now, is where the ego frame begins."""
 
@@ -51,9 +54,16 @@ def describe_attempt(situation: Situation) -> Values:
     attempt = situation.attempt
     if attempt is None:
         raise FamilyError("there is no attempt to be refined: give a draft and feedback on it")
-    return Values.of(
-        _base(situation) | {"draft": told_poses(attempt.trajectory), "feedback": attempt.feedback}
-    )
+    draft, feedback = told_poses(attempt.trajectory), _told(attempt.feedback)
+    return Values.of(_base(situation) | {"draft": draft, "feedback": feedback})
+
+
+def _told(feedback: str) -> str:
+    """Feedback without the tags that sections bring and the prompt sets, and units in plain letters."""
+    text = feedback.strip()
+    if text.startswith(BEGIN) and text.endswith(END):
+        text = text[len(BEGIN) : -len(END)].strip()
+    return text.translate(_PLAIN)
 
 
 def _line(name: str, start: str, piece: pieces.Piece, end: str = "\n") -> Section:
@@ -68,7 +78,7 @@ _BASE: Final = (
 )
 _ATTEMPT: Final = (
     _line("draft", "Draft: ", poses(len(TIMES_S))),
-    _line("feedback", "<feedback>", FreeText("</feedback>", MAX_FEEDBACK_TOKENS, multiline=True)),
+    _line("feedback", BEGIN, FreeText(END, MAX_FEEDBACK_TOKENS, multiline=True)),
 )
 
 BASE: Final = TextInputs(Format("elf_vla inputs", Sequence(_BASE)), describe)
