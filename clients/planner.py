@@ -24,7 +24,7 @@ import msgpack
 from httpx_sse import EventSource
 from pydantic import BaseModel
 
-from clients import wire, wire_feedback, wire_scores
+from clients import wire, wire_feedback, wire_refine, wire_scores
 from clients.answers import (
     BUSY_STATUSES,
     BadAnswer,
@@ -48,7 +48,7 @@ from clients.answers import (
     told,
     unreachable,
 )
-from clients.requests import attempt_at, label_request, plan_request, reflect_request
+from clients.requests import attempt_at, label_request, plan_request, refine_request, reflect_request
 from clients.wire_values import with_pictures
 from model.driving.outcome import Outcome
 from model.driving.plan import Plan
@@ -76,6 +76,7 @@ __all__ = [
     "attempt_at",
     "label_request",
     "plan_request",
+    "refine_request",
     "reflect_request",
 ]
 
@@ -240,6 +241,11 @@ class PlannerClient:
         """Have trajectories judged, and be told why they fail; raises `PlannerError`."""
         return read(self._ask("/v1/feedback", request), wire_feedback.FeedbackResponse)
 
+    def refine(self, request: wire_refine.RefineRequest) -> wire_refine.RefineResponse:
+        """Have a draft refined by feedback on it (`refine_request` makes the body); raises `PlannerError`."""
+        answer = self._ask("/v1/refine", request, deadline_ms=request.controls.deadline_ms)
+        return read(answer, wire_refine.RefineResponse)
+
     def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""
         return self._model_list().models
@@ -365,6 +371,11 @@ class AsyncPlannerClient:
     async def feedback(self, request: wire_feedback.FeedbackRequest) -> wire_feedback.FeedbackResponse:
         """Have trajectories judged, and be told why they fail; raises `PlannerError`."""
         return read(await self._ask("/v1/feedback", request), wire_feedback.FeedbackResponse)
+
+    async def refine(self, request: wire_refine.RefineRequest) -> wire_refine.RefineResponse:
+        """Have a draft refined by feedback on it; see `PlannerClient.refine`."""
+        answer = await self._ask("/v1/refine", request, deadline_ms=request.controls.deadline_ms)
+        return read(answer, wire_refine.RefineResponse)
 
     async def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from clients import wire
+from clients import wire, wire_refine
 from clients.wire_values import rows, wire_agents, wire_scene
 from model.driving.outcome import Outcome
 from model.driving.plan import Plan
@@ -42,6 +42,24 @@ def reflect_request(
 ) -> wire.ReflectRequest:
     """The body of POST /v1/reflect for ``plan`` in ``scene``."""
     return wire.ReflectRequest(scene=wire_scene(scene), plan=str(plan), controls=controls, format=format)
+
+
+def refine_request(
+    scene: Scene,
+    draft: FloatArray,
+    feedback: str | wire_refine.SectionsGiven = wire_refine.AUTO,
+    controls: wire.ReflectControls = wire.ReflectControls(),
+    *,
+    threshold: float = 0.8,
+) -> wire_refine.RefineRequest:
+    """The body of POST /v1/refine for a ``draft`` [8, 4] at 0.5 s or [64, 4] at 0.1 s in ``scene``."""
+    return wire_refine.RefineRequest(
+        scene=wire_scene(scene),
+        draft=rows(draft),
+        feedback=feedback,
+        threshold=threshold,
+        controls=controls,
+    )
 
 
 def label_request(

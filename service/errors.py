@@ -63,9 +63,10 @@ _KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], Kind]]] = (
     (("labels",), INVALID_LABELS),
     *(
         ((field,), INVALID_TRAJECTORY)
-        for field in ("trajectories", "reference", "previous", "human", "ground_truth")
+        for field in ("trajectories", "reference", "previous", "human", "ground_truth", "draft")
     ),
     (("said", "written"), INVALID_FEEDBACK),
+    (("feedback",), INVALID_FEEDBACK),
 )
 _KIND_BY_STATUS: Final = {
     kind.status: kind

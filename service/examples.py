@@ -33,6 +33,18 @@ def example_reflection(cameras: tuple[str, ...]) -> dict[str, Any]:
     return {"scene": asked["scene"], "plan": plan, "controls": asked["controls"]}
 
 
+def example_refinement(cameras: tuple[str, ...]) -> dict[str, Any]:
+    """The same scene behind a slower car, with a draft that keeps its speed."""
+    leader = {"x_m": 25.0, "y_m": 0.0, "heading_rad": 0.0, "speed_ms": 3.0, "kind": "vehicle"}
+    asked = example_request(cameras)
+    return {
+        "scene": asked["scene"] | {"tracks": [leader | {"length_m": 4.5, "width_m": 1.9}]},
+        "draft": [[5.0 * step, 0.0, 0.0, 0.0] for step in range(1, 9)],
+        "feedback": "auto",
+        "controls": {"n": 2, "seed": 7},
+    }
+
+
 def example_score() -> dict[str, Any]:
     """Two trajectories behind a slower car: one brakes, one does not."""
 

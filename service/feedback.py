@@ -120,7 +120,7 @@ def feedback_given(asked: wire_feedback.FeedbackRequest, bundled: BundledScenes,
     for row, plan in enumerate(judged):
         plan_id = plan_id_of(asked.trajectories[row])
         written = said[row].written
-        feedback, writer = _by_rule(plan, asked.mode), NAME
+        feedback, writer = by_rule(plan, asked.mode), NAME
         if written is not None:
             feedback, writer = _checked(written, plan, plan_id, f"/said/{row}/written"), CALLER
         told.append(
@@ -222,7 +222,7 @@ async def _asked(
     return written.feedback, written.attempts
 
 
-def _by_rule(plan: JudgedPlan, mode: wire_feedback.FeedbackMode) -> Feedback | RuleFeedback:
+def by_rule(plan: JudgedPlan, mode: wire_feedback.FeedbackMode) -> Feedback | RuleFeedback:
     """ELF-VLA section 7.2: sections of what is wrong, the verdict of what is correct."""
     if plan.correct or mode == "rule":
         return RuleFeedback(plan.score, plan.correct)

@@ -65,6 +65,7 @@ QUEUE_FULL: Final = Kind("queue-full", 429, "The service has as much to do as it
 RATE_LIMITED: Final = Kind("rate-limited", 429, "The caller has asked for as much as is allowed")
 INTERNAL: Final = Kind("internal", 500, "The service failed")
 NEEDS_ANNOTATIONS: Final = Kind("needs-annotations", 422, "The teacher needs what the request lacks")
+NEEDS_TRACKS: Final = Kind("needs-tracks", 422, "Feedback is made of tracked objects, and none are sent")
 NOTHING_IN_VIEW: Final = Kind(
     "nothing-in-view", 422, "The teacher sees nothing that asks for the better plan"
 )

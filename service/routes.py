@@ -57,6 +57,7 @@ from service.problems import (
     UNSUPPORTED_MEDIA_TYPE,
     ProblemError,
 )
+from service.refine_routes import refine_router
 from service.scene_files import read_scene_file
 from service.scoring_routes import scoring_router
 from service.views import BundledScenes, view
@@ -76,6 +77,7 @@ def make_router(parts: Parts) -> APIRouter:
     """All endpoints but the inspector page."""
     router = APIRouter()
     router.include_router(planning_router(parts))
+    router.include_router(refine_router(parts))
     router.include_router(openai_router(parts))
     _add_labelling(router, parts)
     bundled = BundledScenes(parts.settings.bundled_scenes)

@@ -327,6 +327,7 @@ def test_types_are_stable() -> None:
         "feedback-refused": 502,
         "internal": 500,
         "needs-annotations": 422,
+        "needs-tracks": 422,
         "nothing-in-view": 422,
         "label-refused": 502,
         "teacher-away": 503,

@@ -48,7 +48,7 @@ def world_of(labelled: LabelledScene) -> World:
     A scene without a lane map knows no lanes as areas, no intersections and no lights: those layers are None,
     and the centre line is the route, where there is one.
     """
-    past = _states(labelled.scene.history)
+    past = past_states(labelled.scene.history)
     known = labelled.lane_map
     return World(
         ego=past[-1],
@@ -59,7 +59,7 @@ def world_of(labelled: LabelledScene) -> World:
         drivable=_areas(labelled.drivable) or None,
         # A world without lights has none that is red, and that is known. Of a world with lights it is not.
         lights=None if known is None or known.has_lights else (),
-        centreline=_route_line(labelled) if known is None else known.centreline.astype(np.float64),
+        centreline=route_line(labelled.scene.route) if known is None else known.centreline.astype(np.float64),
         past=past[:-1],
     )
 
@@ -73,14 +73,14 @@ def _areas(rings: tuple[FloatArray, ...]) -> tuple[Area, ...]:
     return (Area(tuple(ring.astype(np.float64) for ring in rings)),) if rings else ()
 
 
-def _route_line(labelled: LabelledScene) -> Array | None:
-    route = labelled.scene.route
+def route_line(route: FloatArray | None) -> Array | None:
+    """A route [20, 2] as a centre line [21, 2] from the ego on; None without one."""
     return None if route is None else np.concatenate([np.zeros((1, 2)), route.astype(np.float64)])
 
 
 def states_of(history: FloatArray, plan: Array) -> Array:
     """Simulated states [41, 11] of a plan [64, 3] of the centre that begins where a history [h, 4] ends."""
-    state = _states(history)[-1]
+    state = past_states(history)[-1]
     states: Array = simulate(reference_poses(plan[None], EGO, state, centre=True), EGO, state)[0]
     return states
 
@@ -102,7 +102,7 @@ def plans_of(trajectories: FloatArray) -> Array:
     return trajectories[..., [0, 1, 3]].astype(np.float64)
 
 
-def _states(history: FloatArray) -> Array:
+def past_states(history: FloatArray) -> Array:
     """States [h, 11] of the rear axle, of poses [h, 4] of the centre at 10 Hz.
 
     At both ends, speeds and turns are those of the parabola through the three nearest poses. A plain

@@ -26,7 +26,8 @@ class Areas:
     """Where plans are, bool [n, 41] each; None where the layer is not known.
 
     Attributes:
-        several_lanes: no lane holds all corners, and more than one holds some.
+        several_lanes: no lane holds all corners, and more than one holds some; of careful worlds without
+            lanes it is taken for granted.
         off_road: a corner lies nowhere where a car may be.
         off_route: the centre lies in no lane of the route.
         crossing: the centre lies in an intersection.
@@ -74,6 +75,8 @@ def areas_of(ego: Boxes, axles: Array, world: World) -> Areas:
         several_lanes = ((held > 0).sum(axis=0) > 1) & ~_any(held == 4)
         on_route = [lane.on_route for lane in world.lanes]
         off_route = ~_any(lanes[on_route, ..., _CENTRE])
+    elif world.careful:
+        several_lanes = np.ones(ego.x.shape, dtype=np.bool_)
     if world.drivable is not None:
         off_road = _any(np.moveaxis(~(_any(drivable) | _any(crossings))[..., :_CENTRE], -1, 0))
     if world.intersections is not None:
