@@ -13,8 +13,9 @@ from pydantic import ValidationError
 
 import clients.wire as wire
 from clients.wire_feedback import FeedbackRequest
+from clients.wire_refine import RefineRequest
 from clients.wire_scores import ScoreRequest
-from service.examples import example_feedback, example_score
+from service.examples import example_feedback, example_refinement, example_score
 from service.openai_chat import ChatRequest
 from tests.service.serving import body
 
@@ -22,6 +23,10 @@ REAL = body()["scene"]
 SCORED = {"scene_id": None, **example_score()}
 JUDGED = {"scene_id": None, **example_feedback()}
 _JUDGED_ONLY = {"said", "threshold", "mode", "command", "ground_truth"}
+DRAFT = example_refinement(("front_wide_120",))["draft"]
+REFINES = "elf_vla_refine"
+ATTEMPT = {"trajectory": DRAFT, "times_s": [0.5 * step for step in range(1, 9)], "feedback": "Brake."}
+ATTEMPTED = {"format": REFINES, "attempt": ATTEMPT}
 PICTURES = [
     {"type": "image_url", "image_url": {"url": f"data:image/jpeg;base64,{image}"}}
     for clip in REAL["clips"]
@@ -43,6 +48,10 @@ def map_body(context: Any, body: Any) -> Any:
     for request in requests:
         if isinstance(request, dict) and len(str(request)) % 2 and _is_of_the_schema(ScoreRequest, request):
             request.update(SCORED)
+        if isinstance(request, dict) and "attempt" in request and len(str(request)) % 2:
+            request.update(ATTEMPTED if _is_of_the_schema(wire.PlanRequest, request) else {})
+        if isinstance(request, dict) and "draft" in request and len(str(request)) % 2:
+            request.update({"draft": DRAFT} if _is_of_the_schema(RefineRequest, request) else {})
         if isinstance(request, dict) and _JUDGED_ONLY & request.keys() and len(str(request)) % 2:
             request.update(JUDGED if _is_of_the_schema(FeedbackRequest, request) else {})
         scene = request.get("scene") if isinstance(request, dict) else None

@@ -15,7 +15,7 @@ import schemathesis
 from model.driving.scene import FRONT_WIDE
 from service.examples import example_score
 from tests.service import fuzz_hooks
-from tests.service.fuzz_hooks import PICTURES, REAL
+from tests.service.fuzz_hooks import ATTEMPT, DRAFT, PICTURES, REAL
 from tests.service.scripted_engine import KEEP_ON
 
 _SCORE = example_score()
@@ -51,6 +51,9 @@ WHOLE: dict[tuple[str, str], dict[str, Any]] = {
     ("Tracks", "lateral"): _track("Straight"),
     ("Tracks", "lane"): _track("Keep Lane"),
     ("PlanRequest", "format"): _one("cf_vla"),
+    ("Attempt", "trajectory"): _one(ATTEMPT["trajectory"]),
+    ("Attempt", "times_s"): _one(ATTEMPT["times_s"], None),
+    ("RefineRequest", "draft"): _one(DRAFT),
     ("ReflectRequest", "format"): _one("cf_vla"),
     ("Extras", "format"): _one("cf_vla"),
     ("ChatRequest", "model"): _one(""),
