@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from transformers import AutoTokenizer
 
+from clients.wire import MAX_FEEDBACK_CHARACTERS
 from model.bundled import CHECKPOINT
 from model.driving.agents import AGENT_KINDS
 from model.driving.pdm.foresight import world_ahead
@@ -122,6 +123,7 @@ def test_every_plan_can_be_judged_and_what_is_said_of_it_fits_the_prompt(
     found = judged(world_ahead(history(speed_ms), None, tracks), steps)
     assert 0.0 <= found.score <= 1.0
     feedback = str(critique(found))
+    assert len(feedback) <= MAX_FEEDBACK_CHARACTERS
     attempt = Attempt(np.zeros((8, 4), np.float32), feedback)
     tokens = prompt.render(WITH_ATTEMPT.values(Situation(history(speed_ms), None, attempt)))
     told = vocabulary.decode([token.id for token in tokens if token.section == "feedback"])
