@@ -110,12 +110,25 @@ def edges_of(drivable: Iterable[FloatArray]) -> Edges:
     Args:
         drivable: rings as of a `LabelledScene`; both distances are 0 where they do not contain the ego.
     """
+    return Edges(*map(_told_edge, edge_distances(drivable)))
+
+
+def edge_distances(drivable: Iterable[FloatArray]) -> tuple[float, float]:
+    """Metres from the ego's left and right side to the edge of the road now; infinite where there is none.
+
+    Args:
+        drivable: rings as of a `LabelledScene`; both distances are 0 where they do not contain the ego.
+    """
     rings = [ring.astype(np.float64) for ring in drivable]
     middle, front, rear = (_crossings(rings, x) for x in (0.0, EGO_LENGTH_M / 2, -EGO_LENGTH_M / 2))
     if np.count_nonzero(middle > 0) % 2 == 0:
-        return Edges(0.0, 0.0)
+        return 0.0, 0.0
     beside = np.concatenate([middle, front, rear])
-    return Edges(_told_edge(beside[beside > 0]), _told_edge(-beside[beside <= 0]))
+    left, right = (
+        max(0.0, float(side.min(initial=math.inf)) - EGO_WIDTH_M / 2)
+        for side in (beside[beside > 0], -beside[beside <= 0])
+    )
+    return left, right
 
 
 def _crossings(rings: Iterable[Array], x: float) -> Array:
@@ -129,9 +142,8 @@ def _crossings(rings: Iterable[Array], x: float) -> Array:
     return np.concatenate(found)
 
 
-def _told_edge(distances: Array) -> float | None:
-    nearest = float(distances.min(initial=math.inf)) - EGO_WIDTH_M / 2
-    steps = round(max(0.0, nearest) / EDGE_STEP_M) if math.isfinite(nearest) else math.inf
+def _told_edge(nearest_m: float) -> float | None:
+    steps = round(nearest_m / EDGE_STEP_M) if math.isfinite(nearest_m) else math.inf
     return None if steps * EDGE_STEP_M > EDGE_FARTHEST_M else steps * EDGE_STEP_M
 
 
