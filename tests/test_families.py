@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 from model.families.cf_vla import CF_VLA
 from model.families.elf_vla import ELF_VLA
+from model.families.vla_world import VLA_WORLD
 from tests.test_architecture import ROOT, modules
 
 assert CF_VLA.branch is not None
@@ -83,6 +84,20 @@ def test_nobody_else_names_sections_and_words_of_elf_vla() -> None:
     }
     # What a branch of CF-VLA's is counted as; a field of the HTTP contract of feedback.
     assert found == {"service/metrics.py": "think", "service/examples.py": "think"}
+
+
+def test_nobody_else_writes_the_tags_of_vla_world() -> None:
+    tags = tuple(f"{start}{section}>" for section in VLA_WORLD.format.sections() for start in ("<", "</"))
+    found = {
+        str(path.relative_to(ROOT))
+        for _, path in modules()
+        if not str(path.relative_to(ROOT)).startswith(
+            ("model/families/elf_vla/", "model/families/vla_world/")
+        )
+        for text in literals(path.read_text())
+        if any(tag in text for tag in tags)
+    }
+    assert found == set()
 
 
 def test_literals_are_counted_and_docstrings_are_not() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+from model.driving.perceived import Perceived
 from model.driving.phrases import ReflectionLanguage
 from model.driving.plan import Plan
 from model.driving.thoughts import Thoughts
@@ -114,6 +115,19 @@ class Reflection:
     judged: bool = True
 
 
+@dataclass(frozen=True)
+class NextPicture:
+    """What a camera saw half a second later.
+
+    Attributes:
+        camera: one of `CAMERAS`.
+        codes: 98 codes of its picture, see `model.network.visual_codes`.
+    """
+
+    camera: str
+    codes: tuple[int, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Lesson:
     """What a labelled scene has to teach.
@@ -124,6 +138,8 @@ class Lesson:
         future: float32 [64, 4], the expert's trajectory at 10 Hz.
         reflection: on a plan of the model's own, if any.
         thoughts: that lead to what the expert does; None where the scene's annotations do not tell.
+        perceived: what there is to perceive; None where they do not tell.
+        next_picture: None where there is none.
     """
 
     plan: Plan
@@ -131,6 +147,8 @@ class Lesson:
     future: FloatArray
     reflection: Reflection | None = None
     thoughts: Thoughts | None = None
+    perceived: Perceived | None = None
+    next_picture: NextPicture | None = None
 
 
 @dataclass(frozen=True, eq=False)

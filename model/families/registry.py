@@ -18,11 +18,12 @@ from model.families.cf_vla import CF_VLA
 from model.families.elf_vla import ELF_VLA, ELF_VLA_REFINE
 from model.families.family import Family, FamilyError
 from model.families.traj_only import TRAJ_ONLY
+from model.families.vla_world import VLA_WORLD
 
 GROUP: Final = "looktwice.families"
 """The entry points that declare families."""
 
-_OURS: Final = {family.name: family for family in (CF_VLA, TRAJ_ONLY, ELF_VLA, ELF_VLA_REFINE)}
+_OURS: Final = {family.name: family for family in (CF_VLA, TRAJ_ONLY, ELF_VLA, ELF_VLA_REFINE, VLA_WORLD)}
 
 
 @cache

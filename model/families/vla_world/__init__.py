@@ -1,1 +1,30 @@
 """VLA-World: it says what is there, predicts half a second, imagines a picture of it, thinks, and acts."""
+
+from typing import Final
+
+from model.families.family import Family
+from model.families.vla_world import format as its
+from model.families.vla_world.inputs import INPUTS
+from model.families.vla_world.read import read
+from model.families.vla_world.targets import teach
+
+_TASK: Final = (
+    "Coordinates: X-axis is perpendicular, and Y-axis is parallel to the direction you're facing. You're at "
+    "point (0,0). Units: meters. Traffic Rules: Avoid collision with other objects. Please perceive, predict "
+    "0.5 second, think about it, and plan waypoints (0.5s intervals) for the next 3 seconds."
+)
+"""Figure 5, shortened."""
+
+VLA_WORLD: Final = Family(
+    format=its.VLA_WORLD_FORMAT,
+    dialects={"phrases": its.VLA_WORLD_TOKENS},
+    task=_TASK,
+    inputs=INPUTS,
+    trajectory=its.ANSWER,
+    reflection=its.THINK,
+    read=read,
+    times_s=its.TIMES_S,
+    teach=teach,
+    title="perceive-think-answer",
+)
+"""perception, prediction, a picture or none, think, action, answer"""

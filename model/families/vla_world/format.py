@@ -7,7 +7,9 @@ Its axes are the paper's: (lateral, forward) in metres, what lies to the left is
 from __future__ import annotations
 
 from collections.abc import Sequence as Several
-from typing import Final, cast
+from dataclasses import replace
+from typing import Final, cast, get_args
+from typing import Literal as OneOf
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +35,8 @@ from model.formats.pieces import (
 
 PERCEPTION: Final = "perception"
 PREDICTION: Final = "prediction"
+IMAGINE: Final = "imagine"
+"""The section, and the choice in it, where a response imagines a picture or does not."""
 VISUAL: Final = "visual"
 THINK: Final = "think"
 ACTION: Final = "action"
@@ -48,25 +52,38 @@ VISUAL_SIZE: Final = 1000
 """How many different codes there are."""
 CAMERA_OPTIONS: Final = {camera: f"CAM_{camera.upper()}" for camera in CAMERAS}
 """How each of our cameras is written."""
-DIRECTIONS: Final = ("Left", "Forward", "Right")
-LATERAL: Final = ("MOVE FORWARD", "TURN LEFT", "TURN RIGHT")
-SPEED: Final = (
+IMAGINED: Final = f"<{VISUAL}>"
+UNSEEN: Final = "\n"
+"""The options of that choice; they begin with different tokens, so that one token decides it."""
+Direction = OneOf["Left", "Forward", "Right"]
+DIRECTIONS: Final[tuple[Direction, ...]] = get_args(Direction)
+Lateral = OneOf["MOVE FORWARD", "TURN LEFT", "TURN RIGHT"]
+LATERAL: Final[tuple[Lateral, ...]] = get_args(Lateral)
+Speed = OneOf[
     "A CONSTANT SPEED",
     "AN ACCELERATION",
     "A QUICK ACCELERATION",
     "A DECELERATION",
     "A QUICK DECELERATION",
     "A DECELERATION TO ZERO",
-)
+]
+SPEED: Final[tuple[Speed, ...]] = get_args(Speed)
 """What table 3 counts as keep, accelerate (two), decelerate (two) and stop."""
 
 _MOVING_M: Final = 0.2
 """Between waypoints: less says nothing of a heading, as waypoints are rounded to 0.1 m."""
-_LATERAL_M: Final = Number(-50.0, 50.0, 0.1, name="lateral_m")
-_FORWARD_M: Final = Number(-50.0, 120.0, 0.1, name="forward_m")
+LATERAL_M: Final = Number(-50.0, 50.0, 0.1, name="lateral_m")
+FORWARD_M: Final = Number(-50.0, 120.0, 0.1, name="forward_m")
 """120 m in 3 s are 144 km/h."""
-_SIZE_M: Final = (Number(0.1, 20.0, 0.1, name="width_m"), Number(0.1, 20.0, 0.1, name="length_m"))
-_SHOULDER_M: Final = Number(0.0, 50.0, 0.1)
+SIZE_M: Final = Number(0.1, 20.0, 0.1, name="size_m")
+SHOULDER_M: Final = Number(0.0, 50.0, 0.1, name="shoulder_m")
+"""Where numbers are tokens, these names are those of their alphabets."""
+NEAR_S: Final = Number(TIMES_S[0], TIMES_S[-1], 0.5, name="time_s")
+_THOUGHT: Final = (
+    *("Notable Objects: ", " at "),
+    *(". Potential Effects: within the safe zone of the ego-vehicle at ", " second."),
+)
+"""The words around kind, position and time of one thought."""
 _ID: Final = Number(1, 99, 1, name="object_id")
 
 
@@ -83,91 +100,119 @@ def _tagged(section: str, *parts: Piece) -> Section:
     return Section(section, Sequence((Literal(f"<{section}>"), *parts, Literal(f"</{section}>"))))
 
 
-_OBJECT: Final = Record(
-    Sequence(
-        (
-            Literal("object type: "),
-            _kind(),
-            Literal(", object id: "),
-            _ID,
-            Literal(", position: "),
-            _pair(_LATERAL_M, _FORWARD_M),
-            Literal(", size: "),
-            _pair(*_SIZE_M),
-        )
-    )
-)
-_NOTABLE: Final = Record(
-    Sequence(
-        (
-            Literal("Notable Objects: "),
-            _kind(),
-            Literal(" at "),
-            _pair(_LATERAL_M, _FORWARD_M),
-            Literal(". Potential Effects: within the safe zone of the ego-vehicle at "),
-            Number(TIMES_S[0], TIMES_S[-1], 0.5, name="time_s"),
-            Literal(" second."),
-        )
-    )
-)
-_POINT: Final = Record(_pair(_LATERAL_M, _FORWARD_M, ","), name="point")
+def position(*, tokens: bool = False, between: str = ", ") -> Sequence:
+    """Where something is, such as ``(-4.5, 3.2)``: its numbers in digits or as one token each."""
+    return _pair(_spelt(LATERAL_M, tokens), _spelt(FORWARD_M, tokens), between)
 
-VLA_WORLD_FORMAT: Final = Format(
-    "vla_world",
+
+def points(count: int, *, tokens: bool = False) -> Repeat:
+    """So many points, as `told_points` makes them."""
+    return Repeat(_point(tokens), count, count, between=", ")
+
+
+def _notable(tokens: bool) -> Repeat:
+    """Who comes near, and when: the thoughts."""
+    words = map(Literal, _THOUGHT)
+    told = (next(words), _kind(), next(words), position(tokens=tokens), next(words), NEAR_S, next(words))
+    return Repeat(Record(Sequence(told)), MAX_NOTABLE, between=" ")
+
+
+def told_thoughts(value: Value) -> str:
+    """The text of the thoughts of a value of notable objects."""
+    start, at, effects, end = _THOUGHT
+    return " ".join(
+        f"{start}{each['kind']}{at}({each['lateral_m']:.1f}, {each['forward_m']:.1f})"
+        f"{effects}{each['time_s']:.1f}{end}"
+        for each in cast("Several[dict[str, float]]", value)
+    )
+
+
+def _spelt(number: Number, tokens: bool) -> Number:
+    return replace(number, spelling=str(number.name)) if tokens else number
+
+
+def _point(tokens: bool) -> Record:
+    return Record(position(tokens=tokens, between=","), name="point")
+
+
+def _objects(tokens: bool) -> Repeat:
+    width, length = (replace(_spelt(SIZE_M, tokens), name=name) for name in ("width_m", "length_m"))
+    told = (
+        Literal("object type: "),
+        _kind(),
+        Literal(", object id: "),
+        _ID,
+        Literal(", position: "),
+        position(tokens=tokens),
+        Literal(", size: "),
+        _pair(width, length),
+    )
+    return Repeat(Record(Sequence(told)), MAX_OBJECTS, between="; ")
+
+
+_PICTURE: Final = Section(
+    VISUAL,
     Sequence(
         (
-            _tagged(
-                PERCEPTION,
-                Literal("Object detections: "),
-                Repeat(_OBJECT, MAX_OBJECTS, between="; "),
-                Literal(". Distance to the left shoulder is "),
-                _SHOULDER_M,
-                Literal("m and to the right shoulder is "),
-                _SHOULDER_M,
-                Literal("m."),
-            ),
-            _tagged(
-                PREDICTION,
-                Literal("Based on the past trajectory, the predicted trajectory 0.5s later is "),
-                _POINT,
-                Literal(", and the direction is "),
-                Choice(tuple(map(Option, DIRECTIONS))),
-                Literal("."),
-            ),
-            _tagged(
-                VISUAL,
-                Codes(VISUAL_ALPHABET, VISUAL_CODES, VISUAL_SIZE),
-                Literal(" These are the visual tokens of "),
-                Choice(tuple(map(Option, CAMERA_OPTIONS.values())), name="camera"),
-                Literal(" image at the 0.5 second in the future."),
-            ),
-            _tagged(THINK, Repeat(_NOTABLE, MAX_NOTABLE, between=" ")),
-            _tagged(
-                ACTION,
-                Record(
-                    Sequence(
-                        (
-                            Choice(tuple(map(Option, LATERAL)), name="lateral"),
-                            Literal(" WITH "),
-                            Choice(tuple(map(Option, SPEED)), name="speed"),
-                        )
-                    )
-                ),
-            ),
-            Section(
-                ANSWER,
-                Sequence(
-                    (
-                        Literal(f"<{ANSWER}>["),
-                        Repeat(_POINT, len(TIMES_S), len(TIMES_S), between=", "),
-                        Literal(f"]</{ANSWER}><|im_end|>"),
-                    )
-                ),
-            ),
+            Codes(VISUAL_ALPHABET, VISUAL_CODES, VISUAL_SIZE),
+            Literal(" These are the visual tokens of "),
+            Choice(tuple(map(Option, CAMERA_OPTIONS.values())), name="camera"),
+            Literal(f" image at the 0.5 second in the future.</{VISUAL}>"),
         )
     ),
 )
-"""perception, prediction, visual, think, action, answer"""
+_ACTION: Final = Record(
+    Sequence(
+        (
+            Choice(tuple(map(Option, LATERAL)), name="lateral"),
+            Literal(" WITH "),
+            Choice(tuple(map(Option, SPEED)), name="speed"),
+        )
+    )
+)
+
+
+def _vla_world(*, tokens: bool) -> Format:
+    perception = _tagged(
+        PERCEPTION,
+        Literal("Object detections: "),
+        _objects(tokens),
+        Literal(". Distance to the left shoulder is "),
+        _spelt(SHOULDER_M, tokens),
+        Literal("m and to the right shoulder is "),
+        _spelt(SHOULDER_M, tokens),
+        Literal("m."),
+    )
+    prediction = _tagged(
+        PREDICTION,
+        Literal("Based on the past trajectory, the predicted trajectory 0.5s later is "),
+        _point(tokens),
+        Literal(", and the direction is "),
+        Choice(tuple(map(Option, DIRECTIONS))),
+        Literal("."),
+    )
+    imagine = Section(IMAGINE, Choice((Option(IMAGINED, _PICTURE), Option(UNSEEN)), name=IMAGINE))
+    answer = Section(
+        ANSWER,
+        Sequence(
+            (
+                Literal(f"<{ANSWER}>["),
+                points(len(TIMES_S), tokens=tokens),
+                Literal(f"]</{ANSWER}><|im_end|>"),
+            )
+        ),
+    )
+    think = _tagged(THINK, _notable(tokens))
+    return Format(
+        "vla_world", Sequence((perception, prediction, imagine, think, _tagged(ACTION, _ACTION), answer))
+    )
+
+
+VLA_WORLD_FORMAT: Final = _vla_world(tokens=False)
+"""perception, prediction, imagine { visual or none }, think, action, answer; for public checkpoints: numbers
+in digits"""
+VLA_WORLD_TOKENS: Final = _vla_world(tokens=True)
+"""For small checkpoints: metres as one token each."""
 
 
 def told_points(xy_m: npt.ArrayLike) -> tuple[dict[str, float], ...]:
@@ -175,19 +220,19 @@ def told_points(xy_m: npt.ArrayLike) -> tuple[dict[str, float], ...]:
 
     What lies beyond what can be written is moved to its border. Raises `FormatError` for what is not finite.
     """
-    points = to_paper_axes(xy_m)
-    if not np.isfinite(points).all():
+    told = to_paper_axes(xy_m)
+    if not np.isfinite(told).all():
         raise FormatError("points that are not finite cannot be written")
     return tuple(
-        {"lateral_m": _nearest(_LATERAL_M, lateral), "forward_m": _nearest(_FORWARD_M, forward)}
-        for lateral, forward in points
+        {"lateral_m": LATERAL_M.nearest(lateral), "forward_m": FORWARD_M.nearest(forward)}
+        for lateral, forward in told.tolist()
     )
 
 
 def read_points(value: Value) -> npt.NDArray[np.float64]:
     """Points [n, 2] in the ego frame (ahead, left) of a value of points: `told_points` undone."""
-    points = cast("Several[dict[str, float]]", value)
-    return from_paper_axes([[each["lateral_m"], each["forward_m"]] for each in points])
+    told = cast("Several[dict[str, float]]", value)
+    return from_paper_axes([[each["lateral_m"], each["forward_m"]] for each in told])
 
 
 def read_trajectory(value: Value) -> FloatArray:
@@ -203,8 +248,3 @@ def read_trajectory(value: Value) -> FloatArray:
             before = pose[:2].astype(np.float64)
         pose[3] = heading
     return trajectory
-
-
-def _nearest(number: Number, value: float) -> float:
-    step = round((float(np.clip(value, number.low, number.high)) - number.low) / number.step)
-    return float(number.texts[step])

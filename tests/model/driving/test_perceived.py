@@ -51,7 +51,8 @@ def seen(*agents: Agent, speed: float = 10.0) -> Perceived:
 @given(PERCEIVED)
 def test_a_row_tells_all(perceived: Perceived) -> None:
     row = perceived.row()
-    assert (row.shape, row.dtype) == ((ROW_SIZE,), np.float32)
+    assert row.shape == (ROW_SIZE,)
+    assert row.dtype == np.float32
     assert perceived_of_row(row) == perceived
     assert perceived.mirrored().mirrored() == perceived
     assert perceived_of_row(np.full(ROW_SIZE, np.nan, np.float32)) is None

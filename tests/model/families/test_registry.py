@@ -63,7 +63,7 @@ def test_an_installed_package_declares_its_own(install: Callable[[str], None]) -
         (
             "poem = verses:POEM",
             "novel",
-            "no model family 'novel'; known are cf_vla, elf_vla, elf_vla_refine, poem, traj_only",
+            "no model family 'novel'; known are cf_vla, elf_vla, elf_vla_refine, poem, traj_only, vla_world",
         ),
         ("cf_vla = verses:POEM", "cf_vla", "'cf_vla' is declared more than once: .*verses:POEM"),
         ("ode = verses:POEM", "ode", "no family of that name"),

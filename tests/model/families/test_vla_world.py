@@ -1,57 +1,81 @@
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from functools import cache
+from typing import cast
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from model.driving.labeller import expert_plan
+from model.driving.perceived import Perceived, PerceivedAgent
 from model.driving.scene import CAMERAS
 from model.driving.trajectory import constant_turn_rate
+from model.families.family import FamilyError, Lesson, NextPicture, Situation
+from model.families.vla_world import VLA_WORLD
+from model.families.vla_world.actions import action_of
 from model.families.vla_world.format import (
     CAMERA_OPTIONS,
+    FORWARD_M,
+    IMAGINED,
+    LATERAL_M,
+    SHOULDER_M,
+    SIZE_M,
     TIMES_S,
+    UNSEEN,
     VISUAL_ALPHABET,
     VISUAL_CODES,
     VISUAL_SIZE,
     VLA_WORLD_FORMAT,
+    VLA_WORLD_TOKENS,
     read_points,
     read_trajectory,
     told_points,
+    told_thoughts,
 )
+from model.families.vla_world.inputs import describe
+from model.families.vla_world.read import read
 from model.formats.cursor import CompiledFormat
 from model.formats.pieces import FormatError, Values
 from model.formats.text import parse
 from model.network.visual_codes import CODEBOOK_SIZE, CODES
-from tests.model.driving.drives import drive
+from tests.model.driving.drives import MIDDLES_S, drive, labelled_scene
+from tests.model.driving.test_perceived import PERCEIVED
 from tests.model.formats.strategies import values_of
 from tests.model.formats.vocabulary import ByteVocabulary
 
+NUMBERS = {str(number.name): len(number.texts) for number in (LATERAL_M, FORWARD_M, SIZE_M, SHOULDER_M)}
+CODE = re.compile(r"<\|\w+\|>")
+
 
 class ImaginingVocabulary(ByteVocabulary):
-    """With an alphabet of codes of pictures."""
+    """With alphabets of codes of pictures and of metres."""
 
     def __init__(self, size: int = VISUAL_SIZE) -> None:
         super().__init__()
-        first = len(self.texts)
-        self.texts += [f"<|v_{code}|>" for code in range(size)]
-        self.alphabets[VISUAL_ALPHABET] = (range(first, first + size),)
-        self._ids |= {text: first + code for code, text in enumerate(self.texts[first:])}
+        for name, count in {VISUAL_ALPHABET: size, **NUMBERS}.items():
+            first = len(self.texts)
+            self.texts += [f"<|{name}_{code}|>" for code in range(count)]
+            self.alphabets[name] = (range(first, first + count),)
+            self._ids |= {text: first + code for code, text in enumerate(self.texts[first:])}
 
     def encode(self, text: str) -> tuple[int, ...]:
         # Codes are only ever written one by one.
-        return (self._ids[text],) if text.startswith("<|v_") else super().encode(text)
+        return (self._ids[text],) if text in self._ids and CODE.fullmatch(text) else super().encode(text)
 
 
 VOCABULARY = ImaginingVocabulary()
 
 
 @cache
-def compiled() -> CompiledFormat:
-    return CompiledFormat(VLA_WORLD_FORMAT, VOCABULARY)
+def compiled(tokens: bool = False) -> CompiledFormat:
+    return CompiledFormat(VLA_WORLD_TOKENS if tokens else VLA_WORLD_FORMAT, VOCABULARY)
 
 
+END = "]</answer><|im_end|>"
 POINT = {"lateral_m": -0.1, "forward_m": 0.5}
 SAMPLE = Values(
     {
@@ -70,6 +94,7 @@ SAMPLE = Values(
             14.0,
         ),
         "prediction": (POINT, "Left"),
+        "imagine": (IMAGINED,),
         "visual": (tuple(range(VISUAL_CODES)), "CAM_FRONT_LEFT"),
         "think": (({"kind": "pedestrian", "lateral_m": -4.5, "forward_m": 3.2, "time_s": 2.0},),),
         "action": ({"lateral": "TURN LEFT", "speed": "A QUICK ACCELERATION"},),
@@ -78,13 +103,13 @@ SAMPLE = Values(
 )
 
 
-def written(values: Values) -> str:
-    return VOCABULARY.decode([token.id for token in compiled().render(values)])
+def written(values: Values, tokens: bool = False) -> str:
+    return VOCABULARY.decode([token.id for token in compiled(tokens).render(values)])
 
 
 def test_the_papers_sample() -> None:
     """Figure 5b, rounded to 0.1 m."""
-    codes = "".join(f"<|v_{code}|>" for code in range(VISUAL_CODES))
+    codes = "".join(f"<|visual_{code}|>" for code in range(VISUAL_CODES))
     points = ", ".join(["(-0.1,0.5)"] * 6)
     assert written(SAMPLE) == (
         "<perception>Object detections: object type: pedestrian, object id: 1, position: (-4.5, 3.2), "
@@ -99,11 +124,31 @@ def test_the_papers_sample() -> None:
     )
 
 
+def test_metres_may_be_tokens() -> None:
+    text = written(SAMPLE, tokens=True)
+    assert "object id: 1, position: (<|lateral_m_455|>, <|forward_m_532|>), size: (<|size_m_6|>, " in text
+    assert "left shoulder is <|shoulder_m_15|>m" in text
+    assert text.endswith("<answer>[" + ", ".join(["(<|lateral_m_499|>,<|forward_m_505|>)"] * 6) + END)
+    assert len(compiled(tokens=True).render(SAMPLE)) < len(compiled().render(SAMPLE))
+
+
+def test_it_need_not_imagine() -> None:
+    unseen = Values({name: values for name, values in SAMPLE.by_section.items() if name != "visual"})
+    text = written(Values({**unseen.by_section, "imagine": (UNSEEN,)}))
+    assert "direction is Left.</prediction>\n<think>Notable" in text
+    assert "<visual>" not in text
+    # One token decides it, as controls need it.
+    assert IMAGINED[0] != UNSEEN[0]
+    with pytest.raises(FormatError):
+        written(unseen)
+
+
+@pytest.mark.parametrize("tokens", [False, True])
 @given(st.data())
 @settings(max_examples=40)
-def test_what_is_rendered_parses_to_the_same_values(data: st.DataObject) -> None:
-    values = data.draw(values_of(compiled()))
-    assert parse(compiled(), written(values)) == values
+def test_what_is_rendered_parses_to_the_same_values(tokens: bool, data: st.DataObject) -> None:
+    values = data.draw(values_of(compiled(tokens)))
+    assert parse(compiled(tokens), written(values, tokens)) == values
 
 
 @given(st.data())
@@ -121,11 +166,24 @@ def test_a_picture_is_98_codes_and_nothing_else() -> None:
     assert list(dict.fromkeys(sections)) == list(VLA_WORLD_FORMAT.sections())
     assert (VISUAL_CODES, VISUAL_SIZE) == (CODES, CODEBOOK_SIZE)
     text = written(SAMPLE)
-    for wrong in (text.replace("<|v_97|>", ""), text.replace("<|v_97|>", "<|v_97|><|v_97|>")):
+    for wrong in (
+        text.replace("<|visual_97|>", ""),
+        text.replace("<|visual_97|>", "<|visual_97|><|visual_97|>"),
+    ):
         with pytest.raises(FormatError):
             parse(compiled(), wrong)
     with pytest.raises(FormatError):
         CompiledFormat(VLA_WORLD_FORMAT, ImaginingVocabulary(999))
+
+
+def test_thoughts_are_read_in_the_words_that_are_written() -> None:
+    reading = read(SAMPLE, lambda codes: pytest.fail("there are no codes"))
+    assert reading.reflection == told_thoughts(SAMPLE["think"])
+    assert f"<think>{reading.reflection}</think>" in written(SAMPLE)
+    assert (reading.trajectory.shape, reading.codes, reading.branch) == ((6, 4), (), None)
+    np.testing.assert_allclose(reading.trajectory[:, :2], [[0.5, 0.1]] * 6, rtol=1e-6)
+    silent = Values({**SAMPLE.by_section, "think": ((),)})
+    assert read(silent, lambda codes: pytest.fail("there are no codes")).reflection is None
 
 
 def test_every_camera_can_be_asked_for() -> None:
@@ -158,3 +216,141 @@ def test_headings_follow_the_way(speed: float, yaw_rate: float) -> None:
     np.testing.assert_allclose(trajectory[:, :2], expected[:, :2], atol=0.0501)
     # Each is the heading of the chord behind, half a step's turn late, and of rounded points.
     assert np.abs(trajectory[:, 3] - expected[:, 3]).max() < abs(yaw_rate) * 0.25 + 0.11
+
+
+FUTURE, HISTORY = drive(np.maximum(0, 12 - 2 * np.maximum(MIDDLES_S, 0)), 0.05)
+SEEN = Perceived(
+    (
+        PerceivedAgent("vehicle", 12.0, 3.52, 4.5, 1.8, None),
+        PerceivedAgent("pedestrian", 14.0, -4.5, 0.7, 0.7, 2.0),
+        PerceivedAgent("vehicle", 30.0, 0.0, 4.5, 1.8, 1.5),
+        PerceivedAgent("barrier", 31.0, 0.0, 1.0, 25.0, 2.0),
+    ),
+    left_m=2.04,
+    right_m=np.inf,
+)
+
+
+def lesson(perceived: Perceived | None = SEEN, picture: NextPicture | None = None) -> Lesson:
+    plan = expert_plan(labelled_scene())
+    return Lesson(plan, (0,) * 6, FUTURE, perceived=perceived, next_picture=picture)
+
+
+def taught(given: Lesson) -> Values:
+    assert VLA_WORLD.teach is not None
+    return VLA_WORLD.teach(given)
+
+
+def test_what_a_scene_teaches() -> None:
+    assert written(taught(lesson())) == (
+        "<perception>Object detections: object type: vehicle, object id: 1, position: (-3.5, 12.0), "
+        "size: (1.8, 4.5); object type: pedestrian, object id: 2, position: (4.5, 14.0), size: (0.7, 0.7); "
+        "object type: vehicle, object id: 3, position: (0.0, 30.0), size: (1.8, 4.5); "
+        "object type: barrier, object id: 4, position: (0.0, 31.0), size: (20.0, 1.0). "
+        "Distance to the left shoulder is 2.0m and to the right shoulder is 50.0m.</perception>"
+        "<prediction>Based on the past trajectory, the predicted trajectory 0.5s later is (-0.1,5.7), and "
+        "the direction is Forward.</prediction>\n"
+        # The soonest first, and then the nearest.
+        "<think>Notable Objects: vehicle at (0.0, 30.0). Potential Effects: within the safe zone of the "
+        "ego-vehicle at 1.5 second. Notable Objects: pedestrian at (4.5, 14.0). Potential Effects: within "
+        "the safe zone of the ego-vehicle at 2.0 second. Notable Objects: barrier at (0.0, 31.0). Potential "
+        "Effects: within the safe zone of the ego-vehicle at 2.0 second.</think>"
+        "<action>MOVE FORWARD WITH A DECELERATION</action>"
+        "<answer>[(-0.1,5.7), (-0.3,11.0), (-0.6,15.7), (-0.9,20.0), (-1.4,23.7), (-1.8,26.9)]</answer>"
+        "<|im_end|>"
+    )
+
+
+def test_a_picture_is_taught_where_there_is_one() -> None:
+    codes = tuple(range(VISUAL_CODES))
+    values = taught(lesson(picture=NextPicture("front_left", codes)))
+    assert values.all("visual") == (codes, "CAM_FRONT_LEFT")
+    assert "<visual><|visual_0|>" in written(values)
+    with pytest.raises(FormatError):
+        written(taught(lesson(picture=NextPicture("roof", codes))))
+    with pytest.raises(FormatError):
+        written(taught(lesson(picture=NextPicture("front_left", codes[1:]))))
+
+
+def test_nothing_is_taught_where_nothing_is_perceived() -> None:
+    with pytest.raises(FamilyError, match="lacks the edges of the road"):
+        taught(lesson(None))
+
+
+@pytest.mark.parametrize("tokens", [False, True])
+@given(perceived=PERCEIVED)
+def test_what_is_taught_reads_back(tokens: bool, perceived: Perceived) -> None:
+    values = taught(lesson(perceived))
+    assert parse(compiled(tokens), written(values, tokens)) == values
+    trajectory = read(values, lambda codes: pytest.fail("there are no codes")).trajectory
+    np.testing.assert_allclose(trajectory[:, :2], FUTURE[4:30:5, :2], atol=0.0501)
+
+
+@given(st.floats(0, 15), st.floats(-0.3, 0.3), PERCEIVED)
+def test_mirrored_lessons_teach_mirrored_responses(
+    speed: float, yaw_rate: float, perceived: Perceived
+) -> None:
+    future, _ = drive(speed, yaw_rate)
+    straight = taught(replace(lesson(perceived), future=future))
+    mirrored = replace(lesson(perceived.mirrored()), future=drive(speed, -yaw_rate)[0])
+    theirs = taught(mirrored)
+    # What lies between two numbers of the grid is rounded one way.
+    np.testing.assert_allclose(
+        read_points(theirs["answer"]), read_points(straight["answer"]) * [1, -1], atol=0.101
+    )
+    swapped = {"TURN LEFT": "TURN RIGHT", "TURN RIGHT": "TURN LEFT"}
+    action = cast("dict[str, str]", straight["action"])
+    assert theirs["action"] == action | {"lateral": swapped.get(action["lateral"], action["lateral"])}
+    assert theirs.all("perception")[1:] == straight.all("perception")[:0:-1]
+
+
+def points_at(*speeds_ms: float, left_m: float = 0.0) -> list[list[float]]:
+    return [[0.5 * sum(speeds_ms[: step + 1]), left_m * step / 5] for step in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("waypoints", "lateral", "speed"),
+    [
+        (points_at(*[8.0] * 6), "MOVE FORWARD", "A CONSTANT SPEED"),
+        (points_at(*[8.0] * 6, left_m=1.9), "MOVE FORWARD", "A CONSTANT SPEED"),
+        (points_at(*[8.0] * 6, left_m=2.1), "TURN LEFT", "A CONSTANT SPEED"),
+        (points_at(*[8.0] * 6, left_m=-2.1), "TURN RIGHT", "A CONSTANT SPEED"),
+        (points_at(8.0, 8.3, 8.6, 8.9, 9.2, 9.5), "MOVE FORWARD", "AN ACCELERATION"),
+        (points_at(2.0, 3.0, 4.0, 5.0, 6.0, 7.0), "MOVE FORWARD", "A QUICK ACCELERATION"),
+        (points_at(9.0, 8.5, 8.0, 7.5, 7.0, 6.5), "MOVE FORWARD", "A DECELERATION"),
+        (points_at(9.0, 8.0, 7.0, 6.0, 5.0, 4.0), "MOVE FORWARD", "A QUICK DECELERATION"),
+        (points_at(5.0, 4.0, 3.0, 2.0, 1.0, 0.0), "MOVE FORWARD", "A DECELERATION TO ZERO"),
+        (points_at(*[0.0] * 6), "MOVE FORWARD", "A DECELERATION TO ZERO"),
+        (
+            # The paper's sample, (lateral, forward): "TURN LEFT WITH A QUICK ACCELERATION".
+            read_points(
+                tuple(
+                    {"lateral_m": x, "forward_m": y}
+                    for x, y in [
+                        *((-0.06, 0.56), (-0.21, 1.36), (-0.53, 2.47)),
+                        *((-1.08, 3.68), (-2.03, 5.11), (-3.26, 6.40)),
+                    ]
+                )
+            ),
+            "TURN LEFT",
+            "A QUICK ACCELERATION",
+        ),
+    ],
+)
+def test_what_waypoints_do(waypoints: list[list[float]], lateral: str, speed: str) -> None:
+    action = action_of(waypoints)
+    assert (action.lateral, action.speed) == (lateral, speed)
+    assert action.direction.upper() == lateral.split()[-1]
+
+
+def test_prompts_say_the_ego_status_in_the_papers_axes() -> None:
+    assert VLA_WORLD.inputs is not None
+    text = CompiledFormat(VLA_WORLD.inputs.format, VOCABULARY)
+    route = np.stack([np.arange(4.0, 84.0, 4.0), np.full(20, -2.5)], 1).astype(np.float32)
+    for known, goal in ((route, "RIGHT"), (route * 0, "FORWARD"), (-route, "LEFT"), (None, "UNKNOWN")):
+        told = text.render(describe(Situation(HISTORY, known)))
+        assert VOCABULARY.decode([token.id for token in told]) == (
+            "Velocity: 12.0 m/s Heading Angular Velocity: 0.05 rad/s Acceleration: 0.0 m/s2\n"
+            "Historical Trajectory: [(-0.7,-18.0), (-0.3,-12.0), (-0.1,-6.0)]\n"
+            f"Mission Goal: {goal}\n"
+        )

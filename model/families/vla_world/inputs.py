@@ -1,0 +1,68 @@
+"""What VLA-World's prompts say of a scene (figure 5b), in words and numbers.
+
+Points are (lateral, forward), and left is negative. A turn to the left is positive, as in nuScenes. The
+paper's history is 2 s long, ours 1.5 s.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from model.driving.short_term import mission_goal
+from model.driving.trajectory import STEP_S, FloatArray, present_acceleration, present_speed
+from model.families.family import Situation, TextInputs
+from model.families.vla_world.format import points, told_points
+from model.formats.compounds import Number
+from model.formats.pieces import Choice, Format, Literal, Option, Piece, Section, Sequence, Values
+
+GOALS: Final = ("LEFT", "FORWARD", "RIGHT", "UNKNOWN")
+"""The last one where there is no route."""
+
+_SPEED_MS: Final = Number(-20.0, 60.0, 0.1)
+_YAW_RATE_RADS: Final = Number(-2.0, 2.0, 0.01)
+_ACCELERATION_MS2: Final = Number(-15.0, 15.0, 0.1)
+_PAST_STEPS: Final = (0, 5, 10)
+"""Rows of a history 1.5 s, 1 s and 0.5 s ago."""
+
+
+def goal_of(route: FloatArray | None) -> str:
+    """Which way a route [20, 2] leads next, one of `GOALS`."""
+    return "UNKNOWN" if route is None else mission_goal(route).upper()
+
+
+def describe(situation: Situation) -> Values:
+    """Ego status, past trajectory and mission goal."""
+    history = situation.history
+    half_a_second_ago = _PAST_STEPS[-1]
+    turned_rad = float(history[-1, 3] - history[half_a_second_ago, 3])
+    yaw_rate = turned_rad / (STEP_S * (len(history) - 1 - half_a_second_ago))
+    return Values.of(
+        {
+            "velocity": _SPEED_MS.nearest(present_speed(history)),
+            "yaw_rate": _YAW_RATE_RADS.nearest(yaw_rate),
+            "acceleration": _ACCELERATION_MS2.nearest(present_acceleration(history)),
+            "past": told_points(history[list(_PAST_STEPS), :2]),
+            "goal": goal_of(situation.route),
+        }
+    )
+
+
+def _line(name: str, start: str, piece: Piece, end: str) -> Section:
+    return Section(name, Sequence((Literal(start), piece, Literal(end))))
+
+
+INPUTS: Final = TextInputs(
+    Format(
+        "vla_world inputs",
+        Sequence(
+            (
+                _line("velocity", "Velocity: ", _SPEED_MS, " m/s "),
+                _line("yaw_rate", "Heading Angular Velocity: ", _YAW_RATE_RADS, " rad/s "),
+                _line("acceleration", "Acceleration: ", _ACCELERATION_MS2, " m/s2\n"),
+                _line("past", "Historical Trajectory: [", points(len(_PAST_STEPS)), "]\n"),
+                _line("goal", "Mission Goal: ", Choice(tuple(map(Option, GOALS))), "\n"),
+            )
+        ),
+    ),
+    describe,
+)

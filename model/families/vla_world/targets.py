@@ -1,0 +1,70 @@
+"""What a labelled scene teaches VLA-World, and how much each of its sections weighs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+from model.driving.perceived import PerceivedAgent
+from model.driving.trajectory import TEN_HZ_S, at_times
+from model.families.family import FamilyError, Lesson
+from model.families.vla_world import format as its
+from model.families.vla_world.actions import action_of
+from model.formats.pieces import Value, Values
+
+WEIGHTS: Final[Mapping[str, float]] = MappingProxyType(dict.fromkeys(its.VLA_WORLD_FORMAT.sections(), 1.0))
+"""The paper weighs all tokens of a response alike."""
+
+
+def teach(lesson: Lesson) -> Values:
+    """What is perceived, where the expert is in half a second, who comes near, and what the expert does.
+
+    A picture is taught where the lesson has one; otherwise that none is imagined.
+
+    Raises:
+        FamilyError: the scene does not say what there is to perceive.
+        FormatError: the picture's camera or codes cannot be written.
+    """
+    perceived = lesson.perceived
+    if perceived is None:
+        raise FamilyError("nothing to perceive: the scene lacks the edges of the road")
+    waypoints = at_times(lesson.future, TEN_HZ_S, its.TIMES_S)[:, :2]
+    action, points = action_of(waypoints), its.told_points(waypoints)
+    agents = perceived.agents[: its.MAX_OBJECTS]
+    objects = tuple(
+        {"kind": agent.kind, "object_id": float(number), **_place(agent), **_size(agent)}
+        for number, agent in enumerate(agents, 1)
+    )
+    shoulders = (its.SHOULDER_M.nearest(side_m) for side_m in (perceived.left_m, perceived.right_m))
+    values: dict[str, tuple[Value, ...]] = {
+        its.PERCEPTION: (objects, *shoulders),
+        its.PREDICTION: (points[0], action.direction),
+        its.IMAGINE: (its.UNSEEN,),
+        its.THINK: (_notable(agents),),
+        its.ACTION: ({"lateral": action.lateral, "speed": action.speed},),
+        its.ANSWER: (points,),
+    }
+    picture = lesson.next_picture
+    if picture is not None:
+        values[its.IMAGINE] = (its.IMAGINED,)
+        values[its.VISUAL] = (picture.codes, its.CAMERA_OPTIONS.get(picture.camera, picture.camera))
+    return Values(values)
+
+
+def _place(agent: PerceivedAgent) -> Mapping[str, float]:
+    [point] = its.told_points([[agent.x_m, agent.y_m]])
+    return point
+
+
+def _size(agent: PerceivedAgent) -> Mapping[str, float]:
+    return {"width_m": its.SIZE_M.nearest(agent.width_m), "length_m": its.SIZE_M.nearest(agent.length_m)}
+
+
+def _notable(agents: tuple[PerceivedAgent, ...]) -> tuple[Value, ...]:
+    """Who comes into the safe zone: the soonest first, and of those the nearest."""
+    near = [(agent.near_s, agent) for agent in agents if agent.near_s is not None]
+    near.sort(key=lambda each: each[0])
+    return tuple(
+        {"kind": agent.kind, **_place(agent), "time_s": near_s} for near_s, agent in near[: its.MAX_NOTABLE]
+    )
