@@ -154,8 +154,13 @@ class RepeatRest(Shorthand):
 
 
 def number_alphabets(piece: Piece) -> dict[str, int]:
-    """The alphabets that the numbers within ``piece`` are codes of, with how many numbers each has."""
+    """The alphabets that numbers within ``piece`` are codes of, with how many codes each has.
+
+    Those of `Codes` count too where their size is declared, as that of the codes of pictures.
+    """
     if isinstance(piece, Number):
         return {} if piece.spelling == DIGITS else {piece.spelling: len(piece.texts)}
+    if isinstance(piece, Codes):
+        return {} if piece.size is None else {piece.alphabet: piece.size}
     within = (piece.piece,) if isinstance(piece, Repeat) else children(piece)
     return {name: size for each in within for name, size in number_alphabets(each).items()}

@@ -1,4 +1,7 @@
-"""Numbers as tokens: which alphabets a checkpoint's formats need, and how their tokens begin."""
+"""Numbers as tokens: which alphabets a checkpoint's formats need, and how their tokens begin.
+
+The codes of pictures are such numbers too.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from model.families.registry import families_of
+from model.families.vla_world.format import VISUAL_ALPHABET
 from model.formats.compounds import number_alphabets
 from model.network.settings import VlaSettings
+from model.network.visual_codes import levels_of
 from model.network.vocabulary import Vocabulary
 
 _WAVES: Final = 4
@@ -30,6 +35,7 @@ def needed_numbers(settings: VlaSettings) -> dict[str, int]:
 def write_number_embeddings(model: nn.Module, vocabulary: Vocabulary, names: set[str]) -> None:
     """Set the embeddings of alphabets of numbers, so that near numbers begin near.
 
+    Codes of pictures are near where their levels are, as these are what a picture is painted of.
     Draws from torch's global random state, and only where there are any.
     """
     network: Any = model
@@ -38,7 +44,7 @@ def write_number_embeddings(model: nn.Module, vocabulary: Vocabulary, names: set
         spread = float(weight[: vocabulary.code_ids(0).start].float().std())
         for name in sorted(names):
             [ids] = vocabulary.alphabets[name]
-            features = _features(len(ids))
+            features = _levels(len(ids)) if name == VISUAL_ALPHABET else _features(len(ids))
             projected = features @ torch.randn(features.shape[1], weight.shape[1])
             own = torch.randn(len(ids), weight.shape[1])
             rows = projected / projected.std() + torch.randn(weight.shape[1]) + _OWN * own
@@ -51,3 +57,9 @@ def _features(size: int) -> Tensor:
     waves = np.pi * 2.0 ** np.arange(_WAVES) * place[:, None]
     features = np.concatenate([place[:, None], np.sin(waves), np.cos(waves)], axis=1)
     return torch.from_numpy(features.astype(np.float32))
+
+
+def _levels(size: int) -> Tensor:
+    """Of the codes of pictures, float32 [size, 4]: how far their levels are from the mean ones."""
+    levels = levels_of(np.arange(size)).astype(np.float32)
+    return torch.from_numpy((levels - levels.mean(axis=0)) / levels.std(axis=0))

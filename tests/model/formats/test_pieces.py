@@ -185,6 +185,7 @@ def test_alphabets_of_numbers_are_told() -> None:
     tenth = Number(-1.0, 1.0, 0.1, "tenth", name="tenth")
     within = Section("answer", Repeat(Record(Sequence((Literal("("), tenth, Literal(")")))), 3))
     assert number_alphabets(Choice((Option("a", within), Option("b", Number(0, 9, 1))))) == {"tenth": 21}
+    assert number_alphabets(Sequence((Codes("paint", 3, 8), Codes("trajectory", 6)))) == {"paint": 8}
 
 
 NUMBER = compile_(Section("speed", Sequence((Number(0, 120, 1), Literal(" km/h")))))

@@ -24,6 +24,7 @@ from model.network.checkpoint import Loaded, create_nano, expand_stock, load, sa
 from model.network.codec import CODEC_FILE, TrajectoryCodec
 from model.network.inputs import InputBuilder
 from model.network.settings import VlaSettings
+from model.network.visual_codes import levels_of
 from model.network.vocabulary import QWEN_TOKENS, Vocabulary, build_nano_tokenizer
 from tests.model.network.conftest import made_up_scene
 
@@ -87,6 +88,25 @@ def test_numbers_as_tokens_begin_near_their_neighbours(nano_folder: Path) -> Non
     alike = (rows @ rows.T).numpy()
     assert alike.diagonal(1).mean() > 0.9 > 0.7 > alike.diagonal(200).mean()
     assert alike.diagonal(1).max() < 0.99
+
+
+def test_codes_of_pictures_begin_near_those_that_paint_alike(nano_folder: Path, tmp_path: Path) -> None:
+    before, wider = load(nano_folder), with_formats(load(nano_folder), ["vla_world"])
+    assert set(wider.vocabulary.alphabets) == {"trajectory", "visual"}
+    [ids] = wider.vocabulary.alphabets["visual"]
+    assert (ids.start, len(ids)) == (len(before.vocabulary), 1000)
+    assert wider.vocabulary.decode([ids[7]]) == "<|visual_0007|>"
+    embeddings: Any = wider.model.get_input_embeddings()
+    rows = torch.nn.functional.normalize(embeddings.weight[ids.start : ids.stop].detach(), dim=1)
+    alike = (rows @ rows.T).numpy()
+    levels = levels_of(np.arange(1000))
+    apart = np.abs(levels[:, None] - levels[None]).sum(-1)
+    assert alike[apart == 1].mean() > 0.7 > 0.3 > alike[apart >= 8].mean()
+    assert alike[apart == 1].max() < 0.99
+    save(tmp_path, wider.model, wider.vocabulary, wider.codec)
+    again = load(tmp_path)
+    written = slice(len(before.vocabulary))
+    torch.testing.assert_close(logits_of(again)[..., written], logits_of(before)[..., written])
 
 
 def test_saved_in_half_and_loaded(nano: Loaded, tmp_path: Path) -> None:
