@@ -5,28 +5,35 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import llguidance
 import numpy as np
 import pytest
 import torch
 
 import clients.wire as wire
+from clients.answers import PlannedDraw
 from clients.planner import PlannerClient
+from model.driving.labeller import expert_plan
+from model.driving.perceived import perceived_of
+from model.driving.scene import LabelledScene
 from model.engines.engine import Controls, Draw, PlanRequest
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.torch.runner import Runner
 from model.evaluation.open_loop import evaluate_draws
+from model.families.family import Lesson, NextPicture
 from model.families.vla_world import VLA_WORLD
 from model.families.vla_world.format import TIMES_S, UNSEEN, VISUAL_CODES
 from model.formats.cursor import CompiledFormat
 from model.formats.grammar_export import to_lark
 from model.network.checkpoint import Loaded, load, save
 from model.network.settings import VlaSettings
+from model.network.vocabulary import END_OF_TEXT, Vocabulary
 from service.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
-from tests.model.driving.drives import labelled_scene
+from tests.model.driving.drives import agent, labelled_scene
 from tests.model.engines.decoding import decode
 from tests.model.engines.reference import exactly, reference_draws
 from tests.model.evaluation.fakes import draw_of
@@ -52,6 +59,11 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def world(checkpoint: Path) -> Loaded:
     return exactly(load(checkpoint, torch.float64))
+
+
+def lesson_of(labelled: LabelledScene, picture: NextPicture | None = None) -> Lesson:
+    perceived = perceived_of(labelled)
+    return Lesson(expert_plan(labelled), (0,) * 6, labelled.future, perceived=perceived, next_picture=picture)
 
 
 def planned(world: Loaded, **controls: Any) -> list[Draw]:
@@ -89,7 +101,7 @@ def test_waypoints_of_least_error_are_expected_ones(world: Loaded) -> None:
 def test_it_plans_over_http_and_is_evaluated(checkpoint: Path) -> None:
     labelled = labelled_scene(12.0, pictures=1)
     engine = TorchEngine(checkpoint, TorchSettings(rows=8, products=None))
-    draws = []
+    draws: list[PlannedDraw] = []
     with serve(engine, Settings()) as served, PlannerClient(served.url) as planner:
         for seed in range(3):
             controls = wire.Controls(n=8, temperature=1.5, numbers="drawn", seed=seed)
@@ -106,7 +118,36 @@ def test_it_plans_over_http_and_is_evaluated(checkpoint: Path) -> None:
     assert evaluate_draws(labelled, told).avg_ade_m == pytest.approx(apart.mean(), rel=1e-4)
 
 
+class _Tokenizer:
+    """A checkpoint's vocabulary as llguidance wants to see one."""
+
+    bos_token_id = None
+    special_token_ids: ClassVar[list[int]] = []
+
+    def __init__(self, vocabulary: Vocabulary) -> None:
+        self._vocabulary, self.eos_token_id = vocabulary, vocabulary.id_of(END_OF_TEXT)
+        self.tokens = [vocabulary.decode([token]).encode() for token in range(len(vocabulary))]
+
+    def __call__(self, text: str | bytes) -> list[int]:
+        return list(self._vocabulary.encode(text if isinstance(text, str) else text.decode()))
+
+
 @pytest.mark.parametrize("reflection", ["phrases", "free_text"])
-def test_a_grammar_can_be_exported(world: Loaded, reflection: Any) -> None:
+@pytest.mark.parametrize("picture", [None, NextPicture("front_left", tuple(range(VISUAL_CODES)))])
+def test_the_exported_grammar_takes_what_is_taught(
+    world: Loaded, reflection: Any, picture: NextPicture | None
+) -> None:
     compiled = CompiledFormat(VLA_WORLD.in_dialect(reflection).format, world.vocabulary)
-    assert "start:" in to_lark(compiled.start())
+    labelled = labelled_scene(9.0, agents=(agent(15.0, 0.0), agent(30.0, 3.5)))
+    lesson = lesson_of(labelled, picture)
+    assert VLA_WORLD.teach is not None
+    ids = [token.id for token in compiled.render(VLA_WORLD.teach(lesson))]
+    tokenizer = llguidance.LLTokenizer(llguidance.TokenizerWrapper(_Tokenizer(world.vocabulary)))
+    matcher = llguidance.LLMatcher(tokenizer, llguidance.grammar_from("lark", to_lark(compiled.start())))
+    assert not matcher.is_error(), matcher.get_error()
+    assert matcher.deep_copy().validate_tokens(ids) == len(ids)
+    if picture is not None:
+        # No code but 98 of them: the 99th is refused.
+        [codes] = world.vocabulary.alphabets["visual"]
+        last = max(place for place, token in enumerate(ids) if token in codes)
+        assert matcher.validate_tokens([*ids[: last + 1], codes[0]]) == last + 1
