@@ -151,12 +151,14 @@ class ResponseDataset(Dataset[Sample]):
         history, future = examples.history[index], examples.future[index]
         route, tracks = np.nan_to_num(examples.route[index]), examples.tracks[index]
         plan, thoughts = examples.plan(index), examples.thought(index)
+        perceived = examples.perception(index)
         tracks = tracks.copy() if item.route else without_route(tracks)
         if item.mirror:
             history, future, route = history * _MIRROR, future * _MIRROR, route * _MIRROR[:2]
             tracks[:, MIRRORED] *= -1
             plan = plan.mirrored()
             thoughts = None if thoughts is None else thoughts.mirrored()
+            perceived = None if perceived is None else perceived.mirrored()
         if item.blur:
             history = steady_history(present_speed(history))
         vector = self._codec.vectors(history[None], future[None])[0]
@@ -166,7 +168,7 @@ class ResponseDataset(Dataset[Sample]):
         reflections: Sequence[Reflection | None] = found or [None]
         soft = [self._soft.draw(vector, self._random) for _ in reflections]
         lessons = [
-            Lesson(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts)
+            Lesson(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived)
             for drawn, reflection in zip(soft, reflections, strict=True)
         ]
         return Sample(

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from model.driving.facts import scene_facts
 from model.driving.hashing import hash_of
 from model.driving.labeller import expert_plan
+from model.driving.perceived import ROW_SIZE, Perceived, perceived_of, perceived_of_row
 from model.driving.plan import Plan, plan_from_bins
 from model.driving.reasoning import thoughts_of
 from model.driving.scene import CLIP_FRAMES, LabelledScene
@@ -30,9 +31,10 @@ from model.network.inputs import InputBuilder
 from model.network.track_features import track_features
 from model.training.dense import coarse, no_target, relative_motion
 
-CACHE_VERSION: Final = 4
+CACHE_VERSION: Final = 5
 DENSE_FAR_M: Final = 200.0
 """Ranges beyond are all the same to a dense target."""
+_NOTHING_KNOWN: Final = np.full(ROW_SIZE, np.nan, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,7 @@ class Examples:
             left in the ego frame, divided by `SPEED_SCALE_MS`; 0 where no agent is.
         facts: float32 [N, facts].
         thoughts: str [N], the expert's; empty where annotations do not tell it.
+        perceived: float32 [N, ROW_SIZE], see `Perceived.row`; NaN where annotations do not tell it.
         episode: int64 [N], the simulator's seed.
         scene_id: str [N].
     """
@@ -69,6 +72,7 @@ class Examples:
     dense_motion: npt.NDArray[np.float16]
     facts: FloatArray
     thoughts: npt.NDArray[np.str_]
+    perceived: FloatArray
     episode: npt.NDArray[np.int64]
     scene_id: npt.NDArray[np.str_]
 
@@ -84,6 +88,10 @@ class Examples:
         """The expert's thoughts; None where they are not known."""
         text = str(self.thoughts[index])
         return read_thoughts(text) if text else None
+
+    def perception(self, index: int) -> Perceived | None:
+        """What there is to perceive; None where it is not known."""
+        return perceived_of_row(self.perceived[index])
 
     def plan(self, index: int) -> Plan:
         """The expert's plan."""
@@ -120,6 +128,8 @@ class Examples:
             columns["dense_motion"].append([relative_motion(target, labelled) for target in cells])
             columns["facts"].append(scene_facts(labelled))
             columns["thoughts"].append(str(thoughts_of(labelled) or ""))
+            perceived = perceived_of(labelled)
+            columns["perceived"].append(_NOTHING_KNOWN if perceived is None else perceived.row())
             columns["episode"].append(labelled.seed)
             columns["scene_id"].append(scene.scene_id)
         types: dict[str, Any] = {"picture_spans": np.int64, "plan_bins": np.int8, "dense_classes": np.uint8}

@@ -13,6 +13,7 @@ from typing import Final, Literal
 
 from model.families.cf_vla.targets import NANO_WEIGHTS, PAPER_WEIGHTS
 from model.families.elf_vla import targets as elf_vla
+from model.families.vla_world import targets as vla_world
 from model.training.rewards import RewardWeights
 from model.training.targets import SectionWeights
 
@@ -147,14 +148,12 @@ NANO: Final[Mapping[str, Recipe]] = {
     )
 } | {
     # Without trajectory codes there is neither their error to learn from, nor the head beside them.
-    "elf-sft": replace(
-        _NANO,
-        name="elf-sft",
-        tasks={"elf_vla": 1.0},
-        weights=elf_vla.WEIGHTS,
-        error_weight=0.0,
-        head_weight=0.0,
-    ),
+    name: replace(_NANO, name=name, tasks={task: 1.0}, weights=weights, error_weight=0.0, head_weight=0.0)
+    for name, task, weights in (
+        ("elf-sft", "elf_vla", elf_vla.WEIGHTS),
+        ("world-sft", "vla_world", vla_world.WEIGHTS),
+    )
+} | {
     "cf-rl": replace(
         _NANO,
         name="cf-rl",
@@ -170,7 +169,8 @@ NANO: Final[Mapping[str, Recipe]] = {
         outcome=OutcomeSettings(),
     ),
 }
-"""The stages of the shipped checkpoint, the control of its last one, ELF-VLA's second; outcome training."""
+"""The stages of the shipped checkpoint, the control of its last one, the second stages of ELF-VLA and of
+VLA-World, and outcome training."""
 
 PAPER: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe

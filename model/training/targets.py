@@ -50,7 +50,7 @@ def make_target(
         raise ValueError(f"no targets for format {family.name!r}: its family teaches nothing")
     values = family.teach(lesson)
     # Plans of scenes without lanes lack a group, which the model by itself always writes.
-    plans = {section: value for section in values if isinstance(value := values[section], Plan)}
+    plans = {section: each for section in values for each in values.all(section) if isinstance(each, Plan)}
     tokens = compiled.render(values, given=plans)
     untaught, reflection = set[str | None](), lesson.reflection
     if reflection is not None:

@@ -23,20 +23,26 @@ from model.engines.torch.decoder import Decoder
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.torch.runner import Runner
 from model.evaluation.open_loop import evaluate_draws
-from model.families.family import Lesson, NextPicture
+from model.families.family import FamilyError, Lesson, NextPicture
 from model.families.vla_world import VLA_WORLD
 from model.families.vla_world.format import TIMES_S, UNSEEN, VISUAL_CODES
+from model.families.vla_world.targets import WEIGHTS
 from model.formats.cursor import CompiledFormat
 from model.formats.grammar_export import to_lark
 from model.network.checkpoint import Loaded, load, save
 from model.network.settings import VlaSettings
 from model.network.vocabulary import END_OF_TEXT, Vocabulary
+from model.training.batches import Item, ResponseDataset, collate
+from model.training.examples import Examples
+from model.training.learner import ResponseLearner
 from service.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
-from tests.model.driving.drives import agent, labelled_scene
+from tests.model.driving.drives import MIDDLES_S, agent, drive, labelled_scene
+from tests.model.driving.roads import mirrored_scene
 from tests.model.engines.decoding import decode
 from tests.model.engines.reference import exactly, reference_draws
 from tests.model.evaluation.fakes import draw_of
+from tests.model.training.scenes import training_scene
 from tests.service.serving import serve
 
 CODE = re.compile(r"<\|visual_\d{4}\|>")
@@ -151,3 +157,61 @@ def test_the_exported_grammar_takes_what_is_taught(
         [codes] = world.vocabulary.alphabets["visual"]
         last = max(place for place, token in enumerate(ids) if token in codes)
         assert matcher.validate_tokens([*ids[: last + 1], codes[0]]) == last + 1
+
+
+def dataset(loaded: Loaded, scenes: list[LabelledScene]) -> ResponseDataset:
+    examples = Examples.from_scenes(scenes, loaded.settings.cameras)
+    return ResponseDataset(examples, loaded.codec, loaded.inputs, loaded.vocabulary, WEIGHTS, pictures=True)
+
+
+def test_training_reads_the_prompts_that_the_engine_reads(world: Loaded) -> None:
+    scenes = [training_scene(number) for number in range(4)]
+    data = dataset(world, scenes)
+    compiled = CompiledFormat(VLA_WORLD.in_dialect("phrases").format, world.vocabulary)
+    for number, labelled in enumerate(scenes):
+        built = world.inputs.build(labelled.scene, "vla_world")
+        sample = data[Item(number, "vla_world", labelled.scene.route is not None)]
+        assert sample.prompt == built.prompt.ids.tolist()
+        assert len(sample.prompt) <= world.inputs.longest_prompt("vla_world")
+        assert VLA_WORLD.teach is not None
+        taught = compiled.render(VLA_WORLD.teach(lesson_of(labelled)))
+        assert list(sample.responses[0].ids) == [token.id for token in taught]
+        assert len(taught) <= compiled.longest()
+        assert set(sample.responses[0].weights) == {1.0}
+
+
+def test_mirrored_examples_teach_what_mirrored_scenes_do(world: Loaded) -> None:
+    future, history = drive(np.maximum(0, 12 - 2 * np.maximum(MIDDLES_S, 0)), 0.05)
+    plain = training_scene(1)
+    labelled = replace(
+        plain,
+        scene=replace(plain.scene, history=history),
+        future=future,
+        agents=(agent(15.0, 0.43), agent(30.0, 3.42)),
+    )
+    item = Item(0, "vla_world", True)
+    theirs = dataset(world, [mirrored_scene(labelled)])[item]
+    mine = dataset(world, [labelled])[replace(item, mirror=True)]
+    assert (mine.responses, mine.prompt) == (theirs.responses, theirs.prompt)
+    assert dataset(world, [labelled])[item].responses != theirs.responses
+
+
+def test_a_step_of_training_brings_it_nearer_to_the_expert(checkpoint: Path) -> None:
+    loaded = load(checkpoint)
+    batch = collate([dataset(loaded, [training_scene(1)])[Item(0, "vla_world", True)]])
+    learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec)
+    optimiser = torch.optim.SGD(learner.parameters(), lr=0.1)
+    losses = []
+    for _ in range(2):
+        optimiser.zero_grad()
+        loss = learner(**batch)["loss"]
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[1] < losses[0]
+
+
+def test_scenes_without_road_are_not_taught(world: Loaded) -> None:
+    data = dataset(world, [replace(training_scene(1), drivable=())])
+    with pytest.raises(FamilyError, match="nothing to perceive"):
+        data[Item(0, "vla_world", True)]

@@ -8,6 +8,7 @@ import numpy as np
 
 from model.driving.images import decode_image
 from model.driving.labeller import expert_plan
+from model.driving.perceived import perceived_of
 from model.driving.reasoning import thoughts_of
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.driving.scene_store import write_scenes
@@ -27,6 +28,10 @@ def test_examples_hold_what_the_scenes_hold() -> None:
         assert decode_image(examples.picture(index, 0, 0)).ndim == 3
         assert examples.plan(index) == expert_plan(labelled)
         assert examples.thought(index) == thoughts_of(labelled) is not None
+        told, perceived = examples.perception(index), perceived_of(labelled)
+        assert told is not None
+        assert perceived is not None
+        np.testing.assert_array_equal(told.row(), perceived.row())
         assert np.array_equal(examples.future[index], labelled.future)
         assert np.isnan(examples.route[index]).all() == (labelled.scene.route is None)
         assert np.array_equal(examples.dense_classes[index, 0], coarse(labelled.dense[0]).classes)
@@ -38,6 +43,15 @@ def test_thoughts_are_known_where_annotations_tell_them() -> None:
     examples = Examples.from_scenes([replace(SCENES[0], lane_lines=()), SCENES[1]], CAMERAS)
     assert examples.thought(0) is None
     assert examples.thought(1) == thoughts_of(SCENES[1])
+
+
+def test_what_is_perceived_is_known_where_the_road_is() -> None:
+    examples = Examples.from_scenes([replace(SCENES[1], drivable=()), SCENES[1]], CAMERAS)
+    assert examples.perception(0) is None
+    known = examples.perception(1)
+    assert known is not None
+    [vehicle] = known.agents
+    assert (vehicle.kind, vehicle.x_m) == ("vehicle", 11.0)
 
 
 def test_scenes_without_dense_targets_are_examples_too() -> None:

@@ -57,17 +57,18 @@ def test_the_stages_lead_to_a_checkpoint_that_tells_its_history(
     assert all(0 < row["plan_iou_first/cf_vla"] < 1 for row in validated)
 
 
+@pytest.mark.parametrize(("recipe", "format"), [("elf-sft", "elf_vla"), ("world-sft", "vla_world")])
 def test_a_checkpoint_learns_a_format_that_it_did_not_write(
-    resampling_checkpoint: Path, scenes: Path, tmp_path: Path
+    recipe: str, format: str, resampling_checkpoint: Path, scenes: Path, tmp_path: Path
 ) -> None:
     settings = RunSettings(tmp_path / "cache", validate_every=4, save_every=4, draws=1, bf16=False)
-    run(short("elf-sft"), scenes, resampling_checkpoint, tmp_path / "elf", settings, SCENES[:1])
-    before, done = load(resampling_checkpoint), load(tmp_path / "elf")
-    assert done.card.formats == (*before.card.formats, "elf_vla")
+    run(short(recipe), scenes, resampling_checkpoint, tmp_path / "done", settings, SCENES[:1])
+    before, done = load(resampling_checkpoint), load(tmp_path / "done")
+    assert done.card.formats == (*before.card.formats, format)
     ids = range(len(before.vocabulary))
     assert [done.vocabulary.decode([id]) for id in ids] == [before.vocabulary.decode([id]) for id in ids]
-    rows = [json.loads(line) for line in (tmp_path / "elf" / "log.jsonl").read_text().splitlines()]
-    assert [row["step"] for row in rows if "min_ade_m/elf_vla+route" in row] == [4]
+    rows = [json.loads(line) for line in (tmp_path / "done" / "log.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows if f"min_ade_m/{format}+route" in row] == [4]
 
 
 def test_a_vision_tower_can_be_taken_from_elsewhere(
