@@ -9,6 +9,7 @@ from functools import cached_property
 from model.driving.perceived import Perceived
 from model.driving.phrases import ReflectionLanguage
 from model.driving.plan import Plan
+from model.driving.scene import CAMERAS
 from model.driving.thoughts import Thoughts
 from model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, check_times
 from model.formats.pieces import Format, Values, choices
@@ -122,10 +123,17 @@ class NextPicture:
     Attributes:
         camera: one of `CAMERAS`.
         codes: 98 codes of its picture, see `model.network.visual_codes`.
+
+    Raises:
+        FamilyError: there is no such camera.
     """
 
     camera: str
     codes: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if self.camera not in CAMERAS:
+            raise FamilyError(f"unknown camera {self.camera!r}; known are {', '.join(CAMERAS)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,39 +100,22 @@ def _tagged(section: str, *parts: Piece) -> Section:
     return Section(section, Sequence((Literal(f"<{section}>"), *parts, Literal(f"</{section}>"))))
 
 
-def position(*, tokens: bool = False, between: str = ", ") -> Sequence:
-    """Where something is, such as ``(-4.5, 3.2)``: its numbers in digits or as one token each."""
-    return _pair(_spelt(LATERAL_M, tokens), _spelt(FORWARD_M, tokens), between)
-
-
 def points(count: int, *, tokens: bool = False) -> Repeat:
-    """So many points, as `told_points` makes them."""
+    """So many points, as `told_points` makes them, their numbers in digits or as one token each."""
     return Repeat(_point(tokens), count, count, between=", ")
-
-
-def _notable(tokens: bool) -> Repeat:
-    """Who comes near, and when: the thoughts."""
-    words = map(Literal, _THOUGHT)
-    told = (next(words), _kind(), next(words), position(tokens=tokens), next(words), NEAR_S, next(words))
-    return Repeat(Record(Sequence(told)), MAX_NOTABLE, between=" ")
-
-
-def told_thoughts(value: Value) -> str:
-    """The text of the thoughts of a value of notable objects."""
-    start, at, effects, end = _THOUGHT
-    return " ".join(
-        f"{start}{each['kind']}{at}({each['lateral_m']:.1f}, {each['forward_m']:.1f})"
-        f"{effects}{each['time_s']:.1f}{end}"
-        for each in cast("Several[dict[str, float]]", value)
-    )
 
 
 def _spelt(number: Number, tokens: bool) -> Number:
     return replace(number, spelling=str(number.name)) if tokens else number
 
 
+def _position(tokens: bool, between: str = ", ") -> Sequence:
+    """Where something is, such as ``(-4.5, 3.2)``."""
+    return _pair(_spelt(LATERAL_M, tokens), _spelt(FORWARD_M, tokens), between)
+
+
 def _point(tokens: bool) -> Record:
-    return Record(position(tokens=tokens, between=","), name="point")
+    return Record(_position(tokens, ","), name="point")
 
 
 def _objects(tokens: bool) -> Repeat:
@@ -143,11 +126,18 @@ def _objects(tokens: bool) -> Repeat:
         Literal(", object id: "),
         _ID,
         Literal(", position: "),
-        position(tokens=tokens),
+        _position(tokens),
         Literal(", size: "),
         _pair(width, length),
     )
     return Repeat(Record(Sequence(told)), MAX_OBJECTS, between="; ")
+
+
+def _notable(tokens: bool) -> Repeat:
+    """Who comes near, and when: the thoughts."""
+    words = map(Literal, _THOUGHT)
+    told = (next(words), _kind(), next(words), _position(tokens), next(words), NEAR_S, next(words))
+    return Repeat(Record(Sequence(told)), MAX_NOTABLE, between=" ")
 
 
 _PICTURE: Final = Section(
@@ -213,6 +203,16 @@ VLA_WORLD_FORMAT: Final = _vla_world(tokens=False)
 in digits"""
 VLA_WORLD_TOKENS: Final = _vla_world(tokens=True)
 """For small checkpoints: metres as one token each."""
+
+
+def told_thoughts(value: Value) -> str:
+    """The text of the thoughts of a value of notable objects."""
+    start, at, effects, end = _THOUGHT
+    return " ".join(
+        f"{start}{each['kind']}{at}({each['lateral_m']:.1f}, {each['forward_m']:.1f})"
+        f"{effects}{each['time_s']:.1f}{end}"
+        for each in cast("Several[dict[str, float]]", value)
+    )
 
 
 def told_points(xy_m: npt.ArrayLike) -> tuple[dict[str, float], ...]:

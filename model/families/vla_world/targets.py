@@ -20,11 +20,8 @@ WEIGHTS: Final[Mapping[str, float]] = MappingProxyType(dict.fromkeys(its.VLA_WOR
 def teach(lesson: Lesson) -> Values:
     """What is perceived, where the expert is in half a second, who comes near, and what the expert does.
 
-    A picture is taught where the lesson has one; otherwise that none is imagined.
-
-    Raises:
-        FamilyError: the scene does not say what there is to perceive.
-        FormatError: the picture's camera or codes cannot be written.
+    A picture is taught where the lesson has one; otherwise that none is imagined. Raises `FamilyError` where
+    the scene does not say what there is to perceive.
     """
     perceived = lesson.perceived
     if perceived is None:
@@ -48,7 +45,7 @@ def teach(lesson: Lesson) -> Values:
     picture = lesson.next_picture
     if picture is not None:
         values[its.IMAGINE] = (its.IMAGINED,)
-        values[its.VISUAL] = (picture.codes, its.CAMERA_OPTIONS.get(picture.camera, picture.camera))
+        values[its.VISUAL] = (picture.codes, its.CAMERA_OPTIONS[picture.camera])
     return Values(values)
 
 

@@ -266,8 +266,8 @@ def test_a_picture_is_taught_where_there_is_one() -> None:
     values = taught(lesson(picture=NextPicture("front_left", codes)))
     assert values.all("visual") == (codes, "CAM_FRONT_LEFT")
     assert "<visual><|visual_0|>" in written(values)
-    with pytest.raises(FormatError):
-        written(taught(lesson(picture=NextPicture("roof", codes))))
+    with pytest.raises(FamilyError, match="unknown camera 'roof'; known are front_wide_120, "):
+        NextPicture("roof", codes)
     with pytest.raises(FormatError):
         written(taught(lesson(picture=NextPicture("front_left", codes[1:]))))
 
