@@ -127,48 +127,52 @@ _READ: Final = Recipe(
     mirror_share=0.5,
 )
 
-NANO: Final[Mapping[str, Recipe]] = {
-    recipe.name: recipe
-    for recipe in _with_control(
-        replace(
+NANO: Final[Mapping[str, Recipe]] = (
+    {
+        recipe.name: recipe
+        for recipe in _with_control(
+            replace(
+                _NANO,
+                name="language",
+                batch_size=64,
+                learning_rate=1e-3,
+                pictures=False,
+                tasks={"traj_only": 0.65, "cf_vla": 0.35},
+                tracks_share=0.75,
+            ),
+            Recipe("ground", "ground", steps=6000, batch_size=24, learning_rate=1e-3, warmup_steps=200),
+            replace(_READ, name="read-tracks", pictures=False, steps=6000, batch_size=256),
+            replace(_READ, name="read-scene", steps=4000, batch_size=64),
+            replace(_NANO, name="traj-only", steps=3000, tasks={"traj_only": 1.0}),
+            replace(_NANO, name="meta-act"),
+            replace(_NANO, name="counterfactual", steps=3000, learning_rate=2.5e-4, reflections="learned"),
+        )
+    }
+    | {
+        # Without trajectory codes there is neither their error to learn from, nor the head beside them.
+        name: replace(_NANO, name=name, tasks={task: 1.0}, weights=weights, error_weight=0.0, head_weight=0.0)
+        for name, task, weights in (
+            ("elf-sft", "elf_vla", elf_vla.WEIGHTS),
+            ("world-sft", "vla_world", vla_world.WEIGHTS),
+        )
+    }
+    | {
+        "cf-rl": replace(
             _NANO,
-            name="language",
-            batch_size=64,
-            learning_rate=1e-3,
-            pictures=False,
-            tasks={"traj_only": 0.65, "cf_vla": 0.35},
-            tracks_share=0.75,
+            name="cf-rl",
+            goal="outcome",
+            steps=400,
+            batch_size=16,
+            learning_rate=2e-5,
+            warmup_steps=10,
+            tasks={"cf_vla": 1.0},
+            mirror_share=0.0,
+            blur_share=0.0,
+            head_weight=0.0,
+            outcome=OutcomeSettings(),
         ),
-        Recipe("ground", "ground", steps=6000, batch_size=24, learning_rate=1e-3, warmup_steps=200),
-        replace(_READ, name="read-tracks", pictures=False, steps=6000, batch_size=256),
-        replace(_READ, name="read-scene", steps=4000, batch_size=64),
-        replace(_NANO, name="traj-only", steps=3000, tasks={"traj_only": 1.0}),
-        replace(_NANO, name="meta-act"),
-        replace(_NANO, name="counterfactual", steps=3000, learning_rate=2.5e-4, reflections="learned"),
-    )
-} | {
-    # Without trajectory codes there is neither their error to learn from, nor the head beside them.
-    name: replace(_NANO, name=name, tasks={task: 1.0}, weights=weights, error_weight=0.0, head_weight=0.0)
-    for name, task, weights in (
-        ("elf-sft", "elf_vla", elf_vla.WEIGHTS),
-        ("world-sft", "vla_world", vla_world.WEIGHTS),
-    )
-} | {
-    "cf-rl": replace(
-        _NANO,
-        name="cf-rl",
-        goal="outcome",
-        steps=400,
-        batch_size=16,
-        learning_rate=2e-5,
-        warmup_steps=10,
-        tasks={"cf_vla": 1.0},
-        mirror_share=0.0,
-        blur_share=0.0,
-        head_weight=0.0,
-        outcome=OutcomeSettings(),
-    ),
-}
+    }
+)
 """The stages of the shipped checkpoint, the control of its last one, the second stages of ELF-VLA and of
 VLA-World, and outcome training."""
 
