@@ -57,7 +57,7 @@ def test_an_answer_that_is_never_drawn_is_learned_when_it_is_injected() -> None:
         logits = torch.tensor([10.0, 0.0], requires_grad=True)
         optimiser = torch.optim.SGD([logits], lr=20.0)
         for _ in range(2000):
-            arms = torch.distributions.Categorical(logits=logits).sample((8,)).tolist()
+            arms = torch.multinomial(torch.softmax(logits, -1), 8, replacement=True).tolist()
             now = torch.log_softmax(logits, -1)
             drawn: list[Tensor | None] = [now[arm : arm + 1].detach() for arm in arms]
             rewards = [float(arm) for arm in arms]
@@ -66,7 +66,7 @@ def test_an_answer_that_is_never_drawn_is_learned_when_it_is_injected() -> None:
             worth = advantages(torch.tensor([rewards]))[0]
             loss = policy_loss([now[arm : arm + 1] for arm in arms], drawn, worth).loss
             optimiser.zero_grad()
-            loss.backward()
+            torch.autograd.backward(loss)
             optimiser.step()
         return torch.softmax(logits, -1)[1].item()
 

@@ -74,7 +74,9 @@ def test_whom_the_ego_touches_beside_it_is_its_fault_only_in_a_careful_world() -
     )
     assert careful.sub_scores[COLLISIONS] == [0.0]
     assert careful.failures[COLLISIONS].other == [0]
-    assert np.isnan(usual.sub_scores[COLLISIONS])
+    unknown = usual.sub_scores[COLLISIONS]
+    assert unknown is not None
+    assert np.isnan(unknown)
     # Who drives into the ego from behind is at fault himself.
     behind = world_ahead(history(8.0), None, (Track(-12.0, 0.0, 0.0, 14.0, 4.5, 1.9, "vehicle"),))
     assert score(behind, straight(8.0)[None], "v1.1", centre=True).sub_scores[COLLISIONS] == [1.0]
