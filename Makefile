@@ -23,9 +23,9 @@ NOT_FAST := $(addprefix tests/service/,cli vllm test_connection.py test_fuzz.py 
 plan: $(VENV)/.serve
 	$(BIN)/looktwice plan
 
-# A file's tests stay together: they share servers and checkpoints.
+# A file's tests stay together: they share servers and checkpoints. A process may take 3 GB.
 test: $(VENV)/.dev $(BIN)/promtool system-packages lint
-	$(BIN)/python -m pytest -n logical --dist loadfile
+	$(BIN)/python -m pytest -n logical --maxprocesses 8 --dist loadfile
 
 test-fast: $(VENV)/.dev
 	$(BIN)/python -m pytest -q $(FAST_TESTS) $(addprefix --ignore=,$(NOT_FAST))
