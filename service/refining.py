@@ -30,6 +30,7 @@ from service.intake import history_of, route_of, tracks_of
 from service.planning import Arrival, Planned
 from service.problems import (
     INVALID_FEEDBACK,
+    INVALID_TRACKS,
     INVALID_TRAJECTORY,
     NEEDS_TRACKS,
     UNKNOWN_FORMAT,
@@ -74,7 +75,12 @@ def refining_of(asked: wire_refine.RefineRequest, card: ModelCard) -> Refining:
     world, before = None, None
     tracks = tracks_of(asked.scene)
     if tracks is not None:
-        world = world_ahead(history_of(asked.scene), route_of(asked.scene), tracks)
+        history, route = history_of(asked.scene), route_of(asked.scene)
+        try:
+            world = world_ahead(history, route, tracks)
+        except ScoreError as error:
+            # Of what is checked already, boxes alone can be too small; they are called by their places.
+            raise at(INVALID_TRACKS, f"/scene/tracks/{error.place}", error.detail) from None
         try:
             before = _scores(world, draft[None])
         except (ScoreError, SolveError) as error:

@@ -264,6 +264,11 @@ SECTIONS = dict.fromkeys(SectionsGiven.model_fields, "Brake.")
             "invalid-tracks",
             "/scene/tracks/0",
         ),
+        (
+            {"scene": asked()["scene"] | {"tracks": [TRACK, TRACK | {"width_m": 1e-300}]}},
+            "invalid-tracks",
+            "/scene/tracks/1",
+        ),
     ],
 )
 def test_bad_input_gets_a_problem_that_says_where(
