@@ -8,8 +8,6 @@ the distribution that decodes: over the tokens that the format allows, at the te
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +26,7 @@ from model.training.learner import ResponseLearner
 from model.training.policy import advantages, policy_loss
 from model.training.recipes import OutcomeSettings
 from model.training.rewards import rewards
-from model.training.targets import Target
+from model.training.rollouts import with_draws
 
 _MAX_SEED = 2**31
 
@@ -49,20 +47,6 @@ class ScenePlaces(Dataset[int]):
 def collate_places(places: list[int]) -> dict[str, Tensor]:
     """A batch for `OutcomeLearner`."""
     return {"places": torch.tensor(places)}
-
-
-class _Drawn(NamedTuple):
-    """One response to learn from.
-
-    Attributes:
-        target: its tokens.
-        decisions: those that were drawn.
-        logprobs: of these.
-    """
-
-    target: Target
-    decisions: list[Decision]
-    logprobs: Tensor
 
 
 class OutcomeLearner(nn.Module):
@@ -170,29 +154,23 @@ class OutcomeLearner(nn.Module):
         told = [place for place, each in enumerate(worth) if bool(each.any())]
         if not told:
             return worth.new_zeros(()), worth.new_ones(())
-        drawn = {place: [self._drawn(draw) for draw in draws[place]] for place in told}
-        batch = collate(
-            [replace(samples[place], responses=[each.target for each in drawn[place]]) for place in told]
-        )
-        responses = [each for place in told for each in drawn[place]]
-        now = self.learner.log_probabilities(
-            batch, [each.decisions for each in responses], settings.temperature
-        )
-        found = policy_loss(
-            now, [each.logprobs for each in responses], worth[told].flatten(), clip=settings.clip
-        )
+        batch = collate([with_draws(samples[place], draws[place]) for place in told])
+        responses = [draw for place in told for draw in draws[place]]
+        drawn = [self._drawn(draw) for draw in responses]
+        now = self.learner.log_probabilities(batch, drawn, settings.temperature)
+        before = [
+            torch.tensor([draw.logprobs[each.position] for each in made], dtype=torch.float32)
+            for draw, made in zip(responses, drawn, strict=True)
+        ]
+        found = policy_loss(now, before, worth[told].flatten(), clip=settings.clip)
         return found.loss, found.ratio
 
-    def _drawn(self, draw: Draw) -> _Drawn:
+    def _drawn(self, draw: Draw) -> list[Decision]:
+        """The decisions of a draw that were drawn: all but its trajectory codes."""
         format = self._data.formats[self._task]
         codes = self._loaded.vocabulary.alphabets[TRAJECTORY]
-        made = [
+        return [
             each
             for each in decisions(format.start(), draw.ids)
             if not any(int(each.ids[0]) in stage for stage in codes)
         ]
-        return _Drawn(
-            Target(draw.ids, (0.0,) * len(draw.ids)),
-            made,
-            torch.tensor([draw.logprobs[each.position] for each in made], dtype=torch.float32),
-        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,16 +25,24 @@ def rollout(scene: Scene, format: str, draws: Sequence[Draw], inputs: InputBuild
         ImageError: a picture cannot be decoded.
     """
     built = inputs.build(scene, format)
-    empty = np.zeros((len(draws), 0, 0), np.float32)
-    return Sample(
+    nothing = np.zeros((0, 0, 0), np.float32)
+    prompt = Sample(
         prompt=built.prompt.ids.tolist(),
-        responses=[Target(draw.ids, (1.0,) * len(draw.ids)) for draw in draws],
+        responses=[],
         seen=None,
         patches=built.patches,
         history=built.history,
         route=np.zeros((ROUTE_POINTS, 2), np.float32) if built.route is None else built.route,
         tracks=track_features((), None) if built.tracks is None else built.tracks,
         future=np.zeros((FUTURE_STEPS, 4), np.float32),
-        code_shares=empty,
-        code_errors_m=empty,
+        code_shares=nothing,
+        code_errors_m=nothing,
     )
+    return with_draws(prompt, draws)
+
+
+def with_draws(sample: Sample, draws: Sequence[Draw]) -> Sample:
+    """A prompt with what an engine wrote behind it, instead of its own responses; all tokens weigh 1."""
+    empty = np.zeros((len(draws), 0, 0), np.float32)
+    responses = [Target(draw.ids, (1.0,) * len(draw.ids)) for draw in draws]
+    return replace(sample, responses=responses, code_shares=empty, code_errors_m=empty)
