@@ -40,9 +40,8 @@ from model.formats.pieces import FormatError
 from model.formats.text import parse
 from model.network.checkpoint import Loaded, load
 from model.network.settings import VlaSettings
-from model.training.batches import Item, ResponseDataset, collate
+from model.training.batches import Item, ResponseDataset
 from model.training.examples import Examples
-from model.training.learner import ResponseLearner
 from model.training.targets import make_target
 from service.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
@@ -53,6 +52,7 @@ from tests.model.engines.decoding import decode
 from tests.model.engines.reference import exactly, reference_draws
 from tests.model.evaluation.fakes import draw_of
 from tests.model.training.scenes import training_scene
+from tests.model.training.steps import two_losses
 from tests.service.serving import serve
 
 FORMATS = ("elf_vla", "elf_vla_refine")
@@ -276,17 +276,9 @@ def test_mirrored_examples_teach_what_mirrored_scenes_do(elf: Loaded) -> None:
 def test_a_step_of_training_brings_it_nearer_to_the_expert(checkpoint: Path) -> None:
     loaded = load(checkpoint)
     data = dataset(loaded, [training_scene(1)], WEIGHTS)
-    batch = collate([data[Item(0, "elf_vla", True)]])
-    learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec)
-    optimiser = torch.optim.SGD(learner.parameters(), lr=0.1)
-    losses = []
-    for _ in range(2):
-        optimiser.zero_grad()
-        loss = learner(**batch)["loss"]
-        loss.backward()
-        optimiser.step()
-        losses.append(loss.item())
-    assert losses[1] < losses[0]
+    sample = data[Item(0, "elf_vla", True)]
+    before, after = two_losses(loaded, sample)
+    assert after < before
 
 
 def test_it_plans_over_http_and_is_evaluated(checkpoint: Path) -> None:

@@ -29,9 +29,8 @@ from model.formats.cursor import CompiledFormat
 from model.formats.text import parse
 from model.network.checkpoint import Loaded, load
 from model.network.settings import VlaSettings
-from model.training.batches import Item, ResponseDataset, collate
+from model.training.batches import Item, ResponseDataset
 from model.training.examples import Examples
-from model.training.learner import ResponseLearner
 from model.training.targets import make_target
 from service.metrics import Metrics
 from service.planning import Judged
@@ -45,6 +44,7 @@ from tests.model.engines.decoding import decode
 from tests.model.engines.reference import exactly, reference_draws
 from tests.model.evaluation.fakes import draw_of
 from tests.model.training.scenes import training_scene
+from tests.model.training.steps import two_losses
 from tests.service.serving import serve
 
 
@@ -171,17 +171,9 @@ def test_a_step_of_training_brings_it_nearer_to_the_expert(checkpoint: Path) -> 
     examples = Examples.from_scenes([training_scene(1)], toy.settings.cameras)
     weights = {"mood": 2.0, "speeds": 5.0}
     data = ResponseDataset(examples, toy.codec, toy.inputs, toy.vocabulary, weights, pictures=False)
-    batch = collate([data[Item(0, "toy", True)]])
-    learner = ResponseLearner(toy.model, toy.vocabulary, toy.codec)
-    optimiser = torch.optim.SGD(learner.parameters(), lr=0.1)
-    losses = []
-    for _ in range(2):
-        optimiser.zero_grad()
-        loss = learner(**batch)["loss"]
-        loss.backward()
-        optimiser.step()
-        losses.append(loss.item())
-    assert losses[1] < losses[0]
+    sample = data[Item(0, "toy", True)]
+    before, after = two_losses(toy, sample)
+    assert after < before
 
 
 def test_a_labelled_scene_teaches_it(toy: Loaded) -> None:
