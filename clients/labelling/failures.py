@@ -43,11 +43,10 @@ from model.driving.pdm.scoring import Others, score
 from model.driving.pdm.world import Array, ScoreError
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
-from model.driving.trajectory import TEN_HZ_S
+from model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S
 
 FACTS_VERSION: Final = 1
 """Of scores and facts; raised when the same trajectory comes to be judged otherwise."""
-_COARSE_S: Final = tuple(0.5 * number for number in range(1, 9))
 _DECIMALS: Final = 4
 
 
@@ -311,6 +310,8 @@ def _scored_poses(draw: PlannedDraw) -> Array:
     """A draw's trajectory as it is scored, [8, 3] or [64, 3]; raises `CannotBeDone`."""
     if draw.times_s == TEN_HZ_S:
         return plans_of(draw.trajectory)
-    if len(draw.times_s) >= len(_COARSE_S) and np.allclose(draw.times_s[: len(_COARSE_S)], _COARSE_S):
-        return plans_of(draw.trajectory[: len(_COARSE_S)])
+    if len(draw.times_s) >= len(HALF_SECONDS_S) and np.allclose(
+        draw.times_s[: len(HALF_SECONDS_S)], HALF_SECONDS_S
+    ):
+        return plans_of(draw.trajectory[: len(HALF_SECONDS_S)])
     raise CannotBeDone("the model's trajectory has neither 64 poses at 0.1 s nor 8 at 0.5 s")

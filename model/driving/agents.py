@@ -12,6 +12,8 @@ TRACK_STEPS: Final = HISTORY_STEPS + FUTURE_STEPS
 
 AgentKind = Literal["vehicle", "pedestrian", "cone", "barrier"]
 AGENT_KINDS: Final[tuple[AgentKind, ...]] = ("vehicle", "pedestrian", "cone", "barrier")
+ROAD_USERS: Final[tuple[AgentKind, ...]] = ("vehicle", "pedestrian")
+"""Those that move; all others are obstacles."""
 
 Light = Literal["brake", "left", "right"]
 LIGHTS: Final[tuple[Light, ...]] = ("brake", "left", "right")

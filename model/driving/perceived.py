@@ -18,12 +18,12 @@ from model.driving.pdm.geometry import Boxes, boxes_meet
 from model.driving.reasoning import edge_distances
 from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, LabelledScene
 from model.driving.tracks import track_of
-from model.driving.trajectory import STEP_S, FloatArray, speeds
+from model.driving.trajectory import STEP_S, THREE_SECONDS_S, FloatArray, speeds
 from model.driving.view import visible
 
 MAX_PERCEIVED: Final = 8
 """Agents that are told of, the nearest."""
-SAFE_TIMES_S: Final = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+SAFE_TIMES_S: Final = THREE_SECONDS_S
 """When it is asked who is in the safe zone: the times of the paper's waypoints."""
 SAFE_BESIDE_M: Final = 1.0
 """The safe zone reaches so far beyond the ego's sides and its rear: a vehicle in the next lane is outside."""

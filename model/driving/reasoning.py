@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.agents import Agent
+from model.driving.agents import ROAD_USERS, Agent
 from model.driving.high_level import action_of
 from model.driving.labeller import LANE_MOVING
 from model.driving.lane_graph import LaneGraph, Way
@@ -232,8 +232,7 @@ def _crossing(placed: Iterable[_Placed], way: Way, speed_ms: float) -> Crossing 
     found = [
         crossing
         for each in placed
-        if each.track.kind in ("vehicle", "pedestrian")
-        and (crossing := _crosses(each, way, speed_ms)) is not None
+        if each.track.kind in ROAD_USERS and (crossing := _crosses(each, way, speed_ms)) is not None
     ]
     return min(found, key=lambda each: each[0])[1] if found else None
 

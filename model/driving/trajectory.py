@@ -23,6 +23,10 @@ FUTURE_STEPS: Final = 64
 HORIZON_S: Final = 6.4
 TEN_HZ_S: Final = tuple(round(STEP_S * step, 1) for step in range(1, FUTURE_STEPS + 1))
 """Times of the poses of a trajectory, unless a model family has its own."""
+HALF_SECONDS_S: Final = tuple(0.5 * step for step in range(1, 9))
+"""Times of the eight poses of NAVSIM's plans."""
+THREE_SECONDS_S: Final = HALF_SECONDS_S[:6]
+"""Times of the six waypoints by which open-loop figures on nuScenes are told."""
 MAX_TIME_S: Final = 60.0
 ROUTE_POINTS: Final = 20
 ROUTE_SPACING_M: Final = 4.0

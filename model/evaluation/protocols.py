@@ -42,13 +42,13 @@ from PIL import Image, ImageDraw
 from model.driving.agents import Agent, AgentKind
 from model.driving.metrics import box_corners
 from model.driving.paper_axes import to_paper_axes
-from model.driving.trajectory import STEP_S
+from model.driving.trajectory import STEP_S, THREE_SECONDS_S
 
 Array = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 Protocol = Literal["ST-P3", "UniAD"]
-WAYPOINT_TIMES_S: Final = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+WAYPOINT_TIMES_S: Final = THREE_SECONDS_S
 TOLD_AT_S: Final = (1.0, 2.0, 3.0)
 """Where the protocols tell their figures."""
 _TOLD: Final = tuple(WAYPOINT_TIMES_S.index(time_s) for time_s in TOLD_AT_S)

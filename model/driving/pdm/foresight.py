@@ -10,6 +10,7 @@ from typing import Final, Literal
 
 import numpy as np
 
+from model.driving.agents import ROAD_USERS
 from model.driving.pdm.labelled import EGO, past_states, route_line
 from model.driving.pdm.world import LONG_STEPS, STEP_S, TrackedBox, World
 from model.driving.tracks import Track
@@ -18,7 +19,6 @@ from model.driving.trajectory import FloatArray
 Foresight = Literal["constant_velocity"]
 CONSTANT_VELOCITY: Final[Foresight] = "constant_velocity"
 """How a future is foreseen: all objects go on along their headings, as fast as now."""
-_AGENTS: Final = ("vehicle", "pedestrian")
 
 
 def world_ahead(history: FloatArray, route: FloatArray | None, tracks: Sequence[Track]) -> World:
@@ -49,7 +49,7 @@ def _box(track_id: str, track: Track) -> TrackedBox:
     poses = np.full((LONG_STEPS + 1, 3), track.heading_rad)
     poses[:, 0] = track.x_m + gone_m * np.cos(track.heading_rad)
     poses[:, 1] = track.y_m + gone_m * np.sin(track.heading_rad)
-    is_agent = track.kind in _AGENTS
+    is_agent = track.kind in ROAD_USERS
     return TrackedBox(
         track_id, is_agent, track.length_m, track.width_m, poses, abs(track.speed_ms), track.kind
     )

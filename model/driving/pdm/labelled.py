@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.agents import Agent
+from model.driving.agents import ROAD_USERS, Agent
 from model.driving.lane_map import LaneArea
 from model.driving.pdm.simulator import reference_poses, simulate
 from model.driving.pdm.world import (
@@ -128,7 +128,7 @@ def _ahead(agent: Agent) -> FloatArray:
 
 def _track(agent: Agent) -> TrackedBox:
     poses = _ahead(agent).astype(np.float64)
-    is_agent = agent.kind in ("vehicle", "pedestrian")
+    is_agent = agent.kind in ROAD_USERS
     return TrackedBox(
         str(agent.agent_id),
         is_agent,

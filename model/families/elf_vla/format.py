@@ -9,7 +9,7 @@ import numpy as np
 
 from model.driving import sentences
 from model.driving.sentences import END, SPACE, ThoughtError, Word, Words, decisions, joined
-from model.driving.trajectory import FloatArray, wrap_angle
+from model.driving.trajectory import HALF_SECONDS_S, FloatArray, wrap_angle
 from model.formats.compounds import DIGITS, Number, Repeat
 from model.formats.pieces import (
     Choice,
@@ -29,8 +29,7 @@ from model.formats.pieces import (
 THINK: Final = "think"
 ANSWER: Final = "answer"
 
-TIMES_S: Final = tuple(0.5 * step for step in range(1, 9))
-"""NAVSIM's: eight poses within 4 s."""
+TIMES_S: Final = HALF_SECONDS_S
 MAX_THINK_TOKENS: Final = 320
 """Of free text; the sentences of `model.driving.sentences` are shorter."""
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from model.driving.agents import AGENT_KINDS
 from model.driving.paper_axes import from_paper_axes, to_paper_axes
 from model.driving.scene import CAMERAS
-from model.driving.trajectory import FloatArray
+from model.driving.trajectory import THREE_SECONDS_S, FloatArray
 from model.formats.compounds import Number, Repeat
 from model.formats.pieces import (
     Choice,
@@ -42,7 +42,7 @@ THINK: Final = "think"
 ACTION: Final = "action"
 ANSWER: Final = "answer"
 
-TIMES_S: Final = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+TIMES_S: Final = THREE_SECONDS_S
 MAX_OBJECTS: Final = 8
 MAX_NOTABLE: Final = 4
 VISUAL_ALPHABET: Final = "visual"
