@@ -21,7 +21,14 @@ from model.driving.pdm.profiles import SolveError
 from model.driving.pdm.rule_teacher import NAME
 from model.driving.pdm.scoring import Others, Scores, score
 from model.driving.pdm.world import STEP_S, STEPS, ScoreError, World
-from model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, at_times, check_trajectory
+from model.driving.trajectory import (
+    HALF_SECONDS_S,
+    TEN_HZ_S,
+    FloatArray,
+    GeometryError,
+    at_times,
+    check_trajectory,
+)
 from model.engines.engine import Draw, ModelCard
 from model.families.registry import family_named
 from service.answers import plan_answer
@@ -41,7 +48,6 @@ from service.scoring import answer as score_answer
 
 VERSION: Final[Version] = "v1.1"
 """PDMS, which the paper judges by."""
-HALF_SECONDS_S: Final = tuple(round(0.5 * step, 1) for step in range(1, 9))
 _TIMES_S: Final = {len(times_s): times_s for times_s in (HALF_SECONDS_S, TEN_HZ_S)}
 _POINTER: Final = "/draft"
 
@@ -51,12 +57,14 @@ class Refining:
     """A draft that is to be refined.
 
     Attributes:
+        format: that refines it.
         planning: what the engine is asked.
         feedback: what it is told of the draft.
         world: that plans are scored in; None where nothing around is known.
         before: the draft's scores in it.
     """
 
+    format: str
     planning: wire.PlanRequest
     feedback: wire_refine.DraftFeedback
     world: World | None
@@ -99,7 +107,7 @@ def refining_of(asked: wire_refine.RefineRequest, card: ModelCard) -> Refining:
             feedback=feedback.text,
         ),
     )
-    return Refining(planning, feedback, world, before)
+    return Refining(format, planning, feedback, world, before)
 
 
 def refining_format(card: ModelCard) -> str:
@@ -130,7 +138,7 @@ def refine_answer(refining: Refining, planned: Planned, arrival: Arrival) -> wir
     return wire_refine.RefineResponse(
         request_id=answer.request_id,
         model=answer.model,
-        format=refining.planning.format or "",
+        format=refining.format,
         feedback=refining.feedback,
         foresight=None if refining.world is None else CONSTANT_VELOCITY,
         version=VERSION,
