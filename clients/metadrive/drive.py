@@ -21,17 +21,13 @@ from clients.metadrive.tracking import FreeVehicle, world_trajectory
 from clients.metadrive.tracks import tracks_at
 from clients.metadrive.windows import PICTURE_STEPS, history_at
 from model.driving.cameras import FRONT_CAMERAS, CameraSpec
-from model.driving.images import encode_jpeg
-from model.driving.scene import CLIP_FRAMES, Clip, Scene
+from model.driving.scene import CLIP_FRAMES, NO_PICTURE, Clip, Scene
 
 TAKE_OVER: Final = PICTURE_STEPS * (CLIP_FRAMES - 1)
 """The expert drives so many steps, until there are clips and a history."""
 EXPERT: Final = "expert"
 LOST_STEPS: Final = 20
 """Off the road for two seconds, an episode ends."""
-
-BLANK: Final = encode_jpeg(np.zeros((14, 28, 3), np.uint8))
-"""The picture that is given to pilots who do not look: rendering is what takes the time."""
 
 Ended = Literal["time", "route_end", "collision", "off_road"]
 
@@ -113,16 +109,18 @@ def drive(
     config: DriveConfig = DriveConfig(),
     on_shot: Callable[[Shot], None] | None = None,
     on_plan: Callable[[World, Scene], None] | None = None,
+    look: bool = False,
 ) -> Drive:
     """Drive one episode; the world around is the same for every driver until it has to react to it.
 
     Args:
         seed: of the episode.
         pilot: who plans; None for the expert.
-        rig: of cameras; None where nobody looks.
+        rig: of cameras; None where nobody looks. Rendering is what takes the time.
         config: see there.
         on_shot: told every moment with pictures.
         on_plan: told every moment at which the pilot plans, and what it sees then.
+        look: take pictures although the pilot does without.
 
     Raises:
         MapError: no map fits the seed.
@@ -130,7 +128,7 @@ def drive(
     """
     world = make_world(seed, config.duration_s)
     stage = None
-    if on_shot is not None or (pilot is not None and pilot.needs_pictures):
+    if look or on_shot is not None or (pilot is not None and pilot.needs_pictures):
         if rig is None:
             raise ValueError("pictures are wanted, and there is no rig to take them")
         stage = Stage(world.live, rig)
@@ -194,7 +192,7 @@ def _scene(world: World, step: int, shots: dict[int, list[Picture]], cameras: Se
     """What the car sees now; nothing of the world but through its cameras, its motion and its way."""
     times = [step - PICTURE_STEPS * k for k in reversed(range(CLIP_FRAMES))]
     clips = tuple(
-        Clip(spec.name, tuple(shots[at][index].jpeg if shots else BLANK for at in times))
+        Clip(spec.name, tuple(shots[at][index].jpeg if shots else NO_PICTURE for at in times))
         for index, spec in enumerate(cameras)
     )
     log = world.live

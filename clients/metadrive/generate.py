@@ -23,16 +23,14 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from clients import wire
 from clients.metadrive import simulator
 from clients.metadrive.drive import DriveConfig
 from clients.metadrive.episode import run_episode
 from clients.metadrive.maps import MapError
 from clients.metadrive.own_states import own_states
-from clients.metadrive.pilots import ServicePilot
+from clients.metadrive.pilots import Pilot
 from clients.metadrive.rig import Rig
 from clients.metadrive.windows import labelled_scenes, window_steps
-from clients.planner import Access, Patience, PlannerClient
 from model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS
 from model.driving.scene import LabelledScene, split_of_seed
 from model.driving.scene_store import SCENE_VERSION, write_scenes
@@ -63,6 +61,8 @@ class GenerateConfig:
         driver: name and revision of the model that drives; scenes are then of its own states, with what the
             expert would do from there (`own_states`). None for the expert.
         tracks: whether that model is told the tracks of the objects around.
+        pictures: whether scenes have any; without, they are made many times as fast, for planners that read
+            tracks. Only scenes of a model's own states can lack them.
     """
 
     stride_s: float = 0.5
@@ -75,6 +75,7 @@ class GenerateConfig:
     width_px: int = 224
     driver: str | None = None
     tracks: bool = False
+    pictures: bool = True
 
     def __post_init__(self) -> None:
         if self.driver is not None and (self.dense or self.surround or self.drifts or self.lapses):
@@ -82,6 +83,8 @@ class GenerateConfig:
                 "scenes of a model's own drives have no dense targets and no surround cameras, "
                 "and its expert neither drifts nor lapses"
             )
+        if self.driver is None and not self.pictures:
+            raise GenerationError("only scenes of a model's own drives can do without pictures")
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ def generate(
     workers: int = 2,
     config: GenerateConfig | None = None,
     console: Console | None = None,
-    service: str | None = None,
+    pilot: Callable[[], Pilot] | None = None,
 ) -> GenerateReport:
     """Generate the scenes of ``seeds`` into ``out_dir``; blocks that are there already are left alone.
 
@@ -123,7 +126,7 @@ def generate(
         workers: processes.
         config: what to generate.
         console: of the progress bar.
-        service: URL of the model that drives, where the config names one.
+        pilot: makes the model that drives, where the config names one; called in every worker process.
 
     Raises:
         SimulatorMissing: MetaDrive is not installed.
@@ -144,7 +147,7 @@ def generate(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
         task = progress.add_task(out_dir.name, total=len(blocks), completed=report.blocks_resumed)
-        for _ in _run_blocks(out_dir, missing, workers, config, service):
+        for _ in _run_blocks(out_dir, missing, workers, config, pilot):
             report.blocks_written += 1
             progress.advance(task)
             write_manifest(out_dir, config)
@@ -171,7 +174,11 @@ def _check_config(out_dir: Path, config: GenerateConfig) -> None:
 
 
 def _run_blocks(
-    out_dir: Path, blocks: Sequence[range], workers: int, config: GenerateConfig, service: str | None
+    out_dir: Path,
+    blocks: Sequence[range],
+    workers: int,
+    config: GenerateConfig,
+    pilot: Callable[[], Pilot] | None,
 ) -> Iterator[range]:
     """Run every block in a process of its own, ``workers`` at a time; a dead worker's is tried again."""
     context = multiprocessing.get_context("spawn")
@@ -181,7 +188,7 @@ def _run_blocks(
         while waiting or running:
             while waiting and len(running) < workers:
                 block, attempt = waiting.pop(0)
-                arguments = (out_dir, block, config, service)
+                arguments = (out_dir, block, config, pilot)
                 process = context.Process(target=write_block, args=arguments, daemon=True)
                 process.start()
                 running[process] = (block, attempt)
@@ -204,13 +211,15 @@ def _run_blocks(
             process.join()
 
 
-def write_block(out_dir: Path, seeds: range, config: GenerateConfig, service: str | None = None) -> None:
+def write_block(
+    out_dir: Path, seeds: range, config: GenerateConfig, pilot: Callable[[], Pilot] | None = None
+) -> None:
     """Generate one block in this process and put its file in place."""
     cameras = FRONT_CAMERAS + (SURROUND_CAMERAS if config.surround else ())
     rig = Rig(tuple(camera.resized(config.width_px) for camera in cameras))
     scenes: list[LabelledScene] = []
     outcomes: list[EpisodeOutcome] = []
-    run = run_seed if service is None else _driven_by(service, config)
+    run = run_seed if pilot is None else _driven_by(pilot())
     for seed in seeds:
         made, outcome = run(seed, rig, config)
         scenes += made
@@ -236,18 +245,16 @@ def run_seed(seed: int, rig: Rig, config: GenerateConfig) -> tuple[list[Labelled
 
 
 def _driven_by(
-    service: str, config: GenerateConfig
+    pilot: Pilot,
 ) -> Callable[[int, Rig, GenerateConfig], tuple[list[LabelledScene], EpisodeOutcome]]:
-    """What takes the place of `run_seed` where a served model drives."""
-    # Without second looks: those are taught by what comes of first plans.
-    planner = PlannerClient(service, Patience(timeout_s=120.0), access=Access.from_environment())
-    pilot = ServicePilot(planner, "never", wire.Controls(n=6, thinking="never"), tracks=config.tracks)
+    """What takes the place of `run_seed` where a model drives."""
 
     def run(seed: int, rig: Rig, config: GenerateConfig) -> tuple[list[LabelledScene], EpisodeOutcome]:
         started = time.monotonic()
         every = max(1, round(config.stride_s / DriveConfig().replan_s))
         try:
-            made, drove = own_states(seed, pilot, rig, DriveConfig(config.duration_s), every)
+            looking = rig if config.pictures else None
+            made, drove = own_states(seed, pilot, looking, DriveConfig(config.duration_s), every)
         except (MapError, shapely.errors.GEOSException) as error:
             return [], EpisodeOutcome(seed, type(error).__name__, "", 0, 0, time.monotonic() - started)
         dropped = drove.plans // every - len(made)

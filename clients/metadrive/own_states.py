@@ -26,7 +26,7 @@ def own_states(
     Args:
         seed: of the episode.
         pilot: that drives.
-        rig: of its cameras; None for one without eyes, whose scenes have blank pictures.
+        rig: of the cameras; None for a pilot that does without, whose scenes then have no pictures.
         config: see there.
         every: so many plans lie between two scenes.
 
@@ -57,5 +57,5 @@ def own_states(
         if labelled is not None:
             states.append(labelled)
 
-    drove = drive(seed, pilot, rig, config, on_plan=label)
+    drove = drive(seed, pilot, rig, config, on_plan=label, look=rig is not None)
     return states, drove

@@ -64,6 +64,12 @@ SEMANTIC_CLASSES: Final[tuple[SemanticClass, ...]] = (
 )
 """What a pixel of a dense target shows; the position in this tuple is the stored value."""
 
+NO_PICTURE: Final = bytes.fromhex(
+    "89504e470d0a1a0a0000000d494844520000000100000001080000000"
+    "03a7e9b550000000a49444154789c636000000002000148afa4710000000049454e44ae426082"
+)
+"""A PNG of one black pixel, in clips of cameras that nobody looked through."""
+
 EGO_LENGTH_M: Final = 4.51
 EGO_WIDTH_M: Final = 1.85
 
@@ -124,6 +130,11 @@ class Scene:
     def pictures(self) -> tuple[bytes, ...]:
         """Those of all clips, encoded as they are."""
         return tuple(image for clip in self.clips for image in clip.images)
+
+    @property
+    def has_pictures(self) -> bool:
+        """Whether somebody looked: not every picture is `NO_PICTURE`."""
+        return any(picture != NO_PICTURE for picture in self.pictures)
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,6 +51,7 @@ class Item:
         tracks: whether it has its tracks.
         mirror: left and right are swapped.
         blur: of the history only the present speed is left.
+        pictures: whether the prompt has the example's pictures, where any prompt has.
         reflections: places of reflections on it, whose responses all follow the same prompt; without any,
             the response is the expert's own.
     """
@@ -62,6 +63,7 @@ class Item:
     tracks: bool = False
     mirror: bool = False
     blur: bool = False
+    pictures: bool = True
 
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
@@ -147,7 +149,7 @@ class ResponseDataset(Dataset[Sample]):
         return len(self._examples)
 
     def __getitem__(self, item: Item) -> Sample:
-        examples, index = self._examples, item.index
+        examples, index, pictures = self._examples, item.index, self._pictures and item.pictures
         history, future = examples.history[index], examples.future[index]
         route, tracks = np.nan_to_num(examples.route[index]), examples.tracks[index]
         plan, thoughts = examples.plan(index), examples.thought(index)
@@ -174,8 +176,8 @@ class ResponseDataset(Dataset[Sample]):
         return Sample(
             prompt=self._prompt(item, Situation(history, route if item.route else None)),
             responses=[self._target(item.task, lesson) for lesson in lessons],
-            seen=self._vision.tokens(index, item.mirror) if self._vision is not None else None,
-            patches=self._patches(item) if self._pictures and self._vision is None else None,
+            seen=self._vision.tokens(index, item.mirror) if pictures and self._vision is not None else None,
+            patches=self._patches(item) if pictures and self._vision is None else None,
             history=history,
             route=route,
             tracks=tracks,
@@ -188,7 +190,7 @@ class ResponseDataset(Dataset[Sample]):
         return make_target(self._families[task], self.formats[task], lesson, self._weights)
 
     def _prompt(self, item: Item, situation: Situation) -> list[int]:
-        if self._pictures:
+        if self._pictures and item.pictures:
             prompt = self._inputs.prompt(item.task, situation, tracks=item.tracks)
             return cast("list[int]", prompt.ids.tolist())
         # Without pictures nothing but speed counts, and a trajectory's whole example has thirty tokens.
@@ -211,6 +213,8 @@ def steady_history(speed_ms: float) -> Array:
 class TaskSampler(BatchSampler):
     """Epochs of batches; a batch has one task, with or without route, so little is padded.
 
+    Examples without pictures are always given their tracks: else there would be nothing to go by.
+
     Reflections are examples of their own beside all others: the natural mixture of CF-VLA section 6. Those
     on one scene share its prompt, and scenes with about as many share a batch.
 
@@ -221,6 +225,7 @@ class TaskSampler(BatchSampler):
         route_share: share of the examples, among those that have one, that are given their route.
         tracks_share, mirror_share, blur_share: shares of the examples that are given their tracks, mirrored,
             and given no history but the present speed; see `Item`.
+        pictured: bool [m], which examples have pictures; all by default.
         mirror_reflected: whether reflections are mirrored too: those in phrases can be.
         seed: of the order; every epoch has another one.
         processes: so many batches in a row are alike, as those who share the work wait for the slowest.
@@ -245,8 +250,10 @@ class TaskSampler(BatchSampler):
         tracks_share: float = 0.0,
         mirror_share: float = 0.0,
         blur_share: float = 0.0,
+        pictured: npt.NDArray[np.bool_] | None = None,
         mirror_reflected: bool = False,
     ) -> None:
+        self._pictured = np.ones(len(has_route), np.bool_) if pictured is None else pictured
         self._mirror_reflected = mirror_reflected
         self._shares = {"tracks": tracks_share, "mirror": mirror_share, "blur": blur_share}
         self._processes, self._has_route, self._tasks = processes, has_route, tasks
@@ -296,9 +303,10 @@ class TaskSampler(BatchSampler):
                 int(example[place]),
                 names[drawn[place]] if place < count else self._reflecting,
                 bool(given[place]),
-                tracks=bool(tracks[place]),
+                tracks=bool(tracks[place] or not self._pictured[example[place]]),
                 mirror=bool(mirror[place]),
                 blur=bool(blur[place]),
+                pictures=bool(self._pictured[example[place]]),
             )
             for place in random.permutation(len(example))
         ]
@@ -317,6 +325,7 @@ class TaskSampler(BatchSampler):
                 tracks=bool(tracks[place]),
                 mirror=bool(mirror[place]),
                 blur=bool(blur[place]),
+                pictures=bool(self._pictured[index]),
             )
             for place in random.permutation(len(example))
             for index in [int(example[place])]
@@ -334,15 +343,19 @@ class TaskSampler(BatchSampler):
     def _rounds(self, items: list[Item], size: int) -> tuple[list[list[list[Item]]], list[list[Item]]]:
         """Batches of like items, as many in a round as there are processes; and batches of the rest."""
         rounds: list[list[list[Item]]] = []
-        buckets: dict[tuple[str, bool, bool, int], list[Item]] = {}
+        buckets: dict[tuple[str, bool, bool, bool, int], list[Item]] = {}
         for item in items:
-            key = (item.task, item.route, item.tracks, len(item.reflections))
+            key = (item.task, item.route, item.tracks, item.pictures, len(item.reflections))
             bucket = buckets.setdefault(key, [])
             bucket.append(item)
             if len(bucket) == size * self._processes:
                 rounds.append(_split(buckets.pop(key), size))
-        rest = [item for key in sorted(buckets) for item in buckets[key]]
-        return rounds, _split(rest, size)[: len(rest) // size]
+        rest: list[list[Item]] = []
+        # Prompts of any kind can share a batch, but not those with pictures and those without.
+        for pictures in (False, True):
+            left = [item for key in sorted(buckets) for item in buckets[key] if item.pictures == pictures]
+            rest += _split(left, size)[: len(left) // size]
+        return rounds, rest
 
 
 def _split(items: list[Item], size: int) -> list[list[Item]]:

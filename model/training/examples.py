@@ -21,7 +21,7 @@ from model.driving.labeller import expert_plan
 from model.driving.perceived import ROW_SIZE, Perceived, perceived_of, perceived_of_row
 from model.driving.plan import Plan, plan_from_bins
 from model.driving.reasoning import thoughts_of
-from model.driving.scene import CLIP_FRAMES, LabelledScene
+from model.driving.scene import CLIP_FRAMES, NO_PICTURE, LabelledScene
 from model.driving.scene_store import read_scenes, scene_files
 from model.driving.thoughts import Thoughts, read_thoughts
 from model.driving.tracks import tracks_of
@@ -83,6 +83,14 @@ class Examples:
         """One encoded picture."""
         first, last = self.picture_spans[index, camera, frame]
         return self.pictures[first:last].tobytes()
+
+    @property
+    def pictured(self) -> npt.NDArray[np.bool_]:
+        """bool [N]: which examples have pictures; those of drives without cameras have none."""
+        spans = self.picture_spans.reshape(len(self), -1, 2)
+        alike = np.asarray((spans == spans[:, :1]).all(axis=(1, 2)))
+        alike[alike] = [self.picture(int(index), 0, 0) == NO_PICTURE for index in np.flatnonzero(alike)]
+        return ~alike
 
     def thought(self, index: int) -> Thoughts | None:
         """The expert's thoughts; None where they are not known."""

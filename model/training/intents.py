@@ -19,6 +19,7 @@ from torch.utils.data import Dataset
 
 from model.driving.facts import FACTS, mirrored
 from model.driving.plan import GROUPS, TICKS, WORDS
+from model.driving.trajectory import FloatArray
 from model.network.codec import TrajectoryCodec
 from model.network.fact_reader import likely
 from model.network.intent import IntentTrunk, present_speeds
@@ -27,6 +28,7 @@ from model.network.trajectory_head import TrajectoryHead
 from model.network.vla import LookTwiceVla
 from model.training.examples import Examples
 from model.training.grounding import fact_loss, fact_weights
+from model.training.misread import misread
 from model.training.vision_cache import VisionCache
 
 Source = Literal["tracks", "scene"]
@@ -39,7 +41,7 @@ _MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
 
 
 class IntentSample(NamedTuple):
-    """One scene; shapes as in `Examples`, for one example."""
+    """One scene; shapes as in `Examples`, for one example; ``read`` [facts], or empty without pictures."""
 
     history: npt.NDArray[np.float32]
     route: npt.NDArray[np.float32]
@@ -48,7 +50,7 @@ class IntentSample(NamedTuple):
     futures: npt.NDArray[np.float32]
     plan_bins: npt.NDArray[np.int8]
     facts: npt.NDArray[np.float32]
-    seen: npt.NDArray[np.float16]
+    read: npt.NDArray[np.float32]
 
 
 class IntentDataset(Dataset[IntentSample]):
@@ -56,18 +58,18 @@ class IntentDataset(Dataset[IntentSample]):
 
     Args:
         examples: to learn from.
-        vision: what a frozen tower sees in them and in their mirror images; None to learn from tracks alone.
+        read: [N, mirrored or not, route or none, facts] of `read_facts`; None to learn from tracks alone.
         route_share: share that is given its route.
         seed: of what is left to chance.
     """
 
     def __init__(
-        self, examples: Examples, vision: VisionCache | None, route_share: float, seed: int = 0
+        self, examples: Examples, read: FloatArray | None, route_share: float, seed: int = 0
     ) -> None:
-        self._examples, self._vision, self._route_share = examples, vision, route_share
+        self._examples, self._read, self._route_share = examples, read, route_share
         self._random = np.random.default_rng(seed)
         self._mirrored_bins = np.stack([examples.plan(i).mirrored().bins() for i in range(len(examples))])
-        self._nothing = np.zeros((0, 0), np.float16)
+        self._nothing = np.zeros(0, np.float32)
 
     def __len__(self) -> int:
         return len(self._examples)
@@ -89,8 +91,50 @@ class IntentDataset(Dataset[IntentSample]):
             history, future, way = history * _MIRROR, future * _MIRROR, way * _MIRROR[:2]
             tracks[:, MIRRORED] *= -1
             bins, facts = self._mirrored_bins[index], mirrored(facts)
-        seen = self._nothing if self._vision is None else self._vision.tokens(index, mirror)
-        return IntentSample(history, way, np.array(has_route), tracks, future, bins, facts, seen)
+        read = self._nothing if self._read is None else self._read[index, int(mirror), int(has_route)]
+        return IntentSample(history, way, np.array(has_route), tracks, future, bins, facts, read)
+
+
+@torch.inference_mode()
+def read_facts(vla: LookTwiceVla, examples: Examples, vision: VisionCache, seed: int = 0) -> FloatArray:
+    """What is read from pictures of examples, float32 [N, plain and mirrored, without and with route, facts].
+
+    Examples without pictures are `misread` as those with pictures are. Without mirror images in ``vision``
+    only the examples themselves are read, [N, 1, 2, facts].
+
+    Args:
+        vla: whose resampler reads.
+        examples: to read.
+        vision: what its tower sees in them.
+        seed: of the errors in examples without pictures.
+    """
+    assert vla.resampler is not None
+    sides = 1 + vision.mirrored
+    read = np.empty((len(examples), sides, 2, len(FACTS)), np.float32)
+    pictured, random = examples.pictured, np.random.default_rng(seed)
+    with_pictures = np.flatnonzero(pictured)
+    for side in range(sides):
+        truth = mirrored(examples.facts) if side else examples.facts
+        flip = _MIRROR if side else np.ones(4, np.float32)
+        history, route = examples.history * flip, np.nan_to_num(examples.route) * flip[:2]
+        for has_route in range(2):
+            for start in range(0, len(with_pictures), _BATCH):
+                places = with_pictures[start : start + _BATCH]
+                seen = np.stack([vision.tokens(int(place), bool(side)) for place in places])
+                known = np.isfinite(examples.route[places]).all(axis=(1, 2)) & bool(has_route)
+                gathered = vla.resampler.gather(
+                    torch.from_numpy(seen).float(),
+                    torch.from_numpy(history[places]),
+                    torch.from_numpy(route[places]),
+                    torch.from_numpy(known),
+                )
+                read[places, side, has_route] = likely(vla.resampler.facts(gathered)).numpy()
+            if not pictured.all():
+                there = read[with_pictures, side, has_route]
+                read[~pictured, side, has_route] = misread(
+                    truth[~pictured], truth[with_pictures], there, random
+                )
+    return read
 
 
 def collate_intents(samples: list[IntentSample]) -> dict[str, Tensor]:
@@ -99,14 +143,12 @@ def collate_intents(samples: list[IntentSample]) -> dict[str, Tensor]:
     return {name: torch.from_numpy(np.stack(values)) for name, values in columns.items()}
 
 
-def read_errors(
-    learner: IntentLearner, examples: Examples, vision: VisionCache | None
-) -> Mapping[str, float]:
+def read_errors(learner: IntentLearner, examples: Examples, read: FloatArray | None) -> Mapping[str, float]:
     """How well a source is read in held-out scenes: ``plan_ade_m`` and losses, with and without the route.
 
     The learner is put into evaluation mode meanwhile. Scenes without a route count in both.
     """
-    data = IntentDataset(examples, vision, route_share=1.0)
+    data = IntentDataset(examples, read, route_share=1.0)
     was_training = learner.training
     learner.eval()
     figures: dict[str, float] = {}
@@ -142,8 +184,6 @@ class IntentLearner(nn.Module):
         if part is None:
             raise ValueError(f"this checkpoint reads no {source}")
         self._source = source
-        # Kept out of the registered modules: only the part that learns is trained and saved with the state.
-        self._vla: list[LookTwiceVla] = [vla]
         self.part = part
         width = IntentTrunk.width
         self.trajectory = TrajectoryHead(width, codec)
@@ -162,13 +202,14 @@ class IntentLearner(nn.Module):
         futures: Tensor,
         plan_bins: Tensor,
         facts: Tensor,
-        seen: Tensor,
+        read: Tensor,
     ) -> dict[str, Tensor]:
         """The loss of a batch from `collate_intents`, and its parts without gradients."""
         for layer in self.part.trunk.layers:
             if isinstance(layer, nn.Dropout):
                 layer.p = _DROPOUT if self.training else 0.0
-        state = self._state(history, route, has_route, tracks, seen).float()
+        around = tracks if self._source == "tracks" else read
+        state = self.part.state(around, history, route, has_route).float()
         planned = self.trajectory.loss(self.trajectory(state), present_speeds(history), futures)
         words = self._word_loss(state, plan_bins.long())
         of_facts = fact_loss(self.facts(state), facts, self.fact_weights)
@@ -179,20 +220,6 @@ class IntentLearner(nn.Module):
             "word_loss": words.detach(),
             "fact_loss": of_facts.detach(),
         }
-
-    def _state(
-        self, history: Tensor, route: Tensor, has_route: Tensor, tracks: Tensor, seen: Tensor
-    ) -> Tensor:
-        vla = self._vla[0]
-        if self._source == "tracks":
-            assert vla.track_reader is not None
-            return vla.track_reader.state(tracks, history, route, has_route)
-        assert vla.resampler is not None
-        with torch.no_grad():
-            gathered = vla.resampler.gather(seen.float(), history, route, has_route)
-            facts = likely(vla.resampler.facts(gathered))
-        state: Tensor = vla.resampler.intent.state(facts, history, route, has_route)
-        return state
 
     def _word_loss(self, state: Tensor, plan_bins: Tensor) -> Tensor:
         """Nats a bin of plans int64 [b, 3, 64]; bins of absent groups count nothing."""

@@ -32,16 +32,16 @@ _MAX_SEED = 2**31
 
 
 class ScenePlaces(Dataset[int]):
-    """The places of all examples; what is asked of them is left to `OutcomeLearner`."""
+    """The places of examples to learn from; what is asked of them is left to `OutcomeLearner`."""
 
-    def __init__(self, count: int) -> None:
-        self._count = count
+    def __init__(self, places: Sequence[int]) -> None:
+        self._places = places
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._places)
 
     def __getitem__(self, index: int) -> int:
-        return index
+        return self._places[index]
 
 
 def collate_places(places: list[int]) -> dict[str, Tensor]:

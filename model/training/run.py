@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, Subset
 
 from model.driving.reflection_store import read_reflections
 from model.driving.scene import LabelledScene
@@ -29,7 +29,14 @@ from model.training.batches import ResponseDataset, TaskSampler, collate
 from model.training.dense import DENSE_SHAPE
 from model.training.examples import Examples, load_examples
 from model.training.grounding import GroundingDataset, GroundingLearner, collate_grounding
-from model.training.intents import IntentDataset, IntentLearner, Source, collate_intents, read_errors
+from model.training.intents import (
+    IntentDataset,
+    IntentLearner,
+    Source,
+    collate_intents,
+    read_errors,
+    read_facts,
+)
 from model.training.learner import ResponseLearner
 from model.training.outcomes import OutcomeLearner, ScenePlaces, collate_places
 from model.training.recipes import Recipe
@@ -125,8 +132,11 @@ def run(
     learner, dataset, sampler, collator = _prepare(recipe, loaded, scenes, examples, on_examples, settings)
     if isinstance(learner, IntentLearner) and validation:
         held_out = Examples.from_scenes(validation, loaded.settings.cameras)
-        seen = open_vision(loaded, held_out, settings.cache, mirrored=False) if recipe.pictures else None
-        validate = partial(read_errors, learner, held_out, seen)
+        held_out_read = None
+        if recipe.pictures:
+            seen = open_vision(loaded, held_out, settings.cache, mirrored=False)
+            held_out_read = read_facts(loaded.model, held_out, seen)
+        validate = partial(read_errors, learner, held_out, held_out_read)
     trainer = LearnerTrainer(
         learner,
         recipe,
@@ -186,18 +196,19 @@ def _prepare(
     on_examples: OnExamples | None,
     settings: RunSettings,
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
+    pictured = np.flatnonzero(examples.pictured).tolist()
     if recipe.goal == "ground":
         grounding = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE)
         looked_at = GroundingDataset(examples, loaded.inputs, recipe.seed)
-        return grounding, looked_at, None, collate_grounding
+        return grounding, Subset(looked_at, pictured), None, collate_grounding
     vision = None
     if recipe.pictures and recipe.vision_rate == 0:
         vision = open_vision(loaded, examples, settings.cache, mirrored=recipe.mirror_share > 0)
     if recipe.goal == "read":
         source: Source = "scene" if recipe.pictures else "tracks"
         reading = IntentLearner(loaded.model, loaded.codec, source)
-        read = IntentDataset(examples, vision, recipe.route_share, recipe.seed)
-        return reading, read, None, collate_intents
+        read = None if vision is None else read_facts(loaded.model, examples, vision, recipe.seed)
+        return reading, IntentDataset(examples, read, recipe.route_share, recipe.seed), None, collate_intents
     responses = ResponseDataset(
         examples,
         loaded.codec,
@@ -233,7 +244,7 @@ def _prepare(
             route_share=recipe.route_share,
             tracks_share=recipe.tracks_share if loaded.settings.with_tracks else 0.0,
         )
-        return judging, ScenePlaces(len(examples)), None, collate_places
+        return judging, ScenePlaces(pictured), None, collate_places
     has_route = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
     sampler = TaskSampler(
         has_route,
@@ -248,6 +259,7 @@ def _prepare(
         tracks_share=recipe.tracks_share if loaded.settings.with_tracks else 0.0,
         mirror_share=recipe.mirror_share,
         blur_share=recipe.blur_share,
+        pictured=examples.pictured,
         mirror_reflected=loaded.settings.reflection == "phrases",
     )
     return learner, responses, sampler, collate

@@ -62,6 +62,8 @@ def open_vision(
 ) -> VisionCache:
     """The tokens that ``loaded``'s tower gives for examples; worked out where they are not there yet.
 
+    Examples without pictures have none: their tokens are empty.
+
     Args:
         loaded: whose tower it is.
         examples: to look at.
@@ -69,11 +71,15 @@ def open_vision(
         mirrored: look at mirror images too.
         on_done: told how many of how many episodes are done, whenever one is.
     """
-    tower = _tower(loaded)
-    ends = [*np.flatnonzero(np.diff(examples.episode)) + 1, len(examples)]
+    tower, pictured = _tower(loaded), examples.pictured
+    changes = np.diff(examples.episode) | np.diff(pictured)
+    ends = [*np.flatnonzero(changes) + 1, len(examples)]
     episodes = [range(start, end) for start, end in zip([0, *ends], ends, strict=False)]
     parts: list[Tokens] = []
     for number, places in enumerate(episodes, start=1):
+        if not pictured[places.start]:
+            parts.append(np.zeros((1 + mirrored, len(places), 0, 0), np.float16))
+            continue
         path = folder / f"vision-{_key(tower, examples, places, mirrored=mirrored)}.npy"
         if not path.exists():
             seen = [_look(loaded, examples, places, mirror) for mirror in (False, True)[: 1 + mirrored]]

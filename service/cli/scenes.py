@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +16,7 @@ from service.cli.options import DEFAULT_SCENES, Json, told
 if TYPE_CHECKING:
     from clients.importers.recording import Recording
     from clients.importers.views import Source
+    from clients.metadrive.pilots import Pilot
     from model.driving.cameras import CameraSpec
     from model.driving.scene import LabelledScene
 
@@ -48,12 +50,21 @@ def generate(
             "itself, with what the expert would do from there. Needs --no-dense."
         ),
     ] = None,
+    small: Annotated[
+        Path | None,
+        typer.Option(help="Folder of a small planner (`train teacher`) that drives; else as --service."),
+    ] = None,
     tracks: Annotated[bool, typer.Option(help="Tell that model the tracks of the objects around.")] = False,
+    pictures: Annotated[
+        bool,
+        typer.Option(help="Without, --small makes scenes in no time; readers of tracks learn from them."),
+    ] = True,
 ) -> None:
     """Drive episodes in MetaDrive and store their scenes; run again after a kill, it resumes."""
     with told():
         from clients.metadrive.generate import GenerateConfig, generate
 
+        driver, pilot = _driver(service, small, tracks=tracks, pictures=pictures)
         config = GenerateConfig(
             stride_s=stride,
             surround=surround,
@@ -61,19 +72,44 @@ def generate(
             drifts=drifts,
             lapses=lapses,
             width_px=width,
-            driver=None if service is None else _model_at(service),
+            driver=driver,
             tracks=tracks,
+            pictures=pictures,
         )
         seeds = range(first_seed, first_seed + episodes)
-        report = generate(out, seeds, workers=workers, config=config, service=service)
+        report = generate(out, seeds, workers=workers, config=config, pilot=pilot)
         typer.echo(str(report))
 
 
-def _model_at(service: str) -> str:
+def _driver(
+    service: str | None, small: Path | None, *, tracks: bool, pictures: bool
+) -> tuple[str | None, Callable[[], Pilot] | None]:
+    """Who drives in the expert's place, with revision, and what makes it in a worker; None for nobody."""
     from clients.planner import Access, PlannerClient
+    from service.cli.small_pilot import SmallPilot
 
+    if service is not None and small is not None:
+        raise ValueError("either --service or --small drives, not both")
+    if small is not None:
+        pilot = SmallPilot(small)
+        return f"{pilot.name} {pilot.revision}", partial(SmallPilot, small)
+    if service is None:
+        return None, None
+    if not pictures:
+        raise ValueError("a served model looks at pictures: --no-pictures is for --small")
     with PlannerClient(service, access=Access.from_environment()) as planner:
-        return ", ".join(f"{card.name} {card.revision}" for card in planner.models())
+        name = ", ".join(f"{card.name} {card.revision}" for card in planner.models())
+    return name, partial(served_pilot, service, tracks=tracks)
+
+
+def served_pilot(service: str, *, tracks: bool) -> Pilot:
+    """A service's model, without second looks: those are taught by what comes of first plans."""
+    from clients import wire
+    from clients.metadrive.pilots import ServicePilot
+    from clients.planner import Access, Patience, PlannerClient
+
+    planner = PlannerClient(service, Patience(timeout_s=120.0), access=Access.from_environment())
+    return ServicePilot(planner, "never", wire.Controls(n=6, thinking="never"), tracks=tracks)
 
 
 @app.command("import")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from model.driving.metrics import collides, leaves_road
 from model.driving.scene import Scene
 from model.driving.scene_store import read_scenes
 from model.driving.tracks import Track
+from service.cli.scenes import served_pilot
 from service.settings import Settings
 from tests.clients.metadrive.conftest import SEED
 from tests.service.scripted_engine import ScriptedEngine
@@ -69,7 +72,13 @@ def test_a_served_model_s_own_drives_become_scenes(tmp_path: Path) -> None:
         stride_s=2.0, duration_s=8.0, block=1, dense=False, width_px=112, driver="scripted 1"
     )
     with serve(ScriptedEngine(), Settings()) as served:
-        report = generate(tmp_path, range(4, 5), workers=1, config=config, service=served.url)
+        report = generate(
+            tmp_path,
+            range(4, 5),
+            workers=1,
+            config=config,
+            pilot=partial(served_pilot, served.url, tracks=False),
+        )
     scenes = list(read_scenes(tmp_path))
     assert report.scenes == len(scenes) > 0
     for labelled in scenes:
@@ -77,6 +86,19 @@ def test_a_served_model_s_own_drives_become_scenes(tmp_path: Path) -> None:
             assert {Image.open(io.BytesIO(image)).size for image in clip.images} == {(112, 56)}
     with pytest.raises(ReplayError, match="what scripted 1 met"):
         setting_of(tmp_path)
+
+
+def test_a_pilot_without_eyes_has_pictures_where_they_are_wanted(tmp_path: Path) -> None:
+    config = GenerateConfig(
+        stride_s=2.0, duration_s=8.0, block=1, dense=False, width_px=112, driver="constant velocity"
+    )
+    for pictures in (True, False):
+        folder = tmp_path / str(pictures)
+        asked = replace(config, pictures=pictures)
+        assert generate(folder, range(4, 5), workers=1, config=asked, pilot=ConstantVelocity).scenes > 0
+        assert {labelled.scene.has_pictures for labelled in read_scenes(folder)} == {pictures}
+    with pytest.raises(GenerationError, match="can do without pictures"):
+        GenerateConfig(pictures=False)
 
 
 def test_what_only_the_expert_s_drives_have_is_refused() -> None:

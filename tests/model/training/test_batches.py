@@ -16,7 +16,7 @@ from model.families.cf_vla.targets import PAPER_WEIGHTS
 from model.families.family import Reflection, Situation
 from model.formats.pieces import FormatError
 from model.network.checkpoint import Loaded, load
-from model.network.vocabulary import FUTURE_START
+from model.network.vocabulary import FUTURE_START, TRACK, VIDEO_PAD
 from model.training.batches import Item, ResponseDataset, Sample, TaskSampler, collate
 from model.training.examples import Examples
 from model.training.learner import ResponseLearner
@@ -277,6 +277,28 @@ def test_each_chance_is_taken_as_often_as_asked() -> None:
     assert 0.3 < np.mean([item.tracks for item in reflected]) < 0.7
     mixed = [batch for batch in batches if len({(item.route, item.tracks) for item in batch}) > 1]
     assert len(mixed) <= 8
+
+
+def test_examples_without_pictures_are_learned_by_their_tracks(resampling_checkpoint: Path) -> None:
+    pictured = np.arange(len(EXAMPLES)) % 2 == 0
+    tasks = {"traj_only": 0.5, "cf_vla": 0.5}
+    sampler = TaskSampler(np.ones(len(EXAMPLES), np.bool_), 2, tasks, 0.5, seed=0, pictured=pictured)
+    batches = list(sampler)
+    for batch in batches:
+        assert len({item.pictures for item in batch}) == 1
+        for item in batch:
+            assert item.pictures == pictured[item.index]
+            assert item.pictures or item.tracks
+    loaded = load(resampling_checkpoint)
+    data = ResponseDataset(
+        EXAMPLES, loaded.codec, loaded.inputs, loaded.vocabulary, PAPER_WEIGHTS, pictures=True
+    )
+    told = data[Item(1, "cf_vla", True, tracks=True, pictures=False)]
+    assert told.patches is None
+    assert told.responses == data[Item(1, "cf_vla", True, tracks=True)].responses
+    video, track = loaded.vocabulary.id_of(VIDEO_PAD), loaded.vocabulary.id_of(TRACK)
+    assert video not in told.prompt
+    assert track in told.prompt
 
 
 def test_a_mirrored_example_is_the_example_of_the_mirrored_scene(resampling_checkpoint: Path) -> None:

@@ -10,7 +10,7 @@ from model.driving.images import decode_image
 from model.driving.labeller import expert_plan
 from model.driving.perceived import perceived_of
 from model.driving.reasoning import thoughts_of
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
 from model.driving.scene_store import write_scenes
 from model.training.dense import UNLABELLED, coarse
 from model.training.examples import Examples, load_examples
@@ -37,6 +37,18 @@ def test_examples_hold_what_the_scenes_hold() -> None:
         assert np.array_equal(examples.dense_classes[index, 0], coarse(labelled.dense[0]).classes)
         metres = np.expm1(examples.dense_range_log[index, 1].astype(np.float32))
         assert np.allclose(metres, coarse(labelled.dense[1]).range_m, atol=0.2)
+
+
+def test_examples_know_which_have_pictures() -> None:
+    scene = SCENES[1].scene
+    clips = tuple(replace(clip, images=(NO_PICTURE,) * 4) for clip in scene.clips)
+    blind = replace(SCENES[1], scene=replace(scene, clips=clips))
+    assert not blind.scene.has_pictures
+    assert Examples.from_scenes([SCENES[0], blind, SCENES[2]], CAMERAS).pictured.tolist() == [
+        True,
+        False,
+        True,
+    ]
 
 
 def test_thoughts_are_known_where_annotations_tell_them() -> None:

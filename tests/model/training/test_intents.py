@@ -1,18 +1,26 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from model.driving.facts import mirrored
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from model.driving.facts import IS_YES_OR_NO, mirrored
+from model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
 from model.network.checkpoint import Loaded, load
 from model.network.intent import INTENT_TOKENS
 from model.network.track_features import TRACK_FEATURES
 from model.training.examples import Examples
-from model.training.intents import IntentDataset, IntentLearner, Source, collate_intents, read_errors
+from model.training.intents import (
+    IntentDataset,
+    IntentLearner,
+    Source,
+    collate_intents,
+    read_errors,
+    read_facts,
+)
 from model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
 
@@ -33,7 +41,7 @@ def examples() -> Examples:
 @pytest.fixture(scope="module")
 def data(loaded: Loaded, examples: Examples, tmp_path_factory: pytest.TempPathFactory) -> IntentDataset:
     vision = open_vision(loaded, examples, tmp_path_factory.mktemp("vision"), mirrored=True)
-    return IntentDataset(examples, vision, route_share=1.0)
+    return IntentDataset(examples, read_facts(loaded.model, examples, vision), route_share=1.0)
 
 
 def test_a_mirrored_look_swaps_everything_it_knows(data: IntentDataset, examples: Examples) -> None:
@@ -43,7 +51,22 @@ def test_a_mirrored_look_swaps_everything_it_knows(data: IntentDataset, examples
     np.testing.assert_array_equal(swapped.route[:, 1], -plain.route[:, 1])
     np.testing.assert_array_equal(swapped.facts, mirrored(plain.facts))
     np.testing.assert_array_equal(swapped.plan_bins, examples.plan(1).mirrored().bins())
-    assert not np.array_equal(swapped.seen, plain.seen)
+    assert not np.array_equal(swapped.read, plain.read)
+
+
+def test_scenes_without_pictures_are_misread_like_those_with(loaded: Loaded, tmp_path: Path) -> None:
+    blind = []
+    for labelled in SCENES[1:3]:
+        clips = tuple(replace(clip, images=(NO_PICTURE,) * 4) for clip in labelled.scene.clips)
+        blind.append(replace(labelled, scene=replace(labelled.scene, clips=clips)))
+    examples = Examples.from_scenes([*SCENES, *blind], (FRONT_WIDE, FRONT_TELE))
+    vision = open_vision(loaded, examples, tmp_path, mirrored=True)
+    read = read_facts(loaded.model, examples, vision)
+    assert np.isfinite(read).all()
+    assert ((read[..., IS_YES_OR_NO] >= 0) & (read[..., IS_YES_OR_NO] <= 1)).all()
+    assert not np.array_equal(read[6, 0, 1], np.nan_to_num(examples.facts[6])), "nothing was misread"
+    again = read_facts(loaded.model, examples, vision)
+    np.testing.assert_array_equal(read, again)
 
 
 def test_tracks_tell_nothing_of_a_route_that_is_not_given(data: IntentDataset) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
 from model.families.cf_vla.targets import PAPER_WEIGHTS
 from model.network.checkpoint import Loaded, load
 from model.network.patches import patchify
@@ -44,6 +44,20 @@ def test_the_cache_holds_what_the_tower_sees(loaded: Loaded, tmp_path: Path) -> 
         kept = torch.from_numpy(cache.tokens(index, mirror).astype(np.float32))
         # Worked out in bfloat16, and kept in float16.
         torch.testing.assert_close(kept, seen_now(loaded, index, mirror), rtol=0.1, atol=0.05)
+
+
+def test_examples_without_pictures_have_no_tokens(loaded: Loaded, tmp_path: Path) -> None:
+    blind = []
+    for index in range(2):
+        scene = training_scene(index)
+        clips = tuple(replace(clip, images=(NO_PICTURE,) * 4) for clip in scene.scene.clips)
+        blind.append(replace(scene, scene=replace(scene.scene, clips=clips)))
+    without = replace(Examples.from_scenes(blind, CAMERAS), episode=np.full(2, 9))
+    both = open_vision(loaded, Examples.concatenate([without, OTHERS]), tmp_path, mirrored=True)
+    assert both.tokens(1, True).size == 0
+    alone = open_vision(loaded, OTHERS, tmp_path, mirrored=True)
+    for index in range(3):
+        np.testing.assert_array_equal(both.tokens(2 + index, True), alone.tokens(index, True))
 
 
 def test_a_killed_cache_goes_on_where_it_was(loaded: Loaded, tmp_path: Path) -> None:
