@@ -54,6 +54,7 @@ class GenerateConfig:
         duration_s: seconds an episode lasts.
         block: seeds in one file; a worker process lives for one block, so its memory stays bounded.
         surround: also render the six surround cameras.
+        next_frames: also store what every camera sees half a second later.
         dense: also store per-pixel targets.
         drifts: the expert strays from its line now and then; scenes show how it comes back.
         lapses: it brakes late now and then; scenes show how it brakes then.
@@ -69,6 +70,7 @@ class GenerateConfig:
     duration_s: float = 48.0
     block: int = 20
     surround: bool = False
+    next_frames: bool = False
     dense: bool = True
     drifts: bool = False
     lapses: bool = False
@@ -78,10 +80,11 @@ class GenerateConfig:
     pictures: bool = True
 
     def __post_init__(self) -> None:
-        if self.driver is not None and (self.dense or self.surround or self.drifts or self.lapses):
+        filmed = self.dense or self.surround or self.next_frames
+        if self.driver is not None and (filmed or self.drifts or self.lapses):
             raise GenerationError(
-                "scenes of a model's own drives have no dense targets and no surround cameras, "
-                "and its expert neither drifts nor lapses"
+                "scenes of a model's own drives have no dense targets, no surround cameras and no next "
+                "frames, and its expert neither drifts nor lapses"
             )
         if self.driver is None and not self.pictures:
             raise GenerationError("only scenes of a model's own drives can do without pictures")
@@ -236,7 +239,7 @@ def run_seed(seed: int, rig: Rig, config: GenerateConfig) -> tuple[list[Labelled
     started = time.monotonic()
     try:
         log = run_episode(seed, config.duration_s, drifts=config.drifts, lapses=config.lapses)
-        made = list(labelled_scenes(log, rig, config.stride_s, config.dense))
+        made = list(labelled_scenes(log, rig, config.stride_s, config.dense, with_next=config.next_frames))
     except (MapError, shapely.errors.GEOSException) as error:
         return [], EpisodeOutcome(seed, type(error).__name__, "", 0, 0, time.monotonic() - started)
     dropped = len(window_steps(log, config.stride_s)) - len(made)

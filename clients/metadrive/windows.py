@@ -25,6 +25,7 @@ from model.driving.scene import (
     DenseTarget,
     LabelledScene,
     LaneTrace,
+    NextFrame,
     Scene,
     Tag,
 )
@@ -48,9 +49,17 @@ def window_steps(log: EpisodeLog, stride_s: float) -> range:
 
 
 def labelled_scenes(
-    log: EpisodeLog, rig: Rig, stride_s: float, with_dense: bool = True
+    log: EpisodeLog, rig: Rig, stride_s: float, with_dense: bool = True, *, with_next: bool = False
 ) -> Iterator[LabelledScene]:
-    """Render and annotate the windows of ``log`` whose future does not collide, leave the road or stray."""
+    """Render and annotate the windows of ``log`` whose future does not collide, leave the road or stray.
+
+    Args:
+        log: the episode.
+        rig: its cameras.
+        stride_s: seconds from scene to scene.
+        with_dense: also tell what each pixel shows.
+        with_next: also tell what every camera sees half a second later.
+    """
     moments = ((step, _Moment(log, step)) for step in window_steps(log, stride_s))
     usable = [(step, moment) for step, moment in moments if moment.is_safe]
     if not usable:
@@ -62,7 +71,8 @@ def labelled_scenes(
     try:
         for step, moment in usable:
             wanted = [step - PICTURE_STEPS * k for k in reversed(range(CLIP_FRAMES))]
-            for at in wanted:
+            later = [step + PICTURE_STEPS] if with_next else []
+            for at in (*wanted, *later):
                 if at not in shots:
                     shots[at] = stage.shoot(at)
             for old in [at for at in shots if at < wanted[0]]:
@@ -77,7 +87,8 @@ def labelled_scenes(
                     dense_target(spec, picture.depth_m, log, step, moment.area)
                     for spec, picture in zip(rig.specs, shots[step], strict=True)
                 )
-            yield moment.labelled(clips, tagger.tags(step), lane_maps.at(step), dense)
+            next_frames = tuple(NextFrame(each.camera, each.jpeg) for at in later for each in shots[at])
+            yield moment.labelled(clips, tagger.tags(step), lane_maps.at(step), dense, next_frames)
     finally:
         stage.close()
 
@@ -143,6 +154,7 @@ class _Moment:
         tags: frozenset[Tag],
         lane_map: LaneMap,
         dense: tuple[DenseTarget, ...] = (),
+        next_frames: tuple[NextFrame, ...] = (),
     ) -> LabelledScene:
         """All that is known of the moment."""
         name = f"{self._log.seed:06d}"
@@ -158,6 +170,7 @@ class _Moment:
             tags,
             dense,
             lane_map,
+            next_frames,
         )
 
     def _area(self) -> Any:

@@ -42,6 +42,8 @@ CAMERAS: Final = (
 """Known cameras: the two of CF-VLA, then the six surround cameras of VLA-World."""
 CLIP_FRAMES: Final = 4
 CLIP_PERIOD_S: Final = 0.5
+NEXT_FRAME_S: Final = CLIP_PERIOD_S
+"""How long after the scene its next frames are taken."""
 
 Tag = Literal["lead_vehicle", "cut_in", "pedestrian", "lane_change", "turn", "hard_brake"]
 TAGS: Final[tuple[Tag, ...]] = (
@@ -86,6 +88,24 @@ class Clip:
             raise SceneError(f"unknown camera {self.camera!r}; known are {', '.join(CAMERAS)}")
         if len(self.images) != CLIP_FRAMES:
             raise SceneError(f"camera {self.camera} must have {CLIP_FRAMES} frames, got {len(self.images)}")
+
+
+@dataclass(frozen=True)
+class NextFrame:
+    """One encoded picture (JPEG, PNG or WebP): what a camera saw `NEXT_FRAME_S` after the scene."""
+
+    camera: str
+    image: bytes = field(repr=False)
+
+    def __post_init__(self) -> None:
+        if self.camera not in CAMERAS:
+            raise SceneError(f"unknown camera {self.camera!r}; known are {', '.join(CAMERAS)}")
+
+
+def mirrored_camera(camera: str) -> str:
+    """The camera that sees in a mirror what ``camera`` sees: left and right are swapped."""
+    sides = {"left": "right", "right": "left"}
+    return "_".join(sides.get(part, part) for part in camera.split("_"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +209,7 @@ class LabelledScene:
         tags: what makes the scene difficult.
         dense: per-pixel targets of the latest pictures; may be empty.
         lane_map: what NAVSIM's scores ask of the map; None where nobody knows.
+        next_frames: what its cameras, or others, saw half a second later; may be empty.
     """
 
     scene: Scene
@@ -202,9 +223,13 @@ class LabelledScene:
     tags: frozenset[Tag] = frozenset()
     dense: tuple[DenseTarget, ...] = ()
     lane_map: LaneMap | None = None
+    next_frames: tuple[NextFrame, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "future", check_trajectory(self.future))
+        cameras = [frame.camera for frame in self.next_frames]
+        if len(set(cameras)) != len(cameras):
+            raise SceneError(f"a camera has two next frames: {', '.join(cameras)}")
         unknown = set(self.tags) - set(TAGS)
         if unknown:
             raise SceneError(f"unknown tags: {', '.join(sorted(unknown))}")
@@ -247,6 +272,7 @@ __all__ = [
     "FRONT_TELE",
     "FRONT_WIDE",
     "LIGHTS",
+    "NEXT_FRAME_S",
     "SEMANTIC_CLASSES",
     "TAGS",
     "TRACK_STEPS",
@@ -258,9 +284,11 @@ __all__ = [
     "LabelledScene",
     "LaneTrace",
     "Light",
+    "NextFrame",
     "Scene",
     "SceneError",
     "Tag",
     "Track",
+    "mirrored_camera",
     "split_of_seed",
 ]

@@ -1,13 +1,15 @@
 """Labelled scenes in Parquet files: one row a scene, everything a scene knows in it.
 
 A file carries ``looktwice.scene_version`` in its metadata; readers refuse other versions. Files of this
-version may lack ``lane_map``, which came later: then it is not known. Files are written to a temporary name
-beside their place and renamed, so a reader never meets half a file.
+version may lack ``lane_map``, which came later: then it is not known. Where scenes bring what was seen half a
+second later, files have a column ``next_frames``; others lack it, as they always did. Files are written to a
+temporary name beside their place and renamed, so a reader never meets half a file.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -25,6 +27,7 @@ from model.driving.scene import (
     DenseTarget,
     LabelledScene,
     LaneTrace,
+    NextFrame,
     Scene,
     SceneError,
     Tag,
@@ -98,6 +101,10 @@ _SCHEMA: Final = pa.schema(
         ),
     ]
 )
+_NEXT_FRAMES: Final = pa.field(
+    "next_frames", pa.list_(pa.struct([("camera", pa.string()), ("image", pa.binary())]))
+)
+"""Of files whose first scene has some."""
 
 
 class SceneFileError(ValueError):
@@ -107,12 +114,29 @@ class SceneFileError(ValueError):
 def write_scenes(
     path: Path, scenes: Iterable[LabelledScene], metadata: Mapping[str, str] | None = None
 ) -> int:
-    """Write ``scenes`` to one Parquet file and return how many there were; see the module's first lines."""
+    """Write ``scenes`` to one Parquet file and return how many there were; see the module's first lines.
+
+    Raises:
+        SceneError: a scene has next frames, and the first one has none. Nothing is written.
+    """
+    remaining = iter(scenes)
+    first = next(remaining, None)
+    bring = first is not None and bool(first.next_frames)
     described = {_VERSION_KEY: SCENE_VERSION.encode()} | {
         key.encode(): value.encode() for key, value in (metadata or {}).items()
     }
-    schema = _SCHEMA.with_metadata(described)
-    return write_rows(path, map(_to_row, scenes), schema, ROW_GROUP)
+    schema = (_SCHEMA.append(_NEXT_FRAMES) if bring else _SCHEMA).with_metadata(described)
+
+    def rows() -> Iterator[dict[str, Any]]:
+        for labelled in chain([] if first is None else [first], remaining):
+            if labelled.next_frames and not bring:
+                raise SceneError(
+                    f"scene {labelled.scene.scene_id} has next frames, and the first of its file has none: "
+                    "write them to another file"
+                )
+            yield _to_row(labelled)
+
+    return write_rows(path, rows(), schema, ROW_GROUP)
 
 
 def scene_files(path: Path) -> list[Path]:
@@ -160,7 +184,7 @@ def read_scenes(
     Raises:
         SceneFileError: see the class.
     """
-    columns = None if dense else [name for name in _SCHEMA.names if name != "dense"]
+    columns = None if dense else [name for name in (*_SCHEMA.names, _NEXT_FRAMES.name) if name != "dense"]
     for file in scene_files(path):
         parquet = _open(file)
         try:
@@ -238,6 +262,7 @@ def _to_row(labelled: LabelledScene) -> dict[str, Any]:
             for target in labelled.dense
         ],
         "lane_map": None if labelled.lane_map is None else _lane_map_to_row(labelled.lane_map),
+        _NEXT_FRAMES.name: [{"camera": each.camera, "image": each.image} for each in labelled.next_frames],
     }
 
 
@@ -310,6 +335,9 @@ def _from_row(row: dict[str, Any]) -> LabelledScene:
             for target in row.get("dense") or ()
         ),
         lane_map=_lane_map(told) if (told := row.get("lane_map")) is not None else None,
+        next_frames=tuple(
+            NextFrame(each["camera"], each["image"]) for each in row.get(_NEXT_FRAMES.name) or ()
+        ),
     )
 
 

@@ -55,11 +55,13 @@ class Situation:
         history: float32 [16, 4].
         route: float32 [20, 2]; None where the prompt has none.
         attempt: given exactly to families that refine one.
+        camera: whose next picture is to be imagined, one of `CAMERAS`; None where nobody asks for one.
     """
 
     history: FloatArray
     route: FloatArray | None = None
     attempt: Attempt | None = None
+    camera: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
 """Checkpoint folders in Hugging Face layout: create, save, load, expand a stock Qwen2.5-VL.
 
 A folder holds ``config.json``, tokenizer files, ``model.safetensors`` (or shards), the trajectory codec,
-``looktwice.json``, a small card for tools, and what a model repository needs (`model.network.repository`).
+``looktwice.json``, a small card for tools, the codes of pictures where a model imagines any, and what a model
+repository needs (`model.network.repository`).
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -25,6 +26,8 @@ from model.network.inputs import InputBuilder
 from model.network.numbers import needed_numbers, write_number_embeddings
 from model.network.repository import write_repository
 from model.network.settings import SettingsError, VlaSettings
+from model.network.visual_codes import WEIGHTS_FILE as VISUAL_CODES_FILE
+from model.network.visual_codes import VisualCodes, VisualCodesError, load_visual_codes
 from model.network.vla import LookTwiceVla, VlaConfig, nano_config, padded_size, parameters_of, with_settings
 from model.network.vocabulary import Vocabulary, VocabularyError, add_numbers, expand_tokenizer
 
@@ -45,12 +48,14 @@ class Parts:
         codec: its trajectory codec.
         inputs: builds its inputs.
         card: what it is, for people; ``engine`` is ``torch``.
+        visual_codes: its codes of pictures, where it has any.
     """
 
     vocabulary: Vocabulary
     codec: TrajectoryCodec
     inputs: InputBuilder
     card: ModelCard
+    visual_codes: VisualCodes | None = field(default=None, kw_only=True)
 
     @property
     def settings(self) -> VlaSettings:
@@ -95,6 +100,7 @@ def save(
     *,
     dtype: torch.dtype | None = None,
     details: Mapping[str, Any] | None = None,
+    visual_codes: VisualCodes | None = None,
 ) -> None:
     """Write a checkpoint folder.
 
@@ -103,6 +109,7 @@ def save(
         model, vocabulary, codec: its parts.
         dtype: of the stored weights; None keeps the model's. bfloat16 halves the file.
         details: anything worth showing on the card, JSON-like (recipe, steps, figures).
+        visual_codes: of pictures, for models that imagine.
     """
     folder.mkdir(parents=True, exist_ok=True)
     state = model.state_dict()
@@ -119,6 +126,10 @@ def save(
         model.config.dtype = before
     vocabulary.tokenizer.save_pretrained(folder)
     codec.save(folder)
+    if visual_codes is not None:
+        visual_codes.save(folder, visual_codes.details)
+    else:
+        (folder / VISUAL_CODES_FILE).unlink(missing_ok=True)
     write_card(folder, model.settings, parameters_of(model), details or {})
     write_repository(folder)
 
@@ -146,7 +157,9 @@ def read_parts(folder: Path) -> Parts:
         vocabulary = Vocabulary(AutoTokenizer.from_pretrained(folder, local_files_only=True))
         codec = TrajectoryCodec.load(folder)
         settings = VlaSettings.of_config(config)
-    except (VocabularyError, CodecError, SettingsError) as error:
+        has_visual = (folder / VISUAL_CODES_FILE).is_file()
+        visual_codes = load_visual_codes(folder) if has_visual else None
+    except (VocabularyError, CodecError, SettingsError, VisualCodesError) as error:
         raise CheckpointError(f"{folder}: {error}") from error
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{folder}: its tokenizer cannot be loaded: {error}") from error
@@ -173,6 +186,7 @@ def read_parts(folder: Path) -> Parts:
             },
             details=card["details"],
         ),
+        visual_codes=visual_codes,
     )
 
 

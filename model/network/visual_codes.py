@@ -96,10 +96,14 @@ class VisualCodes(nn.Module):
 
     Args:
         width: channels in the middle; half as many at twice the resolution.
+
+    Attributes:
+        details: how it was made, as its file tells.
     """
 
     def __init__(self, width: int = 192) -> None:
         super().__init__()
+        self.details: dict[str, object] = {}
         half, fine = width // 2, width // 6
         self.width = width
         self.encoder = nn.Sequential(
@@ -195,6 +199,7 @@ def load_visual_codes(folder: Path) -> VisualCodes:
                 f"this LookTwice reads {_VERSION} with {list(LEVELS)}"
             )
         codes = VisualCodes(about["width"])
+        codes.details = dict(about["details"])
         codes.load_state_dict(load_file(path))
     except (SafetensorError, json.JSONDecodeError, KeyError, RuntimeError) as error:
         raise VisualCodesError(f"{path} is damaged: {error}") from error

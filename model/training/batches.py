@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
+from model.driving.scene import mirrored_camera
 from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, present_speed
-from model.families.family import Lesson, Reflection, Situation
+from model.families.family import Lesson, NextPicture, Reflection, Situation
 from model.families.registry import families_of
 from model.families.trajectory_codes import CODES
 from model.formats.cursor import CompiledFormat
@@ -22,6 +23,7 @@ from model.network.inputs import InputBuilder
 from model.network.patches import patchify
 from model.network.prompts import motion_text
 from model.network.track_features import MIRRORED, without_route
+from model.network.visual_codes import VisualCodes, frame_of
 from model.network.vocabulary import Vocabulary
 from model.training.examples import Examples, example_frames
 from model.training.reflections import mirrored
@@ -32,6 +34,8 @@ from model.training.vision_cache import VisionCache
 Batch = dict[str, Tensor]
 
 _CHANCES: Final = ("tracks", "mirror", "blur")
+_ASKED_SHARE: Final = 0.5
+"""Of the pictures that are taught: the prompt asks for their camera. Others are of the model's own choice."""
 _MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
 """Of poses (x, y, z, heading)."""
 
@@ -52,6 +56,8 @@ class Item:
         mirror: left and right are swapped.
         blur: of the history only the present speed is left.
         pictures: whether the prompt has the example's pictures, where any prompt has.
+        camera: whose picture half a second later is taught; None for no picture.
+        asked: whether the prompt asks for that camera.
         reflections: places of reflections on it, whose responses all follow the same prompt; without any,
             the response is the expert's own.
     """
@@ -64,6 +70,8 @@ class Item:
     mirror: bool = False
     blur: bool = False
     pictures: bool = True
+    camera: str | None = None
+    asked: bool = False
 
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
@@ -107,6 +115,7 @@ class ResponseDataset(Dataset[Sample]):
         pictures: whether prompts have them.
         vision: what the tower sees in all examples, where it does not learn; else their patches are given.
         reflections: to be asked for by items.
+        visual_codes: of the checkpoint, where items are to teach pictures.
         seed: of the codes that are drawn.
 
     Raises:
@@ -125,8 +134,10 @@ class ResponseDataset(Dataset[Sample]):
         pictures: bool,
         vision: VisionCache | None = None,
         reflections: Sequence[Reflection] = (),
+        visual_codes: VisualCodes | None = None,
         seed: int = 0,
     ) -> None:
+        self._visual_codes, self._next = visual_codes, dict[tuple[int, str, bool], NextPicture]()
         self._examples, self._inputs, self._reflections = examples, inputs, reflections
         self._codec, self._vision = codec, vision
         self._soft = SoftCodes(codec, codec.vectors(examples.history, examples.future))
@@ -163,6 +174,7 @@ class ResponseDataset(Dataset[Sample]):
             perceived = None if perceived is None else perceived.mirrored()
         if item.blur:
             history = steady_history(present_speed(history))
+        picture = None if item.camera is None else self._next_picture(index, item.camera, item.mirror)
         vector = self._codec.vectors(history[None], future[None])[0]
         found = [self._reflections[place] for place in item.reflections]
         if item.mirror:
@@ -170,11 +182,12 @@ class ResponseDataset(Dataset[Sample]):
         reflections: Sequence[Reflection | None] = found or [None]
         soft = [self._soft.draw(vector, self._random) for _ in reflections]
         lessons = [
-            Lesson(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived)
+            Lesson(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived, picture)
             for drawn, reflection in zip(soft, reflections, strict=True)
         ]
+        camera = picture.camera if picture is not None and item.asked else None
         return Sample(
-            prompt=self._prompt(item, Situation(history, route if item.route else None)),
+            prompt=self._prompt(item, Situation(history, route if item.route else None, camera=camera)),
             responses=[self._target(item.task, lesson) for lesson in lessons],
             seen=self._vision.tokens(index, item.mirror) if pictures and self._vision is not None else None,
             patches=self._patches(item) if pictures and self._vision is None else None,
@@ -185,6 +198,19 @@ class ResponseDataset(Dataset[Sample]):
             code_shares=np.stack([drawn.shares for drawn in soft]),
             code_errors_m=np.stack([drawn.errors_m for drawn in soft]),
         )
+
+    def _next_picture(self, index: int, camera: str, mirror: bool) -> NextPicture:
+        """What ``camera`` saw half a second later; its mirror image is that of the other side's camera."""
+        key = (index, camera, mirror)
+        if key not in self._next:
+            if self._visual_codes is None:
+                raise ValueError("pictures are to be taught, and there are no codes to write them in")
+            frame = frame_of(self._examples.next_picture(index, camera))
+            codes = self._visual_codes.encode(np.ascontiguousarray(frame[:, ::-1]) if mirror else frame)
+            self._next[key] = NextPicture(
+                mirrored_camera(camera) if mirror else camera, tuple(codes.tolist())
+            )
+        return self._next[key]
 
     def _target(self, task: str, lesson: Lesson) -> Target:
         return make_target(self._families[task], self.formats[task], lesson, self._weights)
@@ -227,6 +253,10 @@ class TaskSampler(BatchSampler):
             and given no history but the present speed; see `Item`.
         pictured: bool [m], which examples have pictures; all by default.
         mirror_reflected: whether reflections are mirrored too: those in phrases can be.
+        next_cameras: of each example, the cameras whose picture half a second later can be taught; none
+            without it.
+        picture_share: share of the examples with such cameras that are taught a picture, of one of them;
+            half of these are asked for it.
         seed: of the order; every epoch has another one.
         processes: so many batches in a row are alike, as those who share the work wait for the slowest.
         reflected: int64 [r], the example that each reflection is on.
@@ -252,8 +282,11 @@ class TaskSampler(BatchSampler):
         blur_share: float = 0.0,
         pictured: npt.NDArray[np.bool_] | None = None,
         mirror_reflected: bool = False,
+        next_cameras: Sequence[tuple[str, ...]] = (),
+        picture_share: float = 0.0,
     ) -> None:
         self._pictured = np.ones(len(has_route), np.bool_) if pictured is None else pictured
+        self._next_cameras, self._picture_share = next_cameras, picture_share
         self._mirror_reflected = mirror_reflected
         self._shares = {"tracks": tracks_share, "mirror": mirror_share, "blur": blur_share}
         self._processes, self._has_route, self._tasks = processes, has_route, tasks
@@ -298,6 +331,7 @@ class TaskSampler(BatchSampler):
         drawn = random.choice(len(names), len(example), p=list(self._tasks.values()))
         given = self._given(example, random)
         tracks, mirror, blur = (self._drawn(name, len(example), random) for name in _CHANCES)
+        pictures = self._pictures(example, random)
         return [
             Item(
                 int(example[place]),
@@ -307,6 +341,8 @@ class TaskSampler(BatchSampler):
                 mirror=bool(mirror[place]),
                 blur=bool(blur[place]),
                 pictures=bool(self._pictured[example[place]]),
+                camera=pictures[place][0],
+                asked=pictures[place][1],
             )
             for place in random.permutation(len(example))
         ]
@@ -336,6 +372,22 @@ class TaskSampler(BatchSampler):
         # No share, no draw: orders stay what they were before there were such shares.
         return random.random(count) < share if share else np.zeros(count, np.bool_)
 
+    def _pictures(
+        self, example: npt.NDArray[np.int64], random: np.random.Generator
+    ) -> list[tuple[str | None, bool]]:
+        """For each example the camera whose next picture is taught, if any, and whether it is asked for."""
+        if not self._picture_share or not any(self._next_cameras):
+            return [(None, False)] * len(example)  # no draw, as above
+        chances = random.random((len(example), 3)).tolist()
+        drawn: list[tuple[str | None, bool]] = []
+        for index, (taught, which, asked) in zip(example.tolist(), chances, strict=True):
+            cameras = self._next_cameras[index]
+            if cameras and taught < self._picture_share:
+                drawn.append((cameras[int(which * len(cameras))], asked < _ASKED_SHARE))
+            else:
+                drawn.append((None, False))
+        return drawn
+
     def _given(self, example: npt.NDArray[np.int64], random: np.random.Generator) -> npt.NDArray[np.bool_]:
         chosen: npt.NDArray[np.bool_] = random.random(len(example)) < self._route_share
         return self._has_route[example] & chosen
@@ -343,9 +395,16 @@ class TaskSampler(BatchSampler):
     def _rounds(self, items: list[Item], size: int) -> tuple[list[list[list[Item]]], list[list[Item]]]:
         """Batches of like items, as many in a round as there are processes; and batches of the rest."""
         rounds: list[list[list[Item]]] = []
-        buckets: dict[tuple[str, bool, bool, bool, int], list[Item]] = {}
+        buckets: dict[tuple[str, bool, bool, bool, int, bool], list[Item]] = {}
         for item in items:
-            key = (item.task, item.route, item.tracks, item.pictures, len(item.reflections))
+            key = (
+                item.task,
+                item.route,
+                item.tracks,
+                item.pictures,
+                len(item.reflections),
+                item.camera is not None,
+            )
             bucket = buckets.setdefault(key, [])
             bucket.append(item)
             if len(bucket) == size * self._processes:

@@ -21,7 +21,7 @@ from model.driving.labeller import expert_plan
 from model.driving.perceived import ROW_SIZE, Perceived, perceived_of, perceived_of_row
 from model.driving.plan import Plan, plan_from_bins
 from model.driving.reasoning import thoughts_of
-from model.driving.scene import CLIP_FRAMES, NO_PICTURE, LabelledScene
+from model.driving.scene import CAMERAS, CLIP_FRAMES, NO_PICTURE, LabelledScene
 from model.driving.scene_store import read_scenes, scene_files
 from model.driving.thoughts import Thoughts, read_thoughts
 from model.driving.tracks import tracks_of
@@ -31,7 +31,7 @@ from model.network.inputs import InputBuilder
 from model.network.track_features import track_features
 from model.training.dense import coarse, no_target, relative_motion
 
-CACHE_VERSION: Final = 5
+CACHE_VERSION: Final = 6
 DENSE_FAR_M: Final = 200.0
 """Ranges beyond are all the same to a dense target."""
 _NOTHING_KNOWN: Final = np.full(ROW_SIZE, np.nan, np.float32)
@@ -44,6 +44,8 @@ class Examples:
     Attributes:
         pictures: uint8, all encoded pictures one after the other, each distinct one once.
         picture_spans: int64 [N, cameras, 4, 2], first and last-plus-one byte of each picture.
+        next_spans: int64 [N, `CAMERAS`, 2], of what each camera saw half a second later; empty where
+            nothing is known.
         history: float32 [N, 16, 4].
         route: float32 [N, 20, 2]; NaN where a scene has none.
         future: float32 [N, 64, 4].
@@ -62,6 +64,7 @@ class Examples:
 
     pictures: npt.NDArray[np.uint8]
     picture_spans: npt.NDArray[np.int64]
+    next_spans: npt.NDArray[np.int64]
     history: FloatArray
     route: FloatArray
     future: FloatArray
@@ -92,6 +95,16 @@ class Examples:
         alike[alike] = [self.picture(int(index), 0, 0) == NO_PICTURE for index in np.flatnonzero(alike)]
         return ~alike
 
+    def next_cameras(self, index: int) -> tuple[str, ...]:
+        """The cameras whose picture half a second later is known."""
+        first, last = self.next_spans[index].T
+        return tuple(camera for camera, known in zip(CAMERAS, last > first, strict=True) if known)
+
+    def next_picture(self, index: int, camera: str) -> bytes:
+        """What one of `next_cameras` saw half a second later, encoded."""
+        first, last = self.next_spans[index, CAMERAS.index(camera)]
+        return self.pictures[first:last].tobytes()
+
     def thought(self, index: int) -> Thoughts | None:
         """The expert's thoughts; None where they are not known."""
         text = str(self.thoughts[index])
@@ -109,17 +122,21 @@ class Examples:
     def from_scenes(cls, scenes: Iterable[LabelledScene], cameras: Sequence[str]) -> Examples:
         """Gather scenes; every scene needs all ``cameras``, dense targets it may lack."""
         blob, spans_of = bytearray(), dict[bytes, tuple[int, int]]()
+
+        def span(picture: bytes) -> tuple[int, int]:
+            nonlocal blob
+            if picture not in spans_of:
+                spans_of[picture] = (len(blob), len(blob) + len(picture))
+                blob += picture
+            return spans_of[picture]
+
         columns: dict[str, list[Any]] = {field.name: [] for field in fields(cls)}
         for labelled in scenes:
             scene = labelled.scene
-            spans = []
-            for camera in cameras:
-                for picture in scene.clip(camera).images:
-                    if picture not in spans_of:
-                        spans_of[picture] = (len(blob), len(blob) + len(picture))
-                        blob += picture
-                    spans.append(spans_of[picture])
+            spans = [span(picture) for camera in cameras for picture in scene.clip(camera).images]
             columns["picture_spans"].append(np.reshape(spans, (len(cameras), CLIP_FRAMES, 2)))
+            later = {frame.camera: span(frame.image) for frame in labelled.next_frames}
+            columns["next_spans"].append([later.get(camera, (0, 0)) for camera in CAMERAS])
             columns["history"].append(scene.history)
             columns["route"].append(
                 np.full((20, 2), np.nan, np.float32) if scene.route is None else scene.route
@@ -141,6 +158,7 @@ class Examples:
             columns["episode"].append(labelled.seed)
             columns["scene_id"].append(scene.scene_id)
         types: dict[str, Any] = {"picture_spans": np.int64, "plan_bins": np.int8, "dense_classes": np.uint8}
+        types["next_spans"] = np.int64
         types |= {
             "dense_range_log": np.float16,
             "dense_motion": np.float16,
@@ -162,9 +180,11 @@ class Examples:
         columns = {
             field.name: np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)
         }
-        columns["picture_spans"] = np.concatenate(
-            [part.picture_spans + start for part, start in zip(parts, starts, strict=True)]
-        )
+        for name in ("picture_spans", "next_spans"):
+            # Empty spans stay empty, wherever they lie.
+            columns[name] = np.concatenate(
+                [getattr(part, name) + start for part, start in zip(parts, starts, strict=True)]
+            )
         return cls(**columns)
 
 

@@ -57,6 +57,7 @@ class Recipe:
         vision_rate: the tower's learning rate, relative to the rest; 0 leaves the tower as it is.
         tracks_share, mirror_share, blur_share: shares of the examples with tracks, mirrored, and with no
             history but the present speed; see `Item`.
+        picture_share: share of the examples with pictures half a second ahead that are taught one of them.
         error_weight: nats that a metre of a code's expected error counts.
         head_weight: of a regression of the trajectory where its first code is written.
         reflections: what becomes of the reflections of a build: ``learned`` as counterfactual examples, or
@@ -79,6 +80,7 @@ class Recipe:
     tracks_share: float = 0.0
     mirror_share: float = 0.0
     blur_share: float = 0.0
+    picture_share: float = 0.0
     error_weight: float = 0.0
     head_weight: float = 0.0
     reflections: Literal["learned", "scenes"] | None = None
@@ -150,10 +152,19 @@ NANO: Final[Mapping[str, Recipe]] = (
     }
     | {
         # Without trajectory codes there is neither their error to learn from, nor the head beside them.
-        name: replace(_NANO, name=name, tasks={task: 1.0}, weights=weights, error_weight=0.0, head_weight=0.0)
-        for name, task, weights in (
-            ("elf-sft", "elf_vla", elf_vla.WEIGHTS),
-            ("world-sft", "vla_world", vla_world.WEIGHTS),
+        name: replace(
+            _NANO,
+            name=name,
+            tasks={task: 1.0},
+            weights=weights,
+            picture_share=picture_share,
+            error_weight=0.0,
+            head_weight=0.0,
+        )
+        for name, task, weights, picture_share in (
+            ("elf-sft", "elf_vla", elf_vla.WEIGHTS, 0.0),
+            ("world-pretrain", "vla_world", vla_world.PICTURE_WEIGHTS, 1.0),
+            ("world-sft", "vla_world", vla_world.WEIGHTS, 0.5),
         )
     }
     | {
@@ -173,8 +184,8 @@ NANO: Final[Mapping[str, Recipe]] = (
         ),
     }
 )
-"""The stages of the shipped checkpoint, the control of its last one, the second stages of ELF-VLA and of
-VLA-World, and outcome training."""
+"""The stages of the shipped checkpoint, the control of its last one, the second stage of ELF-VLA, the
+first two of VLA-World, and outcome training."""
 
 PAPER: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe

@@ -23,6 +23,7 @@ from model.network.checkpoint import Loaded, create_nano, load, save, with_forma
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus, nano_phrases
 from model.network.settings import NANO_SETTINGS
+from model.network.visual_codes import load_visual_codes
 from model.network.vla import LookTwiceVla
 from model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from model.training.batches import ResponseDataset, TaskSampler, collate
@@ -88,6 +89,7 @@ def run(
     validation: Sequence[LabelledScene] = (),
     vision_source: Path | None = None,
     reflections: Path | None = None,
+    visual_codes: Path | None = None,
 ) -> None:
     """Train ``source`` by a recipe and write the outcome to ``target``, weights in bfloat16.
 
@@ -104,10 +106,11 @@ def run(
         vision_source: a checkpoint whose vision tower replaces the source's; so the tower can be grounded
             while another process trains the language.
         reflections: file of the reflections that the recipe asks for.
+        visual_codes: folder of codes of pictures, which the checkpoint gets; without it, it keeps its own.
 
     Raises:
         ValueError: the recipe wants reflections and there are none, or the other way round, or they are on
-            other scenes.
+            other scenes; it teaches pictures, and there are no codes for those that scenes bring.
     """
     if (reflections is None) != (recipe.reflections is None):
         wants = "needs reflections" if reflections is None else "takes no reflections"
@@ -115,6 +118,8 @@ def run(
     loaded = load(source)
     if new := [task for task in recipe.tasks if task not in loaded.settings.formats]:
         loaded = with_formats(loaded, new, seed=recipe.seed)
+    if visual_codes is not None:
+        loaded = replace(loaded, visual_codes=load_visual_codes(visual_codes))
     stages = list(loaded.card.details.get("stages", []))
     if vision_source is not None:
         vision = load(vision_source)
@@ -125,6 +130,7 @@ def run(
     loaded.model.set_attn_implementation(MATMUL_ATTENTION)
     torch.manual_seed(recipe.seed)
     examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
+    _check_pictures(recipe, examples, loaded)
     validate: Validate | None = None
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
@@ -163,10 +169,26 @@ def run(
             loaded.codec,
             dtype=torch.bfloat16,
             details={"stages": [*stages, _about(recipe, examples, on_examples)]},
+            visual_codes=loaded.visual_codes,
         )
     # gloo's threads drop what they gathered a moment later, and need the interpreter for it: a process that
     # ends before that is aborted. So nobody ends before the checkpoint is written.
     trainer.accelerator.wait_for_everyone()
+
+
+def _check_pictures(recipe: Recipe, examples: Examples, loaded: Loaded) -> None:
+    """Raise ValueError unless pictures that a recipe teaches are there, and can be written as codes."""
+    known = [bool(examples.next_cameras(index)) for index in range(len(examples))]
+    if recipe.picture_share == 1 and not all(known):
+        raise ValueError(
+            f"recipe {recipe.name} teaches pictures half a second ahead, and {known.count(False)} scenes "
+            "bring none: `looktwice scenes generate --next-frames` makes such scenes"
+        )
+    if recipe.picture_share and any(known) and loaded.visual_codes is None:
+        raise ValueError(
+            f"recipe {recipe.name} teaches pictures, and {loaded.card.name} has no codes for them: "
+            "--visual-codes names the folder that `looktwice train visual-codes` made"
+        )
 
 
 def vision_parts(vla: LookTwiceVla) -> list[nn.Module]:
@@ -218,6 +240,7 @@ def _prepare(
         pictures=recipe.pictures,
         vision=vision,
         reflections=() if on_examples is None else on_examples.reflections,
+        visual_codes=loaded.visual_codes,
         seed=recipe.seed,
     )
     for part in vision_parts(loaded.model):
@@ -261,6 +284,8 @@ def _prepare(
         blur_share=recipe.blur_share,
         pictured=examples.pictured,
         mirror_reflected=loaded.settings.reflection == "phrases",
+        next_cameras=[examples.next_cameras(index) for index in range(len(examples))],
+        picture_share=recipe.picture_share,
     )
     return learner, responses, sampler, collate
 

@@ -32,6 +32,9 @@ def generate(
     workers: Annotated[int, typer.Option(help="Processes that render.", min=1)] = 2,
     stride: Annotated[float, typer.Option(help="Seconds between the scenes of an episode.")] = 0.5,
     surround: Annotated[bool, typer.Option(help="Render the six surround cameras too.")] = False,
+    next_frames: Annotated[
+        bool, typer.Option(help="Store what every camera sees half a second later too, to be imagined.")
+    ] = False,
     drifts: Annotated[
         bool, typer.Option(help="The expert strays now and then; scenes show how it comes back.")
     ] = False,
@@ -68,6 +71,7 @@ def generate(
         config = GenerateConfig(
             stride_s=stride,
             surround=surround,
+            next_frames=next_frames,
             dense=dense,
             drifts=drifts,
             lapses=lapses,

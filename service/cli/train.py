@@ -36,6 +36,12 @@ def train(
     reflections: Annotated[
         Path | None, typer.Option(help="A build's reflections, for counterfactual and multi-round.")
     ] = None,
+    visual_codes: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder that visual-codes made, for world-pretrain and world-sft; the checkpoint keeps them."
+        ),
+    ] = None,
     validation: Annotated[
         Path | None, typer.Option(help="Scenes to report errors on while training.")
     ] = None,
@@ -155,6 +161,7 @@ def train(
             held_out,
             vision_from,
             reflections,
+            visual_codes,
         )
         training_curves(target / LOG_FILE, target / "curves.png")
 

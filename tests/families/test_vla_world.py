@@ -15,9 +15,10 @@ import torch
 import clients.wire as wire
 from clients.answers import PlannedDraw
 from clients.planner import PlannerClient
+from model.driving.images import encode_png
 from model.driving.labeller import expert_plan
 from model.driving.perceived import perceived_of
-from model.driving.scene import LabelledScene
+from model.driving.scene import LabelledScene, NextFrame
 from model.engines.engine import Controls, Draw, PlanRequest
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.engine import TorchEngine, TorchSettings
@@ -31,6 +32,7 @@ from model.formats.cursor import CompiledFormat
 from model.formats.grammar_export import to_lark
 from model.network.checkpoint import Loaded, load, save
 from model.network.settings import VlaSettings
+from model.network.visual_codes import VisualCodes
 from model.network.vocabulary import END_OF_TEXT, Vocabulary
 from model.training.batches import Item, ResponseDataset
 from model.training.examples import Examples
@@ -159,9 +161,19 @@ def test_the_exported_grammar_takes_what_is_taught(
         assert matcher.validate_tokens([*ids[: last + 1], codes[0]]) == last + 1
 
 
-def dataset(loaded: Loaded, scenes: list[LabelledScene]) -> ResponseDataset:
+def dataset(
+    loaded: Loaded, scenes: list[LabelledScene], visual_codes: VisualCodes | None = None
+) -> ResponseDataset:
     examples = Examples.from_scenes(scenes, loaded.settings.cameras)
-    return ResponseDataset(examples, loaded.codec, loaded.inputs, loaded.vocabulary, WEIGHTS, pictures=True)
+    return ResponseDataset(
+        examples,
+        loaded.codec,
+        loaded.inputs,
+        loaded.vocabulary,
+        WEIGHTS,
+        pictures=True,
+        visual_codes=visual_codes,
+    )
 
 
 def test_training_reads_the_prompts_that_the_engine_reads(world: Loaded) -> None:
@@ -194,6 +206,32 @@ def test_mirrored_examples_teach_what_mirrored_scenes_do(world: Loaded) -> None:
     mine = dataset(world, [labelled])[replace(item, mirror=True)]
     assert (mine.responses, mine.prompt) == (theirs.responses, theirs.prompt)
     assert dataset(world, [labelled])[item].responses != theirs.responses
+
+
+def test_pictures_half_a_second_ahead_are_taught_as_codes(world: Loaded) -> None:
+    frame = np.random.default_rng(0).integers(0, 256, (112, 224, 3), np.uint8)
+    torch.manual_seed(0)
+    codes = VisualCodes(24).eval()
+    labelled = replace(training_scene(1), next_frames=(NextFrame("back_left", encode_png(frame)),))
+    data = dataset(world, [labelled], codes)
+    item = Item(0, "vla_world", True, camera="back_left", asked=True)
+    # A mirror shows what the camera of the other side sees.
+    for mirror, camera, seen in ((False, "back_left", frame), (True, "back_right", frame[:, ::-1])):
+        sample = data[replace(item, mirror=mirror)]
+        [response] = sample.responses
+        text = world.vocabulary.decode(list(response.ids))
+        told = [int(code[9:13]) for code in CODE.findall(text)]
+        assert told == codes.encode(np.ascontiguousarray(seen)).tolist()
+        assert f"visual tokens of CAM_{camera.upper()} image" in text
+        assert f"Camera: CAM_{camera.upper()}\n" in world.vocabulary.decode(sample.prompt)
+    # Nobody asks, or nothing is taught: the prompt names no camera.
+    chosen, unseen = data[replace(item, asked=False)], data[Item(0, "vla_world", True)]
+    assert "Camera: ANY\n" in world.vocabulary.decode(chosen.prompt)
+    assert chosen.responses == data[item].responses
+    assert unseen.prompt == chosen.prompt
+    assert "</prediction>\n<think>" in world.vocabulary.decode(list(unseen.responses[0].ids))
+    with pytest.raises(ValueError, match="no codes to write them in"):
+        dataset(world, [labelled])[item]
 
 
 def test_a_step_of_training_brings_it_nearer_to_the_expert(checkpoint: Path) -> None:

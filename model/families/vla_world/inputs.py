@@ -11,13 +11,15 @@ from typing import Final
 from model.driving.short_term import mission_goal
 from model.driving.trajectory import STEP_S, FloatArray, present_acceleration, present_speed
 from model.families.family import Situation, TextInputs
-from model.families.vla_world.format import points, told_points
+from model.families.vla_world.format import CAMERA_OPTIONS, points, told_points
 from model.formats.compounds import Number
 from model.formats.pieces import Choice, Format, Literal, Option, Piece, Section, Sequence, Values
 
 GOALS: Final = ("LEFT", "FORWARD", "RIGHT", "UNKNOWN")
 """The last one where there is no route."""
 
+ANY_CAMERA: Final = "ANY"
+"""Where nobody asks for a camera: the model chooses whether it imagines, and which one."""
 _SPEED_MS: Final = Number(-20.0, 60.0, 0.1)
 _YAW_RATE_RADS: Final = Number(-2.0, 2.0, 0.01)
 _ACCELERATION_MS2: Final = Number(-15.0, 15.0, 0.1)
@@ -31,7 +33,7 @@ def goal_of(route: FloatArray | None) -> str:
 
 
 def describe(situation: Situation) -> Values:
-    """Ego status, past trajectory and mission goal."""
+    """Ego status, past trajectory, mission goal and the camera that is asked for."""
     history = situation.history
     half_a_second_ago = _PAST_STEPS[-1]
     turned_rad = float(history[-1, 3] - history[half_a_second_ago, 3])
@@ -43,6 +45,7 @@ def describe(situation: Situation) -> Values:
             "acceleration": _ACCELERATION_MS2.nearest(present_acceleration(history)),
             "past": told_points(history[list(_PAST_STEPS), :2]),
             "goal": goal_of(situation.route),
+            "camera": ANY_CAMERA if situation.camera is None else CAMERA_OPTIONS[situation.camera],
         }
     )
 
@@ -51,6 +54,7 @@ def _line(name: str, start: str, piece: Piece, end: str) -> Section:
     return Section(name, Sequence((Literal(start), piece, Literal(end))))
 
 
+_CAMERAS: Final = (*CAMERA_OPTIONS.values(), ANY_CAMERA)
 INPUTS: Final = TextInputs(
     Format(
         "vla_world inputs",
@@ -61,6 +65,7 @@ INPUTS: Final = TextInputs(
                 _line("acceleration", "Acceleration: ", _ACCELERATION_MS2, " m/s2\n"),
                 _line("past", "Historical Trajectory: [", points(len(_PAST_STEPS)), "]\n"),
                 _line("goal", "Mission Goal: ", Choice(tuple(map(Option, GOALS))), "\n"),
+                _line("camera", "Camera: ", Choice(tuple(map(Option, _CAMERAS))), "\n"),
             )
         ),
     ),

@@ -15,6 +15,10 @@ from model.formats.pieces import Value, Values
 
 WEIGHTS: Final[Mapping[str, float]] = MappingProxyType(dict.fromkeys(its.VLA_WORLD_FORMAT.sections(), 1.0))
 """The paper weighs all tokens of a response alike."""
+PICTURE_WEIGHTS: Final[Mapping[str, float]] = MappingProxyType(
+    dict.fromkeys(its.VLA_WORLD_FORMAT.sections(), 0.0) | {its.VISUAL: 1.0}
+)
+"""Of visual pre-training (section 3.3): the picture alone, behind what is perceived and predicted."""
 
 
 def teach(lesson: Lesson) -> Values:

@@ -39,6 +39,18 @@ def test_the_same_seed_drives_and_films_the_same_episode(filmed: Filmed, rig: Ri
     assert first.tags == filmed.scenes[0].tags
 
 
+def test_next_frames_are_what_the_scene_half_a_second_later_shows(filmed: Filmed, rig: Rig) -> None:
+    scenes = labelled_scenes(filmed.log, rig, 1.0, with_dense=False, with_next=True)
+    assert not any(labelled.next_frames for labelled in filmed.scenes)
+    first = next(scenes)
+    scenes.close()
+    assert first.scene.scene_id == filmed.scenes[0].scene.scene_id
+    later = filmed.scenes[1].scene
+    assert later.scene_id.endswith("-0020")
+    told = {frame.camera: frame.image for frame in first.next_frames}
+    assert told == {clip.camera: clip.images[-1] for clip in later.clips}
+
+
 def test_other_seeds_drive_elsewhere(filmed: Filmed) -> None:
     other = run_episode(SEED + 1, 3.0)
     assert not np.allclose(other.ego[:20], filmed.log.ego[:20])

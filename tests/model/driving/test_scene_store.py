@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from model.driving.lane_map import LaneArea, LaneMap
-from model.driving.scene import FRONT_WIDE, DenseTarget, LabelledScene
+from model.driving.scene import FRONT_WIDE, DenseTarget, LabelledScene, NextFrame, SceneError
 from model.driving.scene_store import (
     ROW_GROUP,
     SCENE_VERSION,
@@ -65,6 +65,7 @@ def rich_scene() -> LabelledScene:
             np.array([[-20.0, 0.01], [160.0, -0.02]]),
             has_lights=False,
         ),
+        next_frames=(NextFrame("back_left", b"left"), NextFrame(FRONT_WIDE, b"wide")),
     )
 
 
@@ -80,6 +81,25 @@ def test_everything_a_scene_knows_comes_back(tmp_path: Path) -> None:
     assert write_scenes(path, written) == 2
     for one, other in zip(written, read_scenes(path), strict=True):
         assert_same(one, other)
+
+
+def test_files_without_next_frames_are_what_they_always_were(tmp_path: Path) -> None:
+    path = tmp_path / "scenes.parquet"
+    write_scenes(path, [bare_scene()])
+    assert "next_frames" not in pq.read_schema(path).names
+    write_scenes(path, [rich_scene(), bare_scene()])
+    told = {name: [scene.next_frames for scene in read_scenes(path, dense=name)] for name in (True, False)}
+    assert told[True] == told[False] == [rich_scene().next_frames, ()]
+
+
+def test_next_frames_behind_a_scene_without_any_are_not_lost_in_silence(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="next frames, and the first of its file has none"):
+        write_scenes(tmp_path / "scenes.parquet", [bare_scene(), rich_scene()])
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(SceneError, match="two next frames"):
+        replace(bare_scene(), next_frames=(NextFrame("back", b"1"), NextFrame("back", b"2")))
+    with pytest.raises(SceneError, match="unknown camera 'rear'"):
+        NextFrame("rear", b"")
 
 
 def test_files_from_before_lane_maps_are_read(tmp_path: Path) -> None:

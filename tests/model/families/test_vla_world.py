@@ -347,10 +347,16 @@ def test_prompts_say_the_ego_status_in_the_papers_axes() -> None:
     assert VLA_WORLD.inputs is not None
     text = CompiledFormat(VLA_WORLD.inputs.format, VOCABULARY)
     route = np.stack([np.arange(4.0, 84.0, 4.0), np.full(20, -2.5)], 1).astype(np.float32)
-    for known, goal in ((route, "RIGHT"), (route * 0, "FORWARD"), (-route, "LEFT"), (None, "UNKNOWN")):
-        told = text.render(describe(Situation(HISTORY, known)))
+    for known, goal, camera, asked in (
+        (route, "RIGHT", None, "ANY"),
+        (route * 0, "FORWARD", "front", "CAM_FRONT"),
+        (-route, "LEFT", "back_left", "CAM_BACK_LEFT"),
+        (None, "UNKNOWN", None, "ANY"),
+    ):
+        told = text.render(describe(Situation(HISTORY, known, camera=camera)))
         assert VOCABULARY.decode([token.id for token in told]) == (
             "Velocity: 12.0 m/s Heading Angular Velocity: 0.05 rad/s Acceleration: 0.0 m/s2\n"
             "Historical Trajectory: [(-0.7,-18.0), (-0.3,-12.0), (-0.1,-6.0)]\n"
             f"Mission Goal: {goal}\n"
+            f"Camera: {asked}\n"
         )

@@ -344,3 +344,27 @@ def test_the_head_draws_where_the_first_code_is_written(loaded: Loaded) -> None:
     torch.testing.assert_close(learner(**batch)["head_ade_m"], parts["head_ade_m"])
     ids[0, int((batch["loss_weights"][0] > 0).int().argmax())] = 7
     assert learner(**batch)["head_ade_m"] != parts["head_ade_m"]
+
+
+def test_pictures_are_taught_where_there_are_any_and_asked_for_in_half_of_them() -> None:
+    cameras = [("back", "front") if index % 2 else () for index in range(4000)]
+    sampler = TaskSampler(
+        np.ones(4000, np.bool_),
+        16,
+        {"vla_world": 1.0},
+        0.8,
+        seed=0,
+        next_cameras=cameras,
+        picture_share=0.5,
+    )
+    batches = list(sampler)
+    items = [item for batch in batches for item in batch]
+    taught = [item for item in items if item.camera is not None]
+    assert all(item.index % 2 for item in taught)
+    assert abs(len(taught) / len(items) - 0.25) < 0.03
+    assert abs(sum(item.camera == "back" for item in taught) / len(taught) - 0.5) < 0.05
+    assert abs(sum(item.asked for item in taught) / len(taught) - 0.5) < 0.05
+    assert not any(item.asked for item in items if item.camera is None)
+    # A picture is a third of a response: those with one share batches.
+    mixed = [batch for batch in batches if len({item.camera is None for item in batch}) == 2]
+    assert len(mixed) <= 4 < len(batches) / 20

@@ -10,7 +10,7 @@ from model.driving.images import decode_image
 from model.driving.labeller import expert_plan
 from model.driving.perceived import perceived_of
 from model.driving.reasoning import thoughts_of
-from model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
+from model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE, NextFrame
 from model.driving.scene_store import write_scenes
 from model.training.dense import UNLABELLED, coarse
 from model.training.examples import Examples, load_examples
@@ -95,6 +95,18 @@ def test_joining_keeps_every_picture_in_its_place() -> None:
     whole = Examples.from_scenes(SCENES, CAMERAS)
     for index in range(6):
         assert joined.picture(index, 0, 1) == whole.picture(index, 0, 1)
+
+
+def test_next_frames_are_kept_camera_by_camera() -> None:
+    wide = SCENES[1].scene.clip(FRONT_WIDE).images[0]
+    frames = (NextFrame("back_right", b"behind"), NextFrame(FRONT_WIDE, wide))
+    later = replace(SCENES[1], next_frames=frames)
+    examples = Examples.concatenate(
+        [Examples.from_scenes(SCENES[:1], CAMERAS), Examples.from_scenes([SCENES[0], later], CAMERAS)]
+    )
+    assert [examples.next_cameras(index) for index in range(3)] == [(), (), (FRONT_WIDE, "back_right")]
+    assert examples.next_picture(2, "back_right") == b"behind"
+    assert examples.next_picture(2, FRONT_WIDE) == wide
 
 
 def test_the_cache_gives_the_same_and_follows_its_file(tmp_path: Path) -> None:

@@ -9,15 +9,18 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from model.driving.images import encode_jpeg
 from model.driving.labeller import expert_plan
 from model.driving.plan import parse_plan
 from model.driving.reflection_store import LabelledReflection, write_reflections
-from model.driving.scene import LabelledScene
+from model.driving.scene import LabelledScene, NextFrame
 from model.driving.scene_store import write_scenes
 from model.network.checkpoint import load
+from model.network.visual_codes import VisualCodes
 from model.training.recipes import NANO, Recipe
 from model.training.run import RunSettings, last_whole_state, run
 from tests.model.training.scenes import training_scene
@@ -69,6 +72,40 @@ def test_a_checkpoint_learns_a_format_that_it_did_not_write(
     assert [done.vocabulary.decode([id]) for id in ids] == [before.vocabulary.decode([id]) for id in ids]
     rows = [json.loads(line) for line in (tmp_path / "done" / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows if f"min_ade_m/{format}+route" in row] == [4]
+
+
+def test_pictures_are_learned_with_codes_that_the_checkpoint_keeps(
+    resampling_checkpoint: Path, scenes: Path, tmp_path: Path
+) -> None:
+    frame = encode_jpeg(np.random.default_rng(0).integers(0, 256, (112, 224, 3), np.uint8))
+    filmed = [replace(each, next_frames=(NextFrame("back", frame),)) for each in SCENES[:8]]
+    write_scenes(tmp_path / "filmed" / "a.parquet", filmed)
+    (tmp_path / "codes").mkdir()
+    codes = VisualCodes(24)
+    codes.save(tmp_path / "codes", {"steps": 7})
+    settings = RunSettings(tmp_path / "cache", bf16=False)
+    pretrain, imagined = short("world-pretrain", 2), tmp_path / "pretrained"
+    with pytest.raises(ValueError, match="16 scenes bring none"):
+        run(pretrain, scenes, resampling_checkpoint, imagined, settings)
+    with pytest.raises(ValueError, match="has no codes for them"):
+        run(pretrain, tmp_path / "filmed", resampling_checkpoint, imagined, settings)
+    run(
+        pretrain,
+        tmp_path / "filmed",
+        resampling_checkpoint,
+        imagined,
+        settings,
+        visual_codes=tmp_path / "codes",
+    )
+    kept = load(imagined).visual_codes
+    assert kept is not None
+    assert kept.details == {"steps": 7}
+    assert torch.equal(kept.exit.weight, codes.exit.weight)
+    # The next stage needs no folder of codes, and hands them on.
+    run(short("world-sft", 2), tmp_path / "filmed", imagined, tmp_path / "done", settings)
+    assert load(tmp_path / "done").visual_codes is not None
+    losses = [json.loads(line) for line in (tmp_path / "done" / "log.jsonl").read_text().splitlines()]
+    assert all(np.isfinite(row["loss"]) for row in losses if "loss" in row)
 
 
 def test_a_vision_tower_can_be_taken_from_elsewhere(
