@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Sequence
 from typing import Final
+
+import numpy as np
+import numpy.typing as npt
 
 from model.engines.engine import Event, Load, ModelCard, PlanRequest, RequestError
 
@@ -52,6 +55,10 @@ class NoModel:
         """Refuse ``request``."""
         raise RequestError("this service runs without a model")
         yield
+
+    def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
+        """Nothing is imagined."""
+        raise RequestError("this service runs without a model")
 
     def cancel(self, request_id: str) -> None:
         """Nothing runs."""

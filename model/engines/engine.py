@@ -5,18 +5,22 @@ Controls are part of the request, not of the engine; every engine gives them the
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
+import numpy as np
+import numpy.typing as npt
+
 from model.driving.plan import Plan
-from model.driving.scene import Scene
+from model.driving.scene import CAMERAS, Scene
 from model.driving.trajectory import TEN_HZ_S, FloatArray, at_10_hz
-from model.families.family import Attempt
+from model.families.family import Attempt, Foreseen
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
 Reasons = Literal["in_view", "any"]
+Imagine = Literal["auto", "never", "always"]
 Cut = Literal["skipped", "shortened", "replaced"]
 """What a deadline did to a second look: not begun, ended early, given up for the draft."""
 
@@ -63,6 +67,9 @@ class Controls:
         reasons: what a reflection in phrases may state: only what has a reason ``in_view``, as far as the
             model can know, or ``any`` statement (`model.engines.reason_mask`).
         logprobs: draws tell how likely each of their decisions was.
+        imagine: who decides whether a picture is imagined: ``auto`` leaves it to the model. For formats that
+            imagine.
+        camera: whose picture is imagined, if one is; the prompt asks for it. None leaves it to the model.
     """
 
     thinking: Thinking = "adaptive"
@@ -78,6 +85,8 @@ class Controls:
     bind: bool = False
     reasons: Reasons = "in_view"
     logprobs: bool = False
+    imagine: Imagine = "auto"
+    camera: str | None = None
 
     def __post_init__(self) -> None:
         if self.thinking not in ("adaptive", "always", "never"):
@@ -87,6 +96,13 @@ class Controls:
                 raise RequestError(f"{name} must be least_error or drawn, got {decision!r}")
         if self.reasons not in ("in_view", "any"):
             raise RequestError(f"reasons must be in_view or any, got {self.reasons!r}")
+        if self.imagine not in ("auto", "never", "always"):
+            raise RequestError(f"imagine must be auto, never or always, got {self.imagine!r}")
+        if self.camera is not None:
+            if self.camera not in CAMERAS:
+                raise RequestError(f"unknown camera {self.camera!r}; known are {', '.join(CAMERAS)}")
+            if self.imagine == "never":
+                raise RequestError("camera has no meaning with imagine: never")
         if not isinstance(self.n, int) or not 1 <= self.n <= MAX_DRAWS:
             raise RequestError(f"n must be a whole number in 1..{MAX_DRAWS}, got {self.n}")
         if not 0.0 <= self.temperature <= 2.0:
@@ -102,6 +118,11 @@ class Controls:
                 raise RequestError("think_threshold only has a meaning with thinking: adaptive")
             if not 0.0 <= self.think_threshold <= 1.0:
                 raise RequestError(f"think_threshold must lie in 0..1, got {self.think_threshold}")
+
+    @property
+    def imagines(self) -> bool | None:
+        """Whether these controls decide for a picture; None leaves it to the draw."""
+        return None if self.imagine == "auto" else self.imagine == "always"
 
     def second_look(self, think_probability: float) -> bool | None:
         """Whether these controls decide for a second look; None leaves it to the draw."""
@@ -153,6 +174,8 @@ class Draw:
         reasons: the statements that its reflection could make; None where it could make any.
         logprobs: of each token's choice, see `model.engines.logprobs`; None where the token is forced. Empty
             where `Controls.logprobs` does not ask for them.
+        section_logprobs: of each section's text, the sum over its choices; empty likewise.
+        foreseen: what its family reads of it as perceived and foreseen; None where it tells of neither.
     """
 
     index: int
@@ -172,6 +195,8 @@ class Draw:
     ids: tuple[int, ...] = ()
     reasons: tuple[str, ...] | None = None
     logprobs: tuple[float | None, ...] = ()
+    section_logprobs: Mapping[str, float] = field(default_factory=dict)
+    foreseen: Foreseen | None = None
 
     @property
     def at_10_hz(self) -> FloatArray:
@@ -242,6 +267,7 @@ class ModelCard:
         inputs: what it takes of a scene beside pictures and history: ``route``, ``tracks``.
         prompt_tokens: of a scene that brings all of these.
         input_tokens: of them, how many each of ``inputs`` takes.
+        paints: whether it can paint the pictures that it imagines.
         details: anything else worth showing, JSON-like.
     """
 
@@ -255,6 +281,7 @@ class ModelCard:
     inputs: tuple[str, ...] = ("route",)
     prompt_tokens: int = 0
     input_tokens: Mapping[str, int] = field(default_factory=dict)
+    paints: bool = False
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -315,6 +342,14 @@ class Engine(Protocol):
             RequestError: at the first iteration, when the request cannot be served.
             ImageError: at the first iteration, when a picture is damaged.
             EngineError: when decoding failed.
+        """
+        ...
+
+    def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
+        """An imagined picture, uint8 RGB [112, 224, 3], of its 98 codes; takes ms of the caller's thread.
+
+        Raises:
+            RequestError: the checkpoint has no codes of pictures (`ModelCard.paints`).
         """
         ...
 

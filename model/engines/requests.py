@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from model.driving.plan import Plan
 from model.driving.trajectory import GeometryError, check_trajectory
@@ -15,6 +15,7 @@ from model.formats.cursor import CompiledFormat, Cursor
 from model.formats.pieces import FormatError
 from model.formats.text import parse
 from model.network.codec import TrajectoryCodec
+from model.network.visual_codes import Frame, VisualCodes
 from model.network.vocabulary import Vocabulary
 
 
@@ -31,7 +32,7 @@ def begin(
 
     Raises:
         RequestError: it can never be served: an unknown format, a missing camera, a prefill that the format
-            cannot write, or an attempt that its family does not refine.
+            cannot write, an attempt that its family does not refine, or a picture that it does not imagine.
     """
     if request.format not in formats:
         known = ", ".join(formats)
@@ -40,8 +41,9 @@ def begin(
     if request.controls.prefill is not None and family.first_plan is None:
         raise RequestError(f"prefill: responses in format {request.format!r} have no plan to be given")
     _check_attempt(request, family)
+    picks = decided(request, family)
     try:
-        start = formats[request.format].start(given_plans(request, family))
+        start = formats[request.format].start(given_plans(request, family), picks)
     except FormatError as error:
         raise RequestError(f"prefill: {error}") from error
     cameras = {clip.camera for clip in request.scene.clips}
@@ -59,6 +61,16 @@ def _check_attempt(request: PlanRequest, family: Family) -> None:
             check_trajectory(request.attempt.trajectory, family.times_s)
         except GeometryError as error:
             raise RequestError(f"attempt: {error}") from error
+
+
+def decided(request: PlanRequest, family: Family) -> dict[str, str]:
+    """The options that the caller has decided, by the name of their choice; raises `RequestError`."""
+    controls = request.controls
+    if family.imagination is not None:
+        return family.imagination.picks(controls.imagines, controls.camera)
+    if controls.imagine != "auto" or controls.camera is not None:
+        raise RequestError(f"imagine: responses in format {request.format!r} imagine no pictures")
+    return {}
 
 
 def given_plans(request: PlanRequest, family: Family) -> dict[str, Plan]:
@@ -112,6 +124,23 @@ def read(
             ids=ids,
             reasons=None if reason_mask is None or reading.reflection is None else reason_mask.statements,
             logprobs=tuple(response.logprobs) if request.controls.logprobs else (),
+            section_logprobs=_by_section(response) if request.controls.logprobs else {},
+            foreseen=reading.foreseen,
         )
         for index in draws
     ]
+
+
+def _by_section(response: Response) -> dict[str, float]:
+    """How likely the text of each section was, as a logarithm."""
+    sums = dict.fromkeys((token.section for token in response.tokens), 0.0)
+    for token, logprob in zip(response.tokens, response.logprobs, strict=True):
+        sums[token.section] += logprob or 0.0
+    return sums
+
+
+def painted(visual_codes: VisualCodes | None, codes: Sequence[int]) -> Frame:
+    """The picture uint8 [112, 224, 3] of 98 codes; raises `RequestError` without codes of pictures."""
+    if visual_codes is None:
+        raise RequestError("this checkpoint has no codes of pictures to paint with")
+    return visual_codes.decode(codes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import zlib
-from collections.abc import AsyncGenerator, Iterable
+from collections.abc import AsyncGenerator, Iterable, Sequence
 from contextlib import aclosing
 from dataclasses import asdict
 from pathlib import Path
@@ -12,12 +12,15 @@ from typing import Any, Final
 
 import msgpack
 import numpy as np
+import numpy.typing as npt
 
 from model.driving.hashing import hash_of, scene_hash
+from model.driving.perceived import Perceived, PerceivedAgent
 from model.driving.plan import Plan, parse_plan
 from model.engines.engine import Draw, DrawFinished, Engine, Event, Load, ModelCard, PlanRequest, Started
+from model.families.family import Foreseen, NextPicture
 
-_SCHEMA_VERSION: Final = 2
+_SCHEMA_VERSION: Final = 3
 """Part of every key, so that a draw that is kept otherwise is none that is known."""
 
 
@@ -78,6 +81,10 @@ class KeptDraws:
         """The engine's."""
         self._engine.cancel(request_id)
 
+    def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
+        """The engine's."""
+        return self._engine.paint(codes)
+
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """See `Engine.submit`."""
         assert self._kept is not None, "an engine is started before it is asked"
@@ -113,6 +120,7 @@ def _packed(draws: Iterable[Draw]) -> bytes:
             "revised_plan": _text(draw.revised_plan),
             "trajectory": draw.trajectory.astype("<f4").tobytes(),
             "tokens": dict(draw.tokens),
+            "foreseen": None if draw.foreseen is None else asdict(draw.foreseen),
         }
         for draw in draws
     ]
@@ -128,11 +136,21 @@ def _unpacked(packed: bytes) -> list[Draw]:
                 "plan": _plan(record["plan"]),
                 "revised_plan": _plan(record["revised_plan"]),
                 "trajectory": np.frombuffer(record["trajectory"], "<f4").reshape(-1, 4),
+                "foreseen": _foreseen(record["foreseen"]),
                 **{name: tuple(record[name]) for name in ("codes", "times_s", "ids", "logprobs")},
             }
         )
         for record in records
     ]
+
+
+def _foreseen(record: dict[str, Any] | None) -> Foreseen | None:
+    if record is None:
+        return None
+    perceived, picture = record["perceived"], record["picture"]
+    agents = tuple(PerceivedAgent(**agent) for agent in perceived["agents"])
+    told = None if picture is None else NextPicture(picture["camera"], tuple(picture["codes"]))
+    return Foreseen(**record | {"perceived": Perceived(**perceived | {"agents": agents}), "picture": told})
 
 
 def _text(plan: Plan | None) -> str | None:

@@ -12,7 +12,7 @@ from model.driving.plan import Plan
 from model.driving.scene import CAMERAS
 from model.driving.thoughts import Thoughts
 from model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, check_times
-from model.formats.pieces import Format, Values, choices
+from model.formats.pieces import Format, FormatError, Values, choices, with_picks
 
 
 class FamilyError(ValueError):
@@ -77,45 +77,38 @@ class TextInputs:
     values: Callable[[Situation], Values]
 
 
-Decode = Callable[[Sequence[int]], FloatArray]
-"""Makes a trajectory float32 [64, 4] of codes, with the checkpoint's codec and the scene's history."""
-
-
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """What a response says. What it does not say is None.
+@dataclass(frozen=True)
+class Imagination:
+    """The choice at which a response imagines a picture of a camera or does not; controls may decide it.
 
     Attributes:
-        trajectory: float32 [t, 4] in the ego frame, at the family's times.
-        codes: the trajectory codes that it was decoded from, if any.
-        plan: the first one, or the one that the caller gave.
-        branch: the option that was taken.
-        reflection: what is wrong with the first plan, in words; without a plan, the thoughts that lead to the
-            trajectory.
-        revised_plan: what takes its place.
+        name: of the choice.
+        imagined, unseen: its options.
+        camera: the name of the choice of the camera.
+        cameras: how the format writes each of `CAMERAS`.
+        section: that holds the picture's codes.
     """
 
-    trajectory: FloatArray
-    codes: tuple[int, ...] = ()
-    plan: Plan | None = None
-    branch: str | None = None
-    reflection: str | None = None
-    revised_plan: Plan | None = None
+    name: str
+    imagined: str
+    unseen: str
+    camera: str
+    cameras: Mapping[str, str]
+    section: str
+
+    def picks(self, imagines: bool | None, camera: str | None) -> dict[str, str]:
+        """The options that are decided, by choice.
+
+        Args:
+            imagines: whether there is to be a picture; None where the model decides.
+            camera: whose; None where the model decides.
+        """
+        picks = {} if imagines is None else {self.name: self.imagined if imagines else self.unseen}
+        return picks if camera is None else picks | {self.camera: self.cameras[camera]}
 
 
-@dataclass(frozen=True)
-class Reflection:
-    """A counterfactual example's own parts: a plan of the model's own, and why it is to be corrected.
-
-    ``thinking`` is empty where it is not: such a plan is acted on. ``revised_plan`` is what the reasoning
-    leads to, where that is not the expert's plan in all tracks. ``judged`` says whether it is known that the
-    plan deserves a second look, or none; otherwise nothing is taught of the branch.
-    """
-
-    first_plan: Plan
-    thinking: str
-    revised_plan: Plan | None = None
-    judged: bool = True
+Decode = Callable[[Sequence[int]], FloatArray]
+"""Makes a trajectory float32 [64, 4] of codes, with the checkpoint's codec and the scene's history."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +129,63 @@ class NextPicture:
     def __post_init__(self) -> None:
         if self.camera not in CAMERAS:
             raise FamilyError(f"unknown camera {self.camera!r}; known are {', '.join(CAMERAS)}")
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """What a response sees around it, and half a second ahead.
+
+    Attributes:
+        perceived: who is around, and where the road ends.
+        x_m, y_m: where the ego will be in half a second, in its frame of now.
+        direction: where it turns: Left, Forward or Right.
+        picture: what a camera will see then; None where it imagines nothing.
+    """
+
+    perceived: Perceived
+    x_m: float
+    y_m: float
+    direction: str
+    picture: NextPicture | None
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What a response says. What it does not say is None.
+
+    Attributes:
+        trajectory: float32 [t, 4] in the ego frame, at the family's times.
+        codes: the trajectory codes that it was decoded from, if any.
+        plan: the first one, or the one that the caller gave.
+        branch: the option that was taken.
+        reflection: what is wrong with the first plan, in words; without a plan, the thoughts that lead to the
+            trajectory.
+        revised_plan: what takes its place.
+        foreseen: what is perceived and foreseen before that.
+    """
+
+    trajectory: FloatArray
+    codes: tuple[int, ...] = ()
+    plan: Plan | None = None
+    branch: str | None = None
+    reflection: str | None = None
+    revised_plan: Plan | None = None
+    foreseen: Foreseen | None = None
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """A counterfactual example's own parts: a plan of the model's own, and why it is to be corrected.
+
+    ``thinking`` is empty where it is not: such a plan is acted on. ``revised_plan`` is what the reasoning
+    leads to, where that is not the expert's plan in all tracks. ``judged`` says whether it is known that the
+    plan deserves a second look, or none; otherwise nothing is taught of the branch.
+    """
+
+    first_plan: Plan
+    thinking: str
+    revised_plan: Plan | None = None
+    judged: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +230,11 @@ class Family:
         title: what tables of measures call it; its name without one.
         dialects: other formats of the same name, for checkpoints whose reflections are written otherwise.
         refines: whether its prompts hold an `Attempt`, which every request then has to bring.
+        imagination: where it may imagine a picture.
 
     Raises:
-        FamilyError: the format lacks a section or the branch that is declared, or times do not ascend.
+        FamilyError: the format lacks a section, the branch or the imagination that is declared, or times do
+            not ascend.
     """
 
     format: Format
@@ -199,9 +251,11 @@ class Family:
     title: str | None = None
     dialects: Mapping[ReflectionLanguage, Format] = field(default_factory=dict)
     refines: bool = False
+    imagination: Imagination | None = None
 
     def __post_init__(self) -> None:
         declared = (
+            None if self.imagination is None else self.imagination.section,
             *(self.trajectory, self.first_plan, self.reflection, self.revised_plan),
             None if self.branch is None else self.branch.name,
         )
@@ -216,6 +270,17 @@ class Family:
             if self.reflection is None and self.revised_plan is None:
                 raise FamilyError(f"family {self.name!r}: a second look writes a reflection or a plan")
             _check_branch(self.name, self.format, self.branch)
+        if self.imagination is not None:
+            self._check_imagination(self.imagination)
+
+    def _check_imagination(self, imagination: Imagination) -> None:
+        try:
+            for imagines in (True, False):
+                with_picks(self.format.body, imagination.picks(imagines, None))
+            for camera in CAMERAS:
+                with_picks(self.format.body, imagination.picks(True, camera))
+        except (FormatError, KeyError) as error:
+            raise FamilyError(f"family {self.name!r}: imagination: {error}") from None
 
     @property
     def name(self) -> str:

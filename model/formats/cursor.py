@@ -32,6 +32,7 @@ from model.formats.pieces import (
     Texts,
     Values,
     narrowing_sections,
+    with_picks,
 )
 from model.formats.plan_tracks import with_given
 from model.formats.starts import check, first_bytes
@@ -146,13 +147,21 @@ class CompiledFormat:
         self._narrowing = narrowing_sections(format.body)
         check(self)
 
-    def start(self, given: Mapping[str, Plan] | None = None) -> Cursor:
+    def start(
+        self, given: Mapping[str, Plan] | None = None, picks: Mapping[str, str] | None = None
+    ) -> Cursor:
         """A cursor at the beginning; plans of the sections in ``given`` are forced, equal neighbours joined.
 
+        Args:
+            given: plans by section.
+            picks: by the name of a choice, the text of the option that is to be taken.
+
         Raises:
-            FormatError: ``given`` names a section without a plan, or a plan beyond the format.
+            FormatError: ``given`` names a section without a plan, or a plan beyond the format; or ``picks`` a
+                choice or an option that there is not.
         """
-        return self._enter((self.body(given), "", None), None)
+        body = self.body(given)
+        return self._enter((with_picks(body, picks) if picks else body, "", None), None)
 
     def body(self, given: Mapping[str, Plan] | None = None) -> Piece:
         """The format's declaration, with the plans of the sections in ``given`` forced; see `start`."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 import collections.abc
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
@@ -340,6 +340,39 @@ def walk(piece: Piece) -> Iterator[Piece]:
 def choices(piece: Piece) -> Iterator[Choice]:
     """The choices within ``piece``."""
     return (each for each in walk(piece) if isinstance(each, Choice))
+
+
+def with_picks(body: Piece, picks: Mapping[str, str]) -> Piece:
+    """``body`` with choices made beforehand: of each named choice, the option of that text alone is left.
+
+    Raises:
+        FormatError: there is no such choice, or it has no such option.
+    """
+    left = set(picks)
+    picked = _with_picks(body, picks, left)
+    if left:
+        raise FormatError(f"the format has no choice {min(left)!r}")
+    return picked
+
+
+def _with_picks(piece: Piece, picks: Mapping[str, str], left: set[str]) -> Piece:
+    match piece:
+        case Section(name, body):
+            return Section(name, _with_picks(body, picks, left))
+        case Sequence(parts):
+            return Sequence(tuple(_with_picks(part, picks, left) for part in parts))
+        case Choice(options, name):
+            if name is not None and name in picks:
+                left.discard(name)
+                options = tuple(option for option in options if option.text == picks[name])
+                if not options:
+                    raise FormatError(f"choice {name!r} has no option {picks[name]!r}")
+            behind = (replace(each, then=_with_picks(each.then, picks, left)) for each in options)
+            return replace(piece, options=tuple(behind))
+        case Maybe(inner, name):
+            return Maybe(_with_picks(inner, picks, left), name)
+        case _:
+            return piece
 
 
 def _sections(piece: Piece) -> Iterator[str]:

@@ -184,6 +184,7 @@ def read_parts(folder: Path) -> Parts:
                 - inputs.longest_prompt(settings.formats[0], ())
                 for name in settings.inputs
             },
+            paints=visual_codes is not None,
             details=card["details"],
         ),
         visual_codes=visual_codes,

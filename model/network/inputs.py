@@ -79,8 +79,12 @@ class InputBuilder:
         """int64 [cameras, 3]."""
         return np.array([self.settings.grid] * len(self.settings.cameras), np.int64)
 
-    def build(self, scene: Scene, format: str, attempt: Attempt | None = None) -> ModelInputs:
+    def build(
+        self, scene: Scene, format: str, attempt: Attempt | None = None, camera: str | None = None
+    ) -> ModelInputs:
         """The inputs of ``scene`` for a response in ``format``, which may refine an attempt.
+
+        ``camera`` is the one whose next picture is asked for, if any.
 
         Raises:
             SceneError: a camera is missing.
@@ -89,7 +93,7 @@ class InputBuilder:
             FormatError: its family says of the scene what its prompt cannot say.
         """
         route, tracks = self.way(scene), self.tracks(scene)
-        situation = Situation(scene.history, route, attempt)
+        situation = Situation(scene.history, route, attempt, camera)
         return ModelInputs(
             prompt=self.prompt(format, situation, tracks=tracks is not None),
             patches=np.concatenate([self.patches(pictures) for pictures in self.slices(scene)]),

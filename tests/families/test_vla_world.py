@@ -19,11 +19,13 @@ from model.driving.images import encode_png
 from model.driving.labeller import expert_plan
 from model.driving.perceived import perceived_of
 from model.driving.scene import LabelledScene, NextFrame
-from model.engines.engine import Controls, Draw, PlanRequest
+from model.engines.engine import Controls, Draw, PlanRequest, RequestError
+from model.engines.requests import begin
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.torch.runner import Runner
 from model.evaluation.open_loop import evaluate_draws
+from model.families.cf_vla import CF_VLA
 from model.families.family import FamilyError, Lesson, NextPicture
 from model.families.vla_world import VLA_WORLD
 from model.families.vla_world.format import TIMES_S, UNSEEN, VISUAL_CODES
@@ -97,6 +99,80 @@ def test_it_writes_what_the_reference_does(world: Loaded) -> None:
         assert len(CODE.findall(draw.text)) == (VISUAL_CODES if "visual" in draw.tokens else 0)
         assert (draw.thinking is None) == ("<think></think>" in draw.text)
         assert {"perception", "prediction", "imagine", "think", "action", "answer"} <= set(draw.tokens)
+
+
+@pytest.mark.parametrize(
+    ("controls", "pictures", "camera"),
+    [
+        ({"imagine": "always"}, 3, None),
+        ({"imagine": "always", "camera": "front_left"}, 3, "front_left"),
+        ({"imagine": "always", "camera": "front"}, 3, "front"),
+        ({"imagine": "never"}, 0, None),
+    ],
+)
+def test_callers_decide_whether_it_imagines_and_which_camera(
+    world: Loaded, controls: dict[str, Any], pictures: int, camera: str | None
+) -> None:
+    draws = planned(world, n=3, numbers="drawn", seed=3, logprobs=True, **controls)
+    seen = [draw.foreseen.picture for draw in draws if draw.foreseen is not None and draw.foreseen.picture]
+    assert len(seen) == pictures
+    assert camera is None or {picture.camera for picture in seen} == {camera}
+    for draw in draws:
+        assert draw.foreseen is not None
+        assert draw.section_logprobs.keys() == draw.tokens.keys()
+        told = [int(code[9:13]) for code in CODE.findall(draw.text)]
+        assert told == list(draw.foreseen.picture.codes if draw.foreseen.picture else ())
+        # What the caller decides is no choice of the model's.
+        assert draw.section_logprobs["imagine"] == 0
+        codes = [
+            logprob
+            for token, logprob in zip(draw.ids, draw.logprobs, strict=True)
+            if token in world.vocabulary.alphabets["visual"][0]
+        ]
+        assert all(logprob is not None and logprob < 0 for logprob in codes)
+        if camera is not None:
+            assert draw.section_logprobs["visual"] == pytest.approx(sum(filter(None, codes)))
+
+
+def test_the_camera_that_is_asked_for_stands_in_the_prompt(world: Loaded) -> None:
+    scene = noisy_scene(1, route=True)
+    for camera, told in (("back", "Camera: CAM_BACK\n"), (None, "Camera: ANY\n")):
+        built = world.inputs.build(scene, "vla_world", camera=camera)
+        assert told in world.vocabulary.decode(built.prompt.ids.tolist())
+
+
+def test_what_cannot_be_imagined_is_refused_by_name(world: Loaded) -> None:
+    with pytest.raises(RequestError, match="camera has no meaning with imagine: never"):
+        Controls(imagine="never", camera="front")
+    with pytest.raises(RequestError, match="unknown camera 'rear'"):
+        Controls(camera="rear")
+    plain = {"cf_vla": CF_VLA}
+    compiled = {"cf_vla": CompiledFormat(CF_VLA.format, world.vocabulary)}
+    for controls in (Controls(imagine="always"), Controls(imagine="never"), Controls(camera="front")):
+        asked = PlanRequest("a", noisy_scene(), "cf_vla", controls)
+        with pytest.raises(RequestError, match="'cf_vla' imagine no pictures"):
+            begin(asked, world.card, plain, compiled)
+    imagination = VLA_WORLD.imagination
+    assert imagination is not None
+    with pytest.raises(FamilyError, match="imagination: the format has no choice 'see'"):
+        replace(VLA_WORLD, imagination=replace(imagination, name="see"))
+
+
+def test_what_it_foresees_is_read_in_our_axes(world: Loaded) -> None:
+    labelled = labelled_scene(9.0, agents=(agent(15.0, 0.0), agent(30.0, 3.5)))
+    lesson = lesson_of(labelled, NextPicture("back_left", tuple(range(VISUAL_CODES))))
+    assert VLA_WORLD.teach is not None
+    foreseen = VLA_WORLD.read(VLA_WORLD.teach(lesson), lambda codes: labelled.future).foreseen
+    assert foreseen is not None
+    assert lesson.perceived is not None
+    assert foreseen.picture == lesson.next_picture
+    for read, taught in zip(foreseen.perceived.agents, lesson.perceived.agents, strict=True):
+        assert (read.kind, read.near_s) == (taught.kind, taught.near_s)
+        told = (read.x_m, read.y_m, read.length_m, read.width_m)
+        assert told == pytest.approx((taught.x_m, taught.y_m, taught.length_m, taught.width_m), abs=0.051)
+    assert (foreseen.x_m, foreseen.y_m) == pytest.approx(labelled.future[4, :2], abs=0.051)
+    assert foreseen.perceived.left_m == pytest.approx(lesson.perceived.left_m, abs=0.051)
+    assert foreseen.direction == "Forward"
 
 
 def test_waypoints_of_least_error_are_expected_ones(world: Loaded) -> None:

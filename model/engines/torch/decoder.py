@@ -274,7 +274,8 @@ class Decoder:
         for tree in trees:
             assert tree.kv_row is not None
             asked = tree.request.plan_request
-            scenes.append(Asked(asked.scene, asked.format, tree.kv_row, asked.attempt))
+            camera = asked.controls.camera
+            scenes.append(Asked(asked.scene, asked.format, tree.kv_row, asked.attempt, camera))
         events: list[StepEvent] = []
         for tree, begun in zip(trees, self._runner.begin_prompts(scenes), strict=True):
             if tree.request.phase is Phase.ENDED:

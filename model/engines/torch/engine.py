@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import queue
 import time
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +24,7 @@ from model.engines.engine import (
     RequestError,
 )
 from model.engines.pictures import PictureThreads
+from model.engines.requests import painted
 from model.engines.torch.decoder import Counts, Decoder, Failed
 from model.engines.torch.frames import Frames
 from model.engines.torch.graphs import CudaGraph
@@ -35,6 +36,7 @@ from model.engines.warm_up import warm_up
 from model.network.allocator import FreedMemory
 from model.network.checkpoint import load
 from model.network.precision import bfloat16_is_fast
+from model.network.visual_codes import Frame
 
 _DRAWS_A_SCENE: Final = 6
 """That most requests ask for."""
@@ -173,6 +175,10 @@ class TorchEngine:
         finally:
             if self._listeners.pop(request.request_id, None):
                 self.cancel(request.request_id)
+
+    def paint(self, codes: Sequence[int]) -> Frame:
+        """An imagined picture; see `Engine.paint`."""
+        return painted(self._loaded.visual_codes, codes)
 
     def cancel(self, request_id: str) -> None:
         """Drop a request; unknown ids are ignored."""

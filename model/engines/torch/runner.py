@@ -59,6 +59,7 @@ class Asked(NamedTuple):
     format: str
     kv_row: int
     attempt: Attempt | None = None
+    camera: str | None = None
 
 
 @dataclass(eq=False)
@@ -332,9 +333,9 @@ class Runner:
         return self._decoder(embeddings, rotation, attention, wanted.to(device) if len(wanted) else None)
 
     def _begin_prompt(self, asked: Asked, encoded: Encoded) -> Prompt:
-        loaded, (scene, format, kv_row, attempt) = self.loaded, asked
+        loaded, (scene, format, kv_row, attempt, camera) = self.loaded, asked
         route, tracks = loaded.inputs.way(scene), loaded.inputs.tracks(scene)
-        situation = Situation(scene.history, route, attempt)
+        situation = Situation(scene.history, route, attempt, camera)
         prompt = loaded.inputs.prompt(format, situation, tracks=tracks is not None)
         embedded = loaded.model.embed_prompt(prompt, encoded.tokens, scene.history, route, tracks)
         shown = format.encode() + encoded.digest

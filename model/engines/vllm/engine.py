@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import os
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, Mapping, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -20,7 +20,7 @@ from model.engines.engine import EngineError, Event, Load, ModelCard, PlanReques
 from model.engines.least_error import LeastError
 from model.engines.pictures import PictureThreads
 from model.engines.reason_mask import reason_mask_of
-from model.engines.requests import begin
+from model.engines.requests import begin, painted
 from model.engines.vllm.decoding import Decoding, VllmPrompt
 from model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
 from model.engines.warm_up import warm_up
@@ -29,6 +29,7 @@ from model.families.registry import families_of
 from model.formats.cursor import Active, CompiledFormat, Cursor, Rest
 from model.formats.grammar_export import to_lark
 from model.network.checkpoint import read_parts
+from model.network.visual_codes import Frame
 
 _ENVIRONMENT: Final = {"VLLM_NO_USAGE_STATS": "1", "HF_HUB_OFFLINE": "1", "VLLM_CPU_KVCACHE_SPACE": "2"}
 """Unless set otherwise: nothing is sent or fetched; 2 GiB of keys and values where there is no GPU."""
@@ -157,27 +158,36 @@ class VllmEngine:
         self._running[request.request_id] = decoding
         try:
             scene, format, attempt = request.scene, request.format, request.attempt
-            prompt = await self._pictures.run(lambda: self.prompt(scene, format, attempt), scene.pictures)
+            camera = request.controls.camera
+            prompt = await self._pictures.run(
+                lambda: self.prompt(scene, format, attempt, camera), scene.pictures
+            )
             async with aclosing(decoding.events(prompt)) as events:
                 async for event in events:
                     yield event
         finally:
             del self._running[request.request_id]
 
+    def paint(self, codes: Sequence[int]) -> Frame:
+        """An imagined picture; see `Engine.paint`."""
+        return painted(self._parts.visual_codes, codes)
+
     def cancel(self, request_id: str) -> None:
         """Drop a request; unknown ids are ignored."""
         if decoding := self._running.get(request_id):
             decoding.fail(EngineError("the request was cancelled"))
 
-    def prompt(self, scene: Scene, format: str, attempt: Attempt | None = None) -> VllmPrompt:
-        """A scene as vLLM takes it, with the attempt that is to be refined.
+    def prompt(
+        self, scene: Scene, format: str, attempt: Attempt | None = None, camera: str | None = None
+    ) -> VllmPrompt:
+        """A scene as vLLM takes it, with the attempt that is to be refined, and the camera to be imagined.
 
         Raises:
             RequestError: the scene cannot be made into inputs (a missing camera).
             ImageError: a picture is damaged.
         """
         try:
-            inputs = self._parts.inputs.build(scene, format, attempt)
+            inputs = self._parts.inputs.build(scene, format, attempt, camera)
         except ImageError:
             raise
         except ValueError as error:

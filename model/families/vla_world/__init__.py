@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from model.families.family import Family
+from model.families.family import Family, Imagination
 from model.families.vla_world import format as its
 from model.families.vla_world.inputs import INPUTS
 from model.families.vla_world.read import read
@@ -26,5 +26,8 @@ VLA_WORLD: Final = Family(
     times_s=its.TIMES_S,
     teach=teach,
     title="perceive-think-answer",
+    imagination=Imagination(
+        its.IMAGINE, its.IMAGINED, its.UNSEEN, its.CAMERA, cameras=its.CAMERA_OPTIONS, section=its.VISUAL
+    ),
 )
 """perception, prediction, a picture or none, think, action, answer"""

@@ -52,6 +52,8 @@ VISUAL_SIZE: Final = 1000
 """How many different codes there are."""
 CAMERA_OPTIONS: Final = {camera: f"CAM_{camera.upper()}" for camera in CAMERAS}
 """How each of our cameras is written."""
+CAMERA: Final = "camera"
+"""The choice of the camera whose picture it is."""
 IMAGINED: Final = f"<{VISUAL}>"
 UNSEEN: Final = "\n"
 """The options of that choice; they begin with different tokens, so that one token decides it."""
@@ -146,7 +148,7 @@ _PICTURE: Final = Section(
         (
             Codes(VISUAL_ALPHABET, VISUAL_CODES, VISUAL_SIZE),
             Literal(" These are the visual tokens of "),
-            Choice(tuple(map(Option, CAMERA_OPTIONS.values())), name="camera"),
+            Choice(tuple(map(Option, CAMERA_OPTIONS.values())), name=CAMERA),
             Literal(f" image at the 0.5 second in the future.</{VISUAL}>"),
         )
     ),

@@ -40,10 +40,8 @@ def test_the_same_seed_drives_and_films_the_same_episode(filmed: Filmed, rig: Ri
 
 
 def test_next_frames_are_what_the_scene_half_a_second_later_shows(filmed: Filmed, rig: Rig) -> None:
-    scenes = labelled_scenes(filmed.log, rig, 1.0, with_dense=False, with_next=True)
+    first = next(labelled_scenes(filmed.log, rig, 1.0, with_dense=False, with_next=True))
     assert not any(labelled.next_frames for labelled in filmed.scenes)
-    first = next(scenes)
-    scenes.close()
     assert first.scene.scene_id == filmed.scenes[0].scene.scene_id
     later = filmed.scenes[1].scene
     assert later.scene_id.endswith("-0020")

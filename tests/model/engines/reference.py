@@ -78,7 +78,7 @@ def reference(
 def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> tuple[Draw, Shares]:
     model: Any = loaded.model
     controls = request.controls
-    inputs = loaded.inputs.build(request.scene, request.format, request.attempt)
+    inputs = loaded.inputs.build(request.scene, request.format, request.attempt, controls.camera)
     prompt = model.encode_prompt_embeddings(inputs)
     cache = DynamicCache(config=model.config)
     logits = model(
@@ -91,7 +91,8 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
     if controls.prefill is not None and family.first_plan is not None:
         given[family.first_plan] = controls.prefill
     compiled = CompiledFormat(family.format, loaded.vocabulary)
-    cursor = compiled.start(given)
+    imagination = family.imagination
+    cursor = compiled.start(given, imagination.picks(None, controls.camera) if imagination else None)
     tokens: list[Token] = []
     binding = binding_of(request, loaded.codec, loaded.vocabulary)
     facts = model.read_facts(prompt.embeddings[inputs.prompt.ids == model.config.video_token_id])
@@ -113,6 +114,9 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
                 left = thinks == (controls.thinking == "always")
             elif controls.think_threshold is not None:
                 left = thinks == (think_probability > controls.think_threshold)
+        if imagination is not None and allowed.choice == imagination.name and controls.imagine != "auto":
+            wanted = imagination.imagined if controls.imagine == "always" else imagination.unseen
+            left = np.array([wanted in cursor.option_texts(int(id)) for id in allowed.ids])
         if binding is not None and (bound := binding.leaves(allowed.ids, tokens, family.plans)) is not None:
             left = bound
         if reason_mask is not None and (named := reason_mask.leaves(cursor, tokens)) is not None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from model.driving.plan import Plan
 from model.driving.trajectory import FloatArray, constant_velocity
@@ -17,6 +18,7 @@ from model.engines.engine import (
     Load,
     ModelCard,
     PlanRequest,
+    RequestError,
     SectionFinished,
 )
 
@@ -78,6 +80,9 @@ class FakeEngine:
 
     def cancel(self, request_id: str) -> None:
         return None
+
+    def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
+        raise RequestError("a fake paints nothing")
 
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         self.requests.append(request)

@@ -8,14 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from model.driving.perceived import Perceived, PerceivedAgent
 from model.driving.plan import parse_plan
 from model.engines.engine import Controls, Draw, DrawFinished, Engine, EngineError, Event, PlanRequest
 from model.evaluation.kept import KeptDraws
+from model.families.family import Foreseen, NextPicture
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import FakeEngine, draw_of
 
 SCENE = labelled_scene().scene
 PLAN = parse_plan("- longitudinal\n  - 0.0s-3.2s: Wait\n  - 3.2s-6.4s: Accelerate\n")
+PERCEIVED = Perceived((PerceivedAgent("vehicle", 9.0, 1.0, 4.5, 2.0, None),), 1.5, 4.0)
 ASKED = PlanRequest("a", SCENE, "cf_vla", Controls(n=3, prefill=PLAN))
 
 
@@ -53,6 +56,8 @@ def test_draws_come_back_whole(tmp_path: Path) -> None:
     whole = replace(
         draw_of(SCENE.history.repeat(4, 0).astype(np.float32), PLAN, PLAN, 2),
         text="…", think_probability=0.1, passes=7, chosen=5, cut="shortened",
+        foreseen=Foreseen(PERCEIVED, 5.0, 0.5, "Left", NextPicture("back", (1, 2, 3))),
+        section_logprobs={"visual": -7.5},
     )  # fmt: skip
 
     class One(FakeEngine):
