@@ -24,7 +24,7 @@ import msgpack
 from httpx_sse import EventSource
 from pydantic import BaseModel
 
-from clients import wire, wire_feedback, wire_refine, wire_scores
+from clients import wire, wire_feedback, wire_imagine, wire_refine, wire_scores
 from clients.answers import (
     BUSY_STATUSES,
     BadAnswer,
@@ -48,7 +48,14 @@ from clients.answers import (
     told,
     unreachable,
 )
-from clients.requests import attempt_at, label_request, plan_request, refine_request, reflect_request
+from clients.requests import (
+    attempt_at,
+    imagine_request,
+    label_request,
+    plan_request,
+    refine_request,
+    reflect_request,
+)
 from clients.wire_values import with_pictures
 from model.driving.outcome import Outcome
 from model.driving.plan import Plan
@@ -74,6 +81,7 @@ __all__ = [
     "ServiceFailed",
     "Told",
     "attempt_at",
+    "imagine_request",
     "label_request",
     "plan_request",
     "refine_request",
@@ -246,6 +254,10 @@ class PlannerClient:
         answer = self._ask("/v1/refine", request, deadline_ms=request.controls.deadline_ms)
         return read(answer, wire_refine.RefineResponse)
 
+    def imagine(self, request: wire_imagine.ImagineRequest) -> wire_imagine.ImagineResponse:
+        """See what a camera will see (`imagine_request` makes the body); raises `PlannerError`."""
+        return read(self._ask("/v1/imagine", request), wire_imagine.ImagineResponse)
+
     def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""
         return self._model_list().models
@@ -376,6 +388,10 @@ class AsyncPlannerClient:
         """Have a draft refined by feedback on it; see `PlannerClient.refine`."""
         answer = await self._ask("/v1/refine", request, deadline_ms=request.controls.deadline_ms)
         return read(answer, wire_refine.RefineResponse)
+
+    async def imagine(self, request: wire_imagine.ImagineRequest) -> wire_imagine.ImagineResponse:
+        """See what a camera will see; see `PlannerClient.imagine`."""
+        return read(await self._ask("/v1/imagine", request), wire_imagine.ImagineResponse)
 
     async def models(self) -> list[wire.ModelCard]:
         """The models behind the service; raises `PlannerError`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from clients import wire, wire_refine
+from clients import wire, wire_imagine, wire_refine
 from clients.wire_values import rows, wire_agents, wire_scene
 from model.driving.outcome import Outcome
 from model.driving.plan import Plan
@@ -60,6 +60,15 @@ def refine_request(
         threshold=threshold,
         controls=controls,
     )
+
+
+def imagine_request(
+    scene: Scene,
+    camera: wire.Camera,
+    controls: wire_imagine.ImagineControls = wire_imagine.ImagineControls(),
+) -> wire_imagine.ImagineRequest:
+    """The body of POST /v1/imagine for what ``camera`` sees half a second after ``scene``."""
+    return wire_imagine.ImagineRequest(scene=wire_scene(scene), camera=camera, controls=controls)
 
 
 def label_request(

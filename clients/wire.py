@@ -33,6 +33,7 @@ Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
 Reasons = Literal["in_view", "any"]
 Branch = Literal["Action:", "Thinking:"]
+Imagine = Literal["auto", "never", "always"]
 Cut = Literal["skipped", "shortened", "replaced"]
 AgentKind = Literal["vehicle", "pedestrian", "cone", "barrier"]
 Light = Literal["brake", "left", "right"]
@@ -260,6 +261,16 @@ class Controls(ReflectControls):
     prefill: PlanGiven | None = Field(
         default=None,
         description="The first plan, given instead of written by the model: bullet text, or tracks.",
+    )
+    imagine: Imagine = Field(
+        default="auto",
+        description="Who decides whether a picture half a second ahead is imagined: auto leaves it to the "
+        "model. For formats that imagine, which GET /v1/models lists; refused by others.",
+    )
+    camera: Camera | None = Field(
+        default=None,
+        description="Whose picture is imagined, where one is; it need not be in the scene. null leaves it to "
+        "the model.",
     )
 
 
@@ -570,6 +581,12 @@ class ModelCard(Answered):
     formats: list[str] = Field(description="Response formats it writes.")
     refines: list[str] = Field(
         default_factory=list, description="Of these, the ones that refine an attempt, which they need."
+    )
+    imagines: list[str] = Field(
+        default_factory=list, description="Of these, the ones that may imagine a picture half a second ahead."
+    )
+    paints: bool = Field(
+        default=False, description="Whether it can paint what it imagines, as POST /v1/imagine asks."
     )
     cameras: list[str] = Field(description="Cameras it needs; a scene must have a clip of each.")
     image_size: Annotated[list[int], Field(min_length=2, max_length=2)] = Field(

@@ -58,6 +58,8 @@ def model_card(card: ModelCard) -> wire.ModelCard:
         engine=card.engine,
         formats=list(card.formats),
         refines=[name for name in card.formats if family_named(name).refines],
+        imagines=[name for name in card.formats if family_named(name).imagination is not None],
+        paints=card.paints,
         cameras=list(card.cameras),
         image_size=list(card.image_size),
         parameters=card.parameters,

@@ -191,7 +191,7 @@ def _kind(fault: dict[str, Any]) -> Kind:
         place = place[1:]
     if fault["type"] == "extra_forbidden":
         return UNKNOWN_FIELD
-    if place[:3] == ("scene", "clips", "camera") and fault["type"] == "literal_error":
+    if place[-1:] == ("camera",) and fault["type"] == "literal_error":
         return UNKNOWN_CAMERA
     for start, kind in _KIND_BY_PLACE:
         if place[: len(start)] == start:

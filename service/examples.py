@@ -45,6 +45,12 @@ def example_refinement(cameras: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
+def example_imagining(cameras: tuple[str, ...]) -> dict[str, Any]:
+    """The same scene, and a camera whose next picture is to be imagined."""
+    scene = example_request(cameras)["scene"]
+    return {"scene": scene, "camera": "front_left", "controls": {"n": 2, "seed": 7}}
+
+
 def example_score() -> dict[str, Any]:
     """Two trajectories behind a slower car: one brakes, one does not."""
 

@@ -26,6 +26,7 @@ from model.engines.engine import Controls, ModelCard, PlanRequest, RequestError
 from model.families.family import Attempt
 from model.families.registry import family_named
 from service.problems import (
+    CANNOT_IMAGINE,
     INVALID_ATTEMPT,
     INVALID_CLIP,
     INVALID_CONTROLS,
@@ -73,9 +74,10 @@ def engine_request(
     if isinstance(asked, wire.ReflectRequest):
         controls = _controls(asked.controls, plan_of(asked.plan, "/plan"))
     else:
+        _check_imagining(asked.controls, format)
         given = asked.controls.prefill
         prefill = None if given is None else plan_of(given, "/controls/prefill")
-        controls = _controls(asked.controls, prefill)
+        controls = _controls(asked.controls, prefill, asked.controls.imagine, asked.controls.camera)
         attempt = _attempt(asked.attempt, format)
     return PlanRequest(engine_id, scene_of(asked.scene), format, controls, attempt, live=asked.stream)
 
@@ -83,6 +85,15 @@ def engine_request(
 def format_of(asked: wire.PlanRequest | wire.ReflectRequest, card: ModelCard) -> str:
     """The response format of what was ``asked``: the model's first where none is named."""
     return card.default_format if asked.format is None else asked.format
+
+
+def _check_imagining(asked: wire.Controls, format: str) -> None:
+    """Raise `ProblemError` where a choice to imagine is made for a format that cannot."""
+    if family_named(format).imagination is not None:
+        return
+    for name, value, left_open in (("imagine", asked.imagine, "auto"), ("camera", asked.camera, None)):
+        if value != left_open:
+            raise at(CANNOT_IMAGINE, f"/controls/{name}", f"{format} imagines no pictures; leave it out")
 
 
 def _attempt(asked: wire.Attempt | None, format: str) -> Attempt | None:
@@ -177,7 +188,12 @@ def _limit(values: np.ndarray[tuple[int, ...], np.dtype[np.floating]], largest: 
         raise at(INVALID_HISTORY, f"/scene/history/{worst + 1}", f"the ego {problem}")
 
 
-def _controls(asked: wire.ReflectControls, prefill: Plan | None) -> Controls:
+def _controls(
+    asked: wire.ReflectControls,
+    prefill: Plan | None,
+    imagine: wire.Imagine = "auto",
+    camera: wire.Camera | None = None,
+) -> Controls:
     try:
         return Controls(
             thinking=asked.thinking,
@@ -193,6 +209,8 @@ def _controls(asked: wire.ReflectControls, prefill: Plan | None) -> Controls:
             bind=asked.bind,
             reasons=asked.reasons,
             logprobs=asked.logprobs,
+            imagine=imagine,
+            camera=camera,
         )
     except RequestError as error:
         raise at(INVALID_CONTROLS, "/controls", str(error)) from None

@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import secrets
 import time
-from collections.abc import AsyncGenerator, Generator
+from collections.abc import AsyncGenerator, Callable, Generator, Sequence
 from contextlib import AbstractContextManager, ExitStack, aclosing, contextmanager
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
+import numpy as np
+import numpy.typing as npt
 import structlog
 
 import clients.wire as wire
@@ -89,6 +91,7 @@ class Planned:
         card: the model that answered.
         timing: where the time went.
         deadline: what became of it; None where none was set.
+        paint: paints the pictures that its draws imagine; takes ms, so not for the event loop.
     """
 
     draws: tuple[Draw, ...]
@@ -97,6 +100,7 @@ class Planned:
     card: ModelCard
     timing: wire.Timing
     deadline: wire.Deadline | None
+    paint: Callable[[Sequence[int]], npt.NDArray[np.uint8]]
 
 
 Told = Event | Judged | Planned
@@ -213,7 +217,7 @@ class Planning:
             if deadline_met is not None:
                 cut = [draw.index for draw in draws if draw.cut is not None]
                 deadline = wire.Deadline(met=deadline_met, cut=cut)
-            yield Planned(tuple(draws), agreements, drafts, engine.card, timing, deadline)
+            yield Planned(tuple(draws), agreements, drafts, engine.card, timing, deadline, engine.paint)
 
     async def _checked(self, asked: Asked, card: ModelCard, arrival: Arrival) -> PlanRequest:
         engine_id = f"{arrival.request_id}/{secrets.token_hex(4)}"

@@ -54,6 +54,7 @@ INVALID_LABELS: Final = Kind("invalid-labels", 422, "The labels are not ones to 
 INVALID_TRAJECTORY: Final = Kind("invalid-trajectory", 422, "A trajectory cannot be scored")
 INVALID_ATTEMPT: Final = Kind("invalid-attempt", 422, "The attempt is not one that the format refines")
 INVALID_FEEDBACK: Final = Kind("invalid-feedback", 422, "The feedback is not of the form, or tells no facts")
+CANNOT_IMAGINE: Final = Kind("cannot-imagine", 422, "The model imagines no such pictures")
 OTHER_PLAN: Final = Kind("other-plan", 422, "The feedback is for another plan")
 UNKNOWN_FORMAT: Final = Kind("unknown-format", 422, "The model does not write this response format")
 REFUSED: Final = Kind("request-refused", 422, "The model cannot serve this request")

@@ -16,6 +16,7 @@ from service.answers import model_card
 from service.auth import NOBODY
 from service.callers import while_connected
 from service.feedback_routes import feedback_router
+from service.imagine_routes import imagine_router
 from service.labelling import label, teacher_name
 from service.openai_routes import openai_router
 from service.openapi import PACKED, Responses, payloads, problems
@@ -78,6 +79,7 @@ def make_router(parts: Parts) -> APIRouter:
     router = APIRouter()
     router.include_router(planning_router(parts))
     router.include_router(refine_router(parts))
+    router.include_router(imagine_router(parts))
     router.include_router(openai_router(parts))
     _add_labelling(router, parts)
     bundled = BundledScenes(parts.settings.bundled_scenes)

@@ -22,16 +22,16 @@ ALLOWED = {
     "clients.importers": ("clients.importers", "clients.navsim", "model.driving"),
     "loadtests": ("loadtests", "clients", "model.driving"),
     "service": (
-        *("service", "clients.wire", "clients.wire_feedback", "clients.wire_refine", "clients.wire_scores"),
-        *("clients.wire_values", "clients.labelling.teachers", "model"),
+        *("service", "clients.wire", "clients.wire_feedback", "clients.wire_imagine", "clients.wire_refine"),
+        *("clients.wire_scores", "clients.wire_values", "clients.labelling.teachers", "model"),
     ),
     "service.cli": EVERYTHING,
     "deploy": ("deploy", "service", "model.bundled"),
 }
 TORCH_FREE = ("model.driving", "model.formats", "model.families", "clients", "loadtests")
 LIGHT = (
-    *("clients.wire", "clients.wire_feedback", "clients.wire_refine", "clients.wire_scores"),
-    "clients.planner",
+    *("clients.wire", "clients.wire_feedback", "clients.wire_imagine", "clients.wire_refine"),
+    *("clients.wire_scores", "clients.planner"),
 )
 LIGHT_IMPORTS = ("numpy", "PIL", "httpx", "httpx_sse", "msgpack", "pydantic", "model", "clients")
 

@@ -25,6 +25,7 @@ JUDGED = {"scene_id": None, **example_feedback()}
 _JUDGED_ONLY = {"said", "threshold", "mode", "command", "ground_truth"}
 DRAFT = example_refinement(("front_wide_120",))["draft"]
 REFINES = "elf_vla_refine"
+IMAGINES = "vla_world"
 ATTEMPT = {"trajectory": DRAFT, "times_s": [0.5 * step for step in range(1, 9)], "feedback": "Brake."}
 ATTEMPTED = {"format": REFINES, "attempt": ATTEMPT}
 PICTURES = [

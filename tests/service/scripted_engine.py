@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
+from model.driving.perceived import Perceived, PerceivedAgent
 from model.driving.plan import GROUPS, Plan, parse_plan
 from model.driving.trajectory import FUTURE_STEPS, STEP_S, TEN_HZ_S, FloatArray, at_times, present_speed
 from model.engines.engine import (
@@ -22,10 +24,12 @@ from model.engines.engine import (
     Load,
     ModelCard,
     PlanRequest,
+    RequestError,
     SectionFinished,
     Started,
     TextWritten,
 )
+from model.families.family import Foreseen, NextPicture
 
 CARD: Final = ModelCard(
     name="scripted",
@@ -142,6 +146,12 @@ class ScriptedEngine:
         finally:
             self.finished += 1
 
+    def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
+        if not self.card_shown.paints:
+            raise RequestError("it paints nothing")
+        grey = np.resize(np.array(codes) // 4, (7, 14)).astype(np.uint8)
+        return np.kron(grey[..., None], np.ones((16, 16, 3), np.uint8))
+
     def cancel(self, request_id: str) -> None:
         self.cancelled.append(request_id)
 
@@ -182,8 +192,17 @@ def _draw(request: PlanRequest, index: int) -> Draw:
         chosen=20,
         ids=(11, 12, 13 + index),
         logprobs=(None, -0.25, -1.5) if controls.logprobs else (),
+        section_logprobs={"visual": -400.0 - index},
+        foreseen=_foreseen(controls.camera, luck) if controls.imagine == "always" else None,
     )
     return replace(direct, thinking=REASONING, revised_plan=SLOW_DOWN) if think else direct
+
+
+def _foreseen(camera: str | None, luck: random.Random) -> Foreseen:
+    """A car ahead, and a picture of any colours."""
+    ahead = PerceivedAgent("vehicle", 20.0, 0.0, 4.5, 1.9, 2.0)
+    picture = NextPicture(camera or "front", tuple(luck.randrange(1000) for _ in range(98)))
+    return Foreseen(Perceived((ahead,), 1.7, 5.2), 5.0, 0.0, "Forward", picture)
 
 
 def _draft(request: PlanRequest, draw: Draw) -> Draw:

@@ -323,6 +323,7 @@ def test_types_are_stable() -> None:
         "invalid-scene-file": 422,
         "invalid-attempt": 422,
         "invalid-feedback": 422,
+        "cannot-imagine": 422,
         "other-plan": 422,
         "feedback-refused": 502,
         "internal": 500,

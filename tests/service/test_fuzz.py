@@ -15,7 +15,7 @@ import pytest
 from model.driving.scene import FRONT_WIDE
 from service.keys import new_line
 from service.settings import Settings
-from tests.service.fuzz_hooks import REFINES
+from tests.service.fuzz_hooks import IMAGINES, REFINES
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
 
@@ -24,7 +24,9 @@ CHECKS = (
     *("not_a_server_error", "status_code_conformance", "content_type_conformance"),
     *("response_schema_conformance", "response_headers_conformance"),
 )
-WITH_SCENES = "^/v1/(plan|plan/batch|reflect|refine|label|score|score/batch|feedback|chat/completions)$"
+WITH_SCENES = (
+    "^/v1/(plan|plan/batch|reflect|refine|imagine|label|score|score/batch|feedback|chat/completions)$"
+)
 CONFIG = """
 # That a picture is one, and that a history can be driven, no schema can say: such bodies get a 422.
 [checks]
@@ -55,7 +57,7 @@ def key_and_service(
     (folder / "keys").write_text(line)
     settings = Settings(bundled_scenes=scene_file, api_keys_file=folder / "keys", checkpoints=folder)
     engine = ScriptedEngine()
-    engine.card_shown = replace(engine.card, formats=(*engine.card.formats, REFINES))
+    engine.card_shown = replace(engine.card, formats=(*engine.card.formats, REFINES, IMAGINES), paints=True)
     with serve(engine, settings, headers={"Authorization": f"Bearer {key}"}) as served:
         yield key, served
 
@@ -97,7 +99,8 @@ def test_nothing_around_whole_scenes_can_break_the_service(tmp_path: Path, scene
         engine.card,
         cameras=(FRONT_WIDE,),
         inputs=("route", "tracks"),
-        formats=(*engine.card.formats, REFINES),
+        formats=(*engine.card.formats, REFINES, IMAGINES),
+        paints=True,
     )
     settings = Settings(bundled_scenes=scene_file, api_keys_file=tmp_path / "keys")
     options = ("--include-path-regex", WITH_SCENES, "--phases", "coverage", "--checks", ",".join(CHECKS))

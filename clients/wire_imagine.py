@@ -1,0 +1,121 @@
+"""The contract of POST /v1/imagine: a scene and a camera in, pictures of half a second later out.
+
+Source: VLA-World (arXiv 2604.09059), section 3.4.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+from pydantic import Field
+
+from clients.wire import (
+    MAX_SEED,
+    AgentKind,
+    Answered,
+    Asked,
+    Camera,
+    Decision,
+    Finite,
+    Length,
+    ModelName,
+    Nearby,
+    Scene,
+    Timing,
+)
+
+SECONDS_AHEAD: Final = 0.5
+PICTURE_CODES: Final = 98
+
+
+class ImagineControls(Asked):
+    """What the caller decides about decoding."""
+
+    n: int = Field(default=1, ge=1, le=64, description="Pictures.")
+    temperature: float = Field(default=1.0, ge=0, le=2, description="0 takes the likeliest allowed token.")
+    top_p: float = Field(default=1.0, gt=0, le=1, description="Nucleus mass; 1 keeps all allowed tokens.")
+    seed: int = Field(
+        default=0,
+        ge=0,
+        le=MAX_SEED,
+        description="The same request and seed give the same pictures; on a CPU to the last byte.",
+    )
+    numbers: Decision = Field(
+        default="least_error",
+        description="How metres are chosen: least_error takes the ones of least expected error, drawn draws "
+        "them as words are.",
+    )
+
+
+class ImagineRequest(Asked):
+    """Body of POST /v1/imagine."""
+
+    scene: Scene
+    camera: Camera = Field(
+        description="Whose picture is to be imagined; it need not be among the cameras of the scene."
+    )
+    controls: ImagineControls = Field(default=ImagineControls(), description="n pictures are made.")
+
+
+class PerceivedObject(Answered):
+    """One road user or obstacle that the model tells of, now, in the ego frame."""
+
+    kind: AgentKind
+    x_m: Nearby = Field(description="Centre of its box.")
+    y_m: Nearby
+    length_m: Length
+    width_m: Length
+    near_s: float | None = Field(
+        description="When the model expects it in the safe zone around the ego; null for never."
+    )
+
+
+class Perception(Answered):
+    """What the model sees around the ego."""
+
+    objects: list[PerceivedObject] = Field(description="The nearest first, at most 8.")
+    left_m: float = Field(ge=0, description="From the ego's left side to the edge of the road.")
+    right_m: float = Field(ge=0, description="The same on the right.")
+
+
+class Prediction(Answered):
+    """Where the ego will be when the imagined picture is taken, in its frame of now."""
+
+    x_m: Finite
+    y_m: Finite
+    direction: str = Field(description="Left, Forward or Right.")
+
+
+class ImaginedPicture(Answered):
+    """One of the n pictures, and what the model said before it."""
+
+    index: int = Field(ge=0, description="0..n-1.")
+    image: str = Field(description="PNG in base64, 224 x 112 pixels, painted of the codes.")
+    codes: Annotated[
+        list[int],
+        Field(
+            min_length=PICTURE_CODES,
+            max_length=PICTURE_CODES,
+            description="98 codes of 0..999, row by row from the upper left, 14 in a row.",
+        ),
+    ]
+    logprob: float = Field(
+        le=0,
+        allow_inf_nan=False,
+        description="Natural logarithm of the probability of all codes, at the request's temperature (0 "
+        "counts as 1), behind what was perceived and predicted.",
+    )
+    perception: Perception
+    prediction: Prediction
+
+
+class ImagineResponse(Answered):
+    """Answer of POST /v1/imagine."""
+
+    request_id: str
+    model: ModelName
+    format: str = Field(description="The model's first format that imagines.")
+    camera: Camera
+    seconds: float = Field(description="How far ahead the pictures are.")
+    pictures: list[ImaginedPicture]
+    timing: Timing

@@ -1,0 +1,52 @@
+"""POST /v1/imagine."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Body, Request
+from fastapi.openapi.models import Example
+
+import clients.wire_imagine as wire_imagine
+from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from service.callers import while_connected
+from service.examples import example_imagining
+from service.imagining import imagine_answer, imagining_of
+from service.openapi import PACKED, payloads, problems
+from service.parts import Parts
+from service.payloads import payload_route
+from service.planning import last
+from service.planning_routes import REFUSALS, arrival_of, respond
+from service.problems import CANNOT_IMAGINE
+
+EXAMPLES: Final[dict[str, Example]] = {
+    "what the left camera will see": {"value": example_imagining((FRONT_WIDE, FRONT_TELE))}
+}
+
+
+def imagine_router(parts: Parts) -> APIRouter:
+    """The endpoint; pictures take places as draws of /v1/plan do."""
+    router = APIRouter(route_class=payload_route(lambda _: parts.planning.check_open()), tags=["planning"])
+
+    @router.post(
+        "/v1/imagine",
+        response_model=wire_imagine.ImagineResponse,
+        responses=problems(*REFUSALS, CANNOT_IMAGINE) | PACKED,
+        openapi_extra=payloads(wire_imagine.ImagineRequest),
+    )
+    async def imagine(
+        request: Request, asked: Annotated[wire_imagine.ImagineRequest, Body(openapi_examples=EXAMPLES)]
+    ) -> Any:
+        """What a camera will see in half a second: n pictures, and what the model perceives and predicts."""
+        arrival = arrival_of(request)
+
+        async def work() -> wire_imagine.ImagineResponse:
+            imagining = imagining_of(asked, parts.lifecycle.card)
+            planned = await last(parts.planning.events(imagining.planning, arrival))
+            # On a thread: painting must not hold up the answers of others.
+            return await asyncio.to_thread(imagine_answer, imagining, planned, arrival)
+
+        return respond(request, await while_connected(request, work()))
+
+    return router
