@@ -18,12 +18,14 @@ from clients.planner import PlannerClient
 from model.driving.images import encode_png
 from model.driving.labeller import expert_plan
 from model.driving.perceived import perceived_of
-from model.driving.scene import LabelledScene, NextFrame
+from model.driving.scene import Clip, LabelledScene, NextFrame
 from model.engines.engine import Controls, Draw, PlanRequest, RequestError
 from model.engines.requests import begin
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.engine import TorchEngine, TorchSettings
+from model.engines.torch.present_picture import present_picture
 from model.engines.torch.runner import Runner
+from model.engines.torch.shortcuts import Shortcuts
 from model.evaluation.open_loop import evaluate_draws
 from model.families.cf_vla import CF_VLA
 from model.families.family import FamilyError, Lesson, NextPicture
@@ -34,7 +36,7 @@ from model.formats.cursor import CompiledFormat
 from model.formats.grammar_export import to_lark
 from model.network.checkpoint import Loaded, load, save
 from model.network.settings import VlaSettings
-from model.network.visual_codes import VisualCodes
+from model.network.visual_codes import VisualCodes, frame_of
 from model.network.vocabulary import END_OF_TEXT, Vocabulary
 from model.training.batches import Item, ResponseDataset
 from model.training.examples import Examples
@@ -132,6 +134,57 @@ def test_callers_decide_whether_it_imagines_and_which_camera(
         assert all(logprob is not None and logprob < 0 for logprob in codes)
         if camera is not None:
             assert draw.section_logprobs["visual"] == pytest.approx(sum(filter(None, codes)))
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_what_the_camera_sees_now_saves_passes_and_changes_nothing(world: Loaded, n: int) -> None:
+    controls = Controls(n=n, imagine="always", camera="front_left", numbers="drawn", seed=4)
+    asked = PlanRequest("a", noisy_scene(1, route=True), "vla_world", controls)
+    random = np.random.default_rng(0)
+    [ids] = world.vocabulary.alphabets["visual"]
+
+    def drawn(picture: tuple[int, ...], shortcuts: Shortcuts = Shortcuts()) -> tuple[list[Draw], int]:
+        with torch.inference_mode():
+            decoder = Decoder(Runner(world, 2 * n), shortcuts, clock=lambda: 0.0)
+            decoder.add(asked, picture=picture)
+            draws = decode(decoder)
+        return [draws["a", index] for index in range(n)], decoder.counts.passes
+
+    plain, passes = drawn((), replace(Shortcuts(), speculate=False))
+    with torch.inference_mode():
+        expected = reference_draws(world, asked)
+    assert [draw.text for draw in plain] == [draw.text for draw in expected]
+    wanted = [ids[int(code[9:13])] for code in CODE.findall(plain[0].text)]
+    half = tuple(code if random.random() < 0.5 else ids[random.integers(1000)] for code in wanted)
+    wrong = tuple(ids[code] for code in random.integers(0, 1000, VISUAL_CODES))
+    told = {name: drawn(picture) for name, picture in (("half", half), ("all", tuple(wanted)), ("no", wrong))}
+    for name, (draws, took) in told.items():
+        assert [(draw.text, draw.ids) for draw in draws] == [(draw.text, draw.ids) for draw in plain], name
+        for one, other in zip(draws, plain, strict=True):
+            np.testing.assert_array_equal(one.trajectory, other.trajectory)
+        assert took <= passes, name
+    if n == 1:
+        assert told["half"][1] < passes - 30
+        assert told["all"][1] < passes - 70
+
+
+def test_the_present_picture_is_what_the_asked_camera_shows_last(world: Loaded) -> None:
+    torch.manual_seed(0)
+    painting = replace(world, visual_codes=VisualCodes(24).eval())
+    scene = noisy_scene(1)
+    wide, _ = scene.clips
+
+    def told(parts: Loaded, camera: str | None) -> tuple[int, ...]:
+        return present_picture(PlanRequest("a", scene, "vla_world", Controls(camera=camera)), parts)
+
+    assert painting.visual_codes is not None
+    [ids] = world.vocabulary.alphabets["visual"]
+    codes = painting.visual_codes.encode(frame_of(wide.images[-1])).tolist()
+    assert told(painting, wide.camera) == tuple(ids[code] for code in codes)
+    assert told(world, wide.camera) == told(painting, "back") == told(painting, None) == ()
+    broken = replace(scene, clips=(*scene.clips, Clip("back", (wide.images[0][:200],) * 4)))
+    request = PlanRequest("a", broken, "vla_world", Controls(camera="back"))
+    assert present_picture(request, painting) == ()
 
 
 def test_the_camera_that_is_asked_for_stands_in_the_prompt(world: Loaded) -> None:

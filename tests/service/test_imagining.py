@@ -22,6 +22,7 @@ from clients.planner import AsyncPlannerClient, PlannerClient, RequestRefused, i
 from clients.wire_imagine import ImagineControls, ImagineRequest, ImagineResponse
 from model.driving.scene import CAMERAS
 from model.engines.torch.engine import TorchEngine, TorchSettings
+from model.engines.torch.shortcuts import Shortcuts
 from model.network.checkpoint import load, save
 from model.network.settings import VlaSettings
 from model.network.visual_codes import VisualCodes, load_visual_codes
@@ -94,6 +95,16 @@ def test_the_same_seed_imagines_the_same_and_another_camera_something_else(
     assert imagined(served, asked()).pictures == first.pictures
     assert imagined(served, asked(camera="back")).pictures != first.pictures
     assert imagined(served, asked(controls={"n": 2, "seed": 8})).pictures != first.pictures
+
+
+def test_what_the_camera_sees_now_changes_no_picture(served: Served[TorchEngine], checkpoint: Path) -> None:
+    settings = TorchSettings(rows=4, products=None, shortcuts=replace(Shortcuts(), speculate=False))
+    request = asked(camera=SEEN[0])
+    with serve(TorchEngine(checkpoint, settings), Settings()) as plain:
+        expected = imagined(plain, request)
+    assert imagined(served, request).pictures == expected.pictures
+    other = asked(camera=SEEN[0], scene=asked()["scene"] | {"route": None})
+    assert imagined(served, other).pictures != expected.pictures
 
 
 def test_clients_imagine_too_in_both_kinds(served: Served[TorchEngine]) -> None:

@@ -30,6 +30,7 @@ from model.engines.torch.batch import Batch, Feed
 from model.engines.torch.deadlines import LatencyModel, drafts_of
 from model.engines.torch.drafter import Drafter
 from model.engines.torch.integrity import check
+from model.engines.torch.present_picture import present_picture
 from model.engines.torch.request import Phase, Request, Tree
 from model.engines.torch.rows import Row
 from model.engines.torch.runner import ROWS_A_TREE, Asked, Runner
@@ -119,6 +120,7 @@ class Decoder:
         plan_request: PlanRequest,
         submitted_s: float | None = None,
         binding: Binding | None = None,
+        picture: tuple[int, ...] | None = None,
     ) -> None:
         """Queue a request.
 
@@ -126,6 +128,7 @@ class Decoder:
             plan_request: what is asked.
             submitted_s: when, on the decoder's clock, its deadline counts from; now if it is not given.
             binding: of the request, see `binding_of`; made here if it is not given.
+            picture: likewise, see `present_picture`.
 
         Raises:
             RequestError: it can never be served: unknown format, too many draws, a missing camera, a
@@ -139,6 +142,8 @@ class Decoder:
         family = self._runner.families[plan_request.format]
         request = Request(plan_request, family, origin, arrived_s, self._least_error)
         request.binding = binding or binding_of(plan_request, loaded.codec, loaded.vocabulary)
+        if self._shortcuts.speculate:
+            request.picture = present_picture(plan_request, loaded) if picture is None else picture
         request.draws_a_tree = self._scheduler.draws_a_tree(request)
         request.plant(share=self._shortcuts.shared_rows)
         if not self._scheduler.fits(request):

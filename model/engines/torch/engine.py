@@ -28,6 +28,7 @@ from model.engines.requests import painted
 from model.engines.torch.decoder import Counts, Decoder, Failed
 from model.engines.torch.frames import Frames
 from model.engines.torch.graphs import CudaGraph
+from model.engines.torch.present_picture import present_picture
 from model.engines.torch.runner import Runner
 from model.engines.torch.shortcuts import Shortcuts
 from model.engines.torch.threads import FreeCores, fit_threads
@@ -163,8 +164,10 @@ class TorchEngine:
         # Now and not when the thread gets to it, which may be a long step later.
         submitted_s = time.monotonic()
         try:
-            binding = await self._pictures.run(lambda: self._prepared(request), request.scene.pictures)
-            self._commands.put(lambda decoder: self._add(decoder, request, submitted_s, binding))
+            binding, picture = await self._pictures.run(
+                lambda: self._prepared(request), request.scene.pictures
+            )
+            self._commands.put(lambda decoder: self._add(decoder, request, submitted_s, binding, picture))
             remaining = request.controls.n
             while remaining:
                 event = await events.get()
@@ -185,16 +188,22 @@ class TorchEngine:
         self._tell(request_id, Failed(EngineError("the request was cancelled")))
         self._commands.put(lambda decoder: decoder.cancel(request_id))
 
-    def _prepared(self, request: PlanRequest) -> Binding | None:
+    def _prepared(self, request: PlanRequest) -> tuple[Binding | None, tuple[int, ...]]:
         """Do what would hold up the decoding thread."""
         self._frames.look_at(request.scene)
-        return binding_of(request, self._loaded.codec, self._loaded.vocabulary)
+        binding = binding_of(request, self._loaded.codec, self._loaded.vocabulary)
+        return binding, present_picture(request, self._loaded) if self._settings.shortcuts.speculate else ()
 
     def _add(
-        self, decoder: Decoder, request: PlanRequest, submitted_s: float, binding: Binding | None
+        self,
+        decoder: Decoder,
+        request: PlanRequest,
+        submitted_s: float,
+        binding: Binding | None,
+        picture: tuple[int, ...],
     ) -> None:
         try:
-            decoder.add(request, submitted_s, binding)
+            decoder.add(request, submitted_s, binding, picture)
         except RequestError as error:
             self._tell(request.request_id, Failed(error))
         except Exception as error:  # one request that cannot be read must not end the others

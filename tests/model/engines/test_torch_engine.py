@@ -174,9 +174,15 @@ def test_a_deadline_counts_from_submission(
         go_on.wait(60)
         return step(decoder)
 
-    def noted(decoder: Decoder, request: PlanRequest, stamp_s: float, binding: Binding | None) -> None:
+    def noted(
+        decoder: Decoder,
+        request: PlanRequest,
+        stamp_s: float,
+        binding: Binding | None,
+        picture: tuple[int, ...],
+    ) -> None:
         submitted_s[request.request_id] = stamp_s
-        add(decoder, request, stamp_s, binding)
+        add(decoder, request, stamp_s, binding, picture)
 
     async def test() -> None:
         async with running(untrained_checkpoint) as engine:
