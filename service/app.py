@@ -104,6 +104,7 @@ def create_app(
         BodyLimit,
         max_bytes=settings.max_body_bytes,
         max_held_bytes=settings.max_held_bytes,
+        large_bytes_per_s=settings.large_bytes_per_s,
         timeout_s=settings.body_timeout_s,
     )
     app.add_middleware(Guard, keys=keys, metrics=metrics, hosts=settings.answers_to())

@@ -25,6 +25,7 @@ class Settings(BaseSettings):
         bundled_scenes: scene file or folder that the inspector page offers; a missing one means no scenes.
         max_body_bytes: larger request bodies get a 413 problem.
         max_held_bytes: of the bodies of all requests under way; the one that goes beyond gets a 429 problem.
+        large_bytes_per_s: of bodies of more than 1 MB, as many are read a second, all together.
         max_scene_file_bytes: the same for scene files dropped onto the page.
         log_format: ``json`` for machines, ``console`` for people.
         api_keys_file: a line ``name:sha256`` for each key; without it everybody may ask.
@@ -56,6 +57,7 @@ class Settings(BaseSettings):
     bundled_scenes: Path = SCENES
     max_body_bytes: int = Field(default=24_000_000, gt=0)
     max_held_bytes: int = Field(default=256_000_000, gt=0)
+    large_bytes_per_s: int = Field(default=16_000_000, gt=0)
     max_scene_file_bytes: int = Field(default=8_000_000, gt=0)
     log_format: Literal["json", "console"] = "json"
     api_keys_file: Path | None = None

@@ -95,3 +95,19 @@ def test_large_bodies_leave_room_for_small_ones(engine: ScriptedEngine) -> None:
         assert served.http.post("/v1/plan", json=body()).status_code == 200
         held.close()
         served.until(lambda: served.http.post("/v1/plan", content=padded, headers=JSON).status_code == 200)
+
+
+def test_large_bodies_are_read_no_faster_than_their_pace(engine: ScriptedEngine) -> None:
+    """One that comes behind others is not there in time; small ones are read whatever large ones take."""
+    settings = Settings(max_body_bytes=2_000_000, large_bytes_per_s=10, body_timeout_s=2)
+    padded = (json.dumps(body()) + " " * 1_500_000).encode()
+    head = f"POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(padded)}\r\n\r\n"
+    with serve(engine, settings) as served:
+        assert served.http.post("/v1/plan", content=padded, headers=JSON).status_code == 200
+        host, port = served.url.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), timeout=30) as connection:
+            connection.sendall(head.encode() + padded)
+            assert served.http.post("/v1/plan", json=body()).status_code == 200
+            served.until(
+                lambda: served.metric("looktwice_requests_total", endpoint="/v1/plan", status="408") == 1
+            )
