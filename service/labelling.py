@@ -23,7 +23,8 @@ from clients.labelling.teachers.teacher import (
     ask,
 )
 from model.driving.outcome import Outcome
-from model.driving.scene import AGENT_KINDS, Agent
+from model.driving.scene import AGENT_KINDS, Agent, SceneError
+from model.driving.tracks import track_of
 from model.driving.view import Surroundings
 from service.intake import plan_of, scene_of
 from service.metrics import Metrics
@@ -144,4 +145,9 @@ def _agent(asked: wire.Agent, number: int) -> Agent:
         problem = f"unknown kind {asked.kind!r}; known are {', '.join(AGENT_KINDS)}"
         raise at(INVALID_REQUEST, f"/annotations/agents/{number}/kind", problem)
     poses = np.array([[np.nan] * 3 if row is None else row for row in asked.poses], np.float32)
-    return Agent(asked.agent_id, kind, asked.length_m, asked.width_m, _UNKNOWN_HEIGHT_M, poses)
+    agent = Agent(asked.agent_id, kind, asked.length_m, asked.width_m, _UNKNOWN_HEIGHT_M, poses)
+    try:
+        track_of(agent)  # teachers look at where it is now
+    except SceneError as error:
+        raise at(INVALID_REQUEST, f"/annotations/agents/{number}", str(error)) from None
+    return agent

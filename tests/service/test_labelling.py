@@ -81,6 +81,16 @@ def test_annotations_are_checked(served: Served) -> None:
     assert problem(served.http.post(PATH, json=document), "invalid-request")
 
 
+@pytest.mark.parametrize(
+    "change", [{"width_m": 99.0}, {"poses": [[90.0 * step, 0, 0] for step in range(80)]}]
+)
+def test_agents_that_no_road_user_can_be_are_told(served: Served, change: dict[str, Any]) -> None:
+    document = asking(served)
+    document["annotations"]["agents"][0] |= change
+    fault = problem(served.http.post(PATH, json=document), "invalid-request").errors[0]
+    assert fault.pointer == "/annotations/agents/0"
+
+
 class Listening(Upstream):
     """Notes what it is asked."""
 
