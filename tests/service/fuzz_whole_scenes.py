@@ -16,11 +16,13 @@ from model.driving.scene import FRONT_WIDE
 from service.examples import example_score
 from tests.service import fuzz_hooks
 from tests.service.fuzz_hooks import ATTEMPT, DRAFT, PICTURES, REAL
-from tests.service.scripted_engine import KEEP_ON
+from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN
 
 _SCORE = example_score()
 _LABELS = _SCORE["labels"]
 _RING = _LABELS["lanes"][0]["ring"]
+_OUTCOME = {"fails": ["collision"], "collided_s": 2.0, "hit": "standing vehicle"}
+_PLAN_OUTCOME = "#/components/schemas/PlanOutcome"
 
 
 def _one(*values: Any) -> dict[str, Any]:
@@ -62,6 +64,9 @@ WHOLE: dict[tuple[str, str], dict[str, Any]] = {
     ("Agent", "kind"): _one("vehicle"),
     ("Agent", "poses"): _one([[10.0, 0.0, 0.0]] * 80),
     ("Annotations", "lane_lines"): _one([[[0.0, 0.0], [50.0, 0.0]]]),
+    ("LabelRequest", "predicted_plan"): _one(str(KEEP_ON)),
+    ("LabelRequest", "expert_plan"): _one(str(SLOW_DOWN)),
+    ("LabelRequest", "outcome"): {"anyOf": [_one(_OUTCOME), {"$ref": _PLAN_OUTCOME}, {"type": "null"}]},
     ("ScoredAgent", "poses"): _one(_LABELS["agents"][0]["poses"]),
     ("ScoredLane", "ring"): _one(_RING),
     ("ClosedLane", "ring"): _one(_RING),

@@ -106,6 +106,7 @@ def test_nothing_around_whole_scenes_can_break_the_service(tmp_path: Path, scene
     options = ("--include-path-regex", WITH_SCENES, "--phases", "coverage", "--checks", ",".join(CHECKS))
     with serve(engine, settings, headers={"Authorization": f"Bearer {key}"}) as served:
         run(served, key, tmp_path, options, "tests.service.fuzz_whole_scenes", 3000)
+        assert served.metric("looktwice_labels_total", teacher="rules") > 0
 
 
 def run(
