@@ -2,22 +2,27 @@
 
 It clones the commit that is checked out and runs every block of commands in order, against the real service.
 The README's Python runs in an environment that holds nothing but what the README names. Of every command that
-the README lists it asks for the help. This takes a network and minutes, so `make test` leaves it out. Nothing
-but Python is needed, since the environments are made on the way.
+the README lists it asks for the help. This takes a network and minutes. Nothing but Python is needed, since
+the environments are made on the way.
+
+`make test` follows them too, without a network: see `follow_without_network`.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 from itertools import product, takewhile
 from pathlib import Path
 from typing import Final
@@ -26,8 +31,13 @@ from urllib.request import urlopen
 
 ROOT: Final = Path(__file__).parents[2]
 PORT: Final = 8000
-ELSEWHERE: Final = {"make test"}
-"""What continuous integration runs in a clean clone anyway, and takes half an hour."""
+ELSEWHERE: Final = {"make test": "continuous integration runs it in a clean clone anyway; half an hour"}
+"""Commands that are not run, and why."""
+_VIDEO: Final = "pip install -c constraints.txt -e '.[video]'"
+_MINUTE: Final = (
+    "looktwice scenes import tests/data/comma2k19/segment_40 minute.parquet --route",
+    "looktwice plan minute.parquet --limit 1",
+)
 ACTIVATE: Final = "source .venv/bin/activate"
 SERVE: Final = "looktwice serve"
 _READY_S: Final = 120.0
@@ -66,13 +76,17 @@ def listed(page: str) -> list[tuple[str, list[str]]]:
 class Newcomer:
     """Somebody in a folder, with a shell that remembers whether the environment was activated."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(
+        self, folder: Path, port: int = PORT, left_out: Mapping[str, str] = ELSEWHERE, *, network: bool = True
+    ) -> None:
+        self.folder, self.port, self.left_out, self.network = folder, port, left_out, network
         self.activated = False
 
     def environment(self) -> dict[str, str]:
         kept = {
-            name: value for name, value in os.environ.items() if name not in ("VIRTUAL_ENV", "PYTHONPATH")
+            name: value
+            for name, value in os.environ.items()
+            if name not in ("VIRTUAL_ENV", "PYTHONPATH") and not name.startswith("LOOKTWICE_")
         }
         venv = Path(sys.prefix)
         paths = [path for path in kept["PATH"].split(":") if Path(path) != venv / "bin"]
@@ -102,12 +116,17 @@ class Newcomer:
     def service(self) -> Iterator[None]:
         """The service, started as the README says; ended as Ctrl-C ends it."""
         began = time.monotonic()
+        elsewhere = [] if self.port == PORT else ["--port", str(self.port)]
         with tempfile.TemporaryFile("w+") as log:
             running = subprocess.Popen(
-                SERVE.split(), cwd=self.folder, env=self.environment(), stdout=log, stderr=log
+                [*SERVE.split(), *elsewhere],
+                cwd=self.folder,
+                env=self.environment(),
+                stdout=log,
+                stderr=log,
             )
             try:
-                while not _is_ready():
+                while not _is_ready(self.port):
                     if running.poll() is not None or time.monotonic() - began > _READY_S:
                         log.seek(0)
                         raise Faulty(f"{SERVE} does not get ready:\n{log.read()[-3000:]}")
@@ -121,9 +140,9 @@ class Newcomer:
             raise Faulty(f"{SERVE} ended with {code}")
 
 
-def _is_ready() -> bool:
+def _is_ready(port: int) -> bool:
     try:
-        with urlopen(f"http://localhost:{PORT}/readyz", timeout=5) as answer:
+        with urlopen(f"http://localhost:{port}/readyz", timeout=5) as answer:
             return bool(answer.status == 200)
     except (URLError, OSError):
         return False
@@ -131,11 +150,11 @@ def _is_ready() -> bool:
 
 def run_block(newcomer: Newcomer, block: str) -> None:
     """A block of commands, one after the other."""
-    for command in lines(block):
+    for command in lines(block.replace(f"localhost:{PORT}", f"localhost:{newcomer.port}")):
         if command == ACTIVATE:
             newcomer.run(command)
             newcomer.activated = True
-        elif command == SERVE or command in ELSEWHERE:
+        elif command == SERVE or command in newcomer.left_out:
             continue
         else:
             asks = command.startswith("curl -s ")
@@ -151,7 +170,8 @@ def follow_readme(newcomer: Newcomer) -> None:
     while not newcomer.activated:
         run_block(newcomer, rest.pop(0)[1])
     assert rest, "nothing behind the service"
-    check_pins(newcomer)
+    if newcomer.network:
+        check_pins(newcomer)
     for command, options in listed(page):
         told = newcomer.run(f"looktwice {command} --help")
         if missing := [option for option in options if option not in told]:
@@ -182,15 +202,66 @@ def _package(line: str) -> str:
 
 
 def run_python(newcomer: Newcomer, code: str) -> None:
-    """A snippet in an environment with the client alone, outside the clone."""
+    """A snippet outside the clone; where there is a network, in an environment with the client alone."""
     folder = newcomer.folder.parent / "client"
-    if not folder.exists():
+    if not newcomer.network:
+        folder.mkdir(exist_ok=True)
+        if not (folder / ".venv").exists():
+            (folder / ".venv").symlink_to(newcomer.folder / ".venv")
+    elif not folder.exists():
         newcomer.run(f"python3 -m venv {folder}/.venv")
         newcomer.run(f"{folder}/.venv/bin/pip install --quiet -c constraints.txt . pyarrow")
-    (folder / "snippet.py").write_text(code)
+    (folder / "snippet.py").write_text(code.replace(f"localhost:{PORT}", f"localhost:{newcomer.port}"))
     told = newcomer.run(".venv/bin/python snippet.py", folder=folder)
     if "done" not in told:
         raise Faulty(f"the snippet says:\n{told[-1000:]}")
+
+
+def follow_own_cameras(newcomer: Newcomer) -> None:
+    """Every command of docs/own-cameras.md."""
+    for language, block in blocks((newcomer.folder / "docs" / "own-cameras.md").read_text()):
+        if language == "bash":
+            run_block(newcomer, block)
+
+
+def follow_without_network(folder: Path, port: int) -> None:
+    """Both pages in a copy of what git carries here, with the packages that run this.
+
+    Not tried: the commands that are `left_out`; that `make plan` installs; that the client needs no more
+    than it names, and that constraints.txt pins all.
+
+    Raises:
+        Faulty: a command does not do what the page says.
+    """
+    newcomer = Newcomer(folder / "looktwice", port, left_out(), network=False)
+    listed_files = ("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard")
+    names = subprocess.run(listed_files, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in filter(None, names.split("\0")):
+        if (ROOT / name).is_file():
+            (newcomer.folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, newcomer.folder / name)
+    _installed(newcomer.folder)
+    follow_readme(newcomer)
+    follow_own_cameras(newcomer)
+
+
+def left_out() -> dict[str, str]:
+    """Commands of both pages that are not run without a network, and why."""
+    films = {} if find_spec("av") else dict.fromkeys(_MINUTE, "PyAV, which reads films, is not installed")
+    return ELSEWHERE | {_VIDEO: "it downloads packages"} | films
+
+
+def _installed(clone: Path) -> None:
+    """Give a clone the environment that `make plan` would: this one's packages, the clone's own modules."""
+    venv = clone / ".venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", venv], check=True)
+    (packages,) = venv.glob("lib/python*/site-packages")
+    (packages / "clone.pth").write_text(f"{clone}\n{sysconfig.get_path('purelib')}\n")
+    command = venv / "bin" / "looktwice"
+    command.write_text(f"#!{venv}/bin/python\nfrom service.cli import main\nmain()\n")
+    command.chmod(0o755)
+    for stage in (".created", ".torch", ".serve"):  # of the Makefile, in order
+        (venv / stage).touch()
 
 
 def main() -> None:
@@ -205,9 +276,7 @@ def main() -> None:
             newcomer.folder /= "looktwice"
             follow_readme(newcomer)
             began = time.monotonic()
-            for language, block in blocks((newcomer.folder / "docs" / "own-cameras.md").read_text()):
-                if language == "bash":
-                    run_block(newcomer, block)
+            follow_own_cameras(newcomer)
             print(f"{time.monotonic() - began:6.1f} s  docs/own-cameras.md in all", flush=True)
         except Faulty as fault:
             sys.exit(str(fault))

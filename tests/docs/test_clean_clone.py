@@ -1,15 +1,38 @@
-"""What `make test-readme` takes for commands; that run itself is a maintainer's."""
+"""Both pages run as they stand, without a network; `make test-readme` runs the rest, as a maintainer does."""
 
 from __future__ import annotations
 
 import re
+import socket
 from pathlib import Path
 
 import pytest
 
-from tests.docs.clean_clone import ACTIVATE, SERVE, blocks, lines, listed
+from tests.docs.clean_clone import (
+    ACTIVATE,
+    SERVE,
+    blocks,
+    follow_without_network,
+    left_out,
+    lines,
+    listed,
+)
 
 ROOT = Path(__file__).parents[2]
+PAGES = ("README.md", "docs/own-cameras.md")
+
+
+def test_every_command_and_snippet_does_what_the_pages_say(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    follow_without_network(tmp_path, port)
+
+
+def test_what_is_left_out_stands_in_the_pages() -> None:
+    commands = [
+        line for page in PAGES for _, block in blocks((ROOT / page).read_text()) for line in lines(block)
+    ]
+    assert left_out().keys() <= set(commands)
 
 
 def test_lines_are_joined_and_comments_left_out() -> None:
@@ -29,7 +52,7 @@ def test_alternatives_are_told_one_by_one_with_their_options() -> None:
     ]
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/own-cameras.md"])
+@pytest.mark.parametrize("name", PAGES)
 def test_no_command_hides_in_a_block_that_is_not_run(name: str) -> None:
     unread = [
         block for language, block in blocks((ROOT / name).read_text()) if language not in ("bash", "python")
