@@ -331,7 +331,7 @@ class TaskSampler(BatchSampler):
         drawn = random.choice(len(names), len(example), p=list(self._tasks.values()))
         given = self._given(example, random)
         tracks, mirror, blur = (self._drawn(name, len(example), random) for name in _CHANCES)
-        pictures = self._pictures(example, random)
+        taught = self._next_pictures(example, random)
         return [
             Item(
                 int(example[place]),
@@ -341,8 +341,8 @@ class TaskSampler(BatchSampler):
                 mirror=bool(mirror[place]),
                 blur=bool(blur[place]),
                 pictures=bool(self._pictured[example[place]]),
-                camera=pictures[place][0],
-                asked=pictures[place][1],
+                camera=taught[place][0],
+                asked=taught[place][1],
             )
             for place in random.permutation(len(example))
         ]
@@ -372,7 +372,7 @@ class TaskSampler(BatchSampler):
         # No share, no draw: orders stay what they were before there were such shares.
         return random.random(count) < share if share else np.zeros(count, np.bool_)
 
-    def _pictures(
+    def _next_pictures(
         self, example: npt.NDArray[np.int64], random: np.random.Generator
     ) -> list[tuple[str | None, bool]]:
         """For each example the camera whose next picture is taught, if any, and whether it is asked for."""
