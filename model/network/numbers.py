@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from model.families.picture_codes import PICTURE
 from model.families.registry import families_of
-from model.families.vla_world.format import VISUAL_ALPHABET
 from model.formats.compounds import number_alphabets
 from model.network.settings import VlaSettings
 from model.network.visual_codes import levels_of
@@ -44,7 +44,7 @@ def write_number_embeddings(model: nn.Module, vocabulary: Vocabulary, names: set
         spread = float(weight[: vocabulary.code_ids(0).start].float().std())
         for name in sorted(names):
             [ids] = vocabulary.alphabets[name]
-            features = _levels(len(ids)) if name == VISUAL_ALPHABET else _features(len(ids))
+            features = _levels(len(ids)) if name == PICTURE else _features(len(ids))
             projected = features @ torch.randn(features.shape[1], weight.shape[1])
             own = torch.randn(len(ids), weight.shape[1])
             rows = projected / projected.std() + torch.randn(weight.shape[1]) + _OWN * own

@@ -29,8 +29,9 @@ from model.engines.torch.shortcuts import Shortcuts
 from model.evaluation.open_loop import evaluate_draws
 from model.families.cf_vla import CF_VLA
 from model.families.family import FamilyError, Lesson, NextPicture
+from model.families.picture_codes import PICTURE_CODES
 from model.families.vla_world import VLA_WORLD
-from model.families.vla_world.format import TIMES_S, UNSEEN, VISUAL_CODES
+from model.families.vla_world.format import TIMES_S, UNSEEN
 from model.families.vla_world.targets import WEIGHTS
 from model.formats.cursor import CompiledFormat
 from model.formats.grammar_export import to_lark
@@ -98,7 +99,7 @@ def test_it_writes_what_the_reference_does(world: Loaded) -> None:
     for draw in draws:
         assert draw.trajectory.shape == (6, 4)
         assert (draw.times_s, draw.plan, draw.branch, draw.codes) == (TIMES_S, None, None, ())
-        assert len(CODE.findall(draw.text)) == (VISUAL_CODES if "visual" in draw.tokens else 0)
+        assert len(CODE.findall(draw.text)) == (PICTURE_CODES if "visual" in draw.tokens else 0)
         assert (draw.thinking is None) == ("<think></think>" in draw.text)
         assert {"perception", "prediction", "imagine", "think", "action", "answer"} <= set(draw.tokens)
 
@@ -156,7 +157,7 @@ def test_what_the_camera_sees_now_saves_passes_and_changes_nothing(world: Loaded
     assert [draw.text for draw in plain] == [draw.text for draw in expected]
     wanted = [ids[int(code[9:13])] for code in CODE.findall(plain[0].text)]
     half = tuple(code if random.random() < 0.5 else ids[random.integers(1000)] for code in wanted)
-    wrong = tuple(ids[code] for code in random.integers(0, 1000, VISUAL_CODES))
+    wrong = tuple(ids[code] for code in random.integers(0, 1000, PICTURE_CODES))
     told = {name: drawn(picture) for name, picture in (("half", half), ("all", tuple(wanted)), ("no", wrong))}
     for name, (draws, took) in told.items():
         assert [(draw.text, draw.ids) for draw in draws] == [(draw.text, draw.ids) for draw in plain], name
@@ -213,7 +214,7 @@ def test_what_cannot_be_imagined_is_refused_by_name(world: Loaded) -> None:
 
 def test_what_it_foresees_is_read_in_our_axes(world: Loaded) -> None:
     labelled = labelled_scene(9.0, agents=(agent(15.0, 0.0), agent(30.0, 3.5)))
-    lesson = lesson_of(labelled, NextPicture("back_left", tuple(range(VISUAL_CODES))))
+    lesson = lesson_of(labelled, NextPicture("back_left", tuple(range(PICTURE_CODES))))
     assert VLA_WORLD.teach is not None
     foreseen = VLA_WORLD.read(VLA_WORLD.teach(lesson), lambda codes: labelled.future).foreseen
     assert foreseen is not None
@@ -270,7 +271,7 @@ class _Tokenizer:
 
 
 @pytest.mark.parametrize("reflection", ["phrases", "free_text"])
-@pytest.mark.parametrize("picture", [None, NextPicture("front_left", tuple(range(VISUAL_CODES)))])
+@pytest.mark.parametrize("picture", [None, NextPicture("front_left", tuple(range(PICTURE_CODES)))])
 def test_the_exported_grammar_takes_what_is_taught(
     world: Loaded, reflection: Any, picture: NextPicture | None
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from model.driving.images import ImageError
 from model.engines.engine import PlanRequest
-from model.families.vla_world.format import VISUAL_ALPHABET
+from model.families.picture_codes import PICTURE
 from model.network.checkpoint import Parts
 from model.network.visual_codes import frame_of
 
@@ -16,12 +16,12 @@ def present_picture(request: PlanRequest, parts: Parts) -> tuple[int, ...]:
     pictures.
     """
     images = [clip.images[-1] for clip in request.scene.clips if clip.camera == request.controls.camera]
-    if not images or parts.visual_codes is None or VISUAL_ALPHABET not in parts.vocabulary.alphabets:
+    if not images or parts.visual_codes is None or PICTURE not in parts.vocabulary.alphabets:
         return ()
     try:
         frame = frame_of(images[0])
     except ImageError:
         # A picture that the model does not look at must not decide whether it answers.
         return ()
-    [ids] = parts.vocabulary.alphabets[VISUAL_ALPHABET]
+    [ids] = parts.vocabulary.alphabets[PICTURE]
     return tuple(ids[code] for code in parts.visual_codes.encode(frame).tolist())

@@ -18,6 +18,7 @@ from model.driving.agents import AGENT_KINDS
 from model.driving.paper_axes import from_paper_axes, to_paper_axes
 from model.driving.scene import CAMERAS
 from model.driving.trajectory import THREE_SECONDS_S, FloatArray
+from model.families.picture_codes import PICTURE, PICTURE_CODEBOOK, PICTURE_CODES
 from model.formats.compounds import Number, Repeat
 from model.formats.pieces import (
     Choice,
@@ -45,11 +46,6 @@ ANSWER: Final = "answer"
 TIMES_S: Final = THREE_SECONDS_S
 MAX_OBJECTS: Final = 8
 MAX_NOTABLE: Final = 4
-VISUAL_ALPHABET: Final = "visual"
-VISUAL_CODES: Final = 98
-"""Of a picture; `model.network.visual_codes` makes them."""
-VISUAL_SIZE: Final = 1000
-"""How many different codes there are."""
 CAMERA_OPTIONS: Final = {camera: f"CAM_{camera.upper()}" for camera in CAMERAS}
 """How each of our cameras is written."""
 CAMERA: Final = "camera"
@@ -146,7 +142,7 @@ _PICTURE: Final = Section(
     VISUAL,
     Sequence(
         (
-            Codes(VISUAL_ALPHABET, VISUAL_CODES, VISUAL_SIZE),
+            Codes(PICTURE, PICTURE_CODES, PICTURE_CODEBOOK),
             Literal(" These are the visual tokens of "),
             Choice(tuple(map(Option, CAMERA_OPTIONS.values())), name=CAMERA),
             Literal(f" image at the 0.5 second in the future.</{VISUAL}>"),

@@ -15,6 +15,7 @@ from model.driving.perceived import Perceived, PerceivedAgent
 from model.driving.scene import CAMERAS
 from model.driving.trajectory import constant_turn_rate
 from model.families.family import FamilyError, Lesson, NextPicture, Situation
+from model.families.picture_codes import PICTURE, PICTURE_CODEBOOK, PICTURE_CODES
 from model.families.vla_world import VLA_WORLD
 from model.families.vla_world.actions import action_of
 from model.families.vla_world.format import (
@@ -26,9 +27,6 @@ from model.families.vla_world.format import (
     SIZE_M,
     TIMES_S,
     UNSEEN,
-    VISUAL_ALPHABET,
-    VISUAL_CODES,
-    VISUAL_SIZE,
     VLA_WORLD_FORMAT,
     VLA_WORLD_TOKENS,
     read_points,
@@ -54,9 +52,9 @@ CODE = re.compile(r"<\|\w+\|>")
 class ImaginingVocabulary(ByteVocabulary):
     """With alphabets of codes of pictures and of metres."""
 
-    def __init__(self, size: int = VISUAL_SIZE) -> None:
+    def __init__(self, size: int = PICTURE_CODEBOOK) -> None:
         super().__init__()
-        for name, count in {VISUAL_ALPHABET: size, **NUMBERS}.items():
+        for name, count in {PICTURE: size, **NUMBERS}.items():
             first = len(self.texts)
             self.texts += [f"<|{name}_{code}|>" for code in range(count)]
             self.alphabets[name] = (range(first, first + count),)
@@ -95,7 +93,7 @@ SAMPLE = Values(
         ),
         "prediction": (POINT, "Left"),
         "imagine": (IMAGINED,),
-        "visual": (tuple(range(VISUAL_CODES)), "CAM_FRONT_LEFT"),
+        "visual": (tuple(range(PICTURE_CODES)), "CAM_FRONT_LEFT"),
         "think": (({"kind": "pedestrian", "lateral_m": -4.5, "forward_m": 3.2, "time_s": 2.0},),),
         "action": ({"lateral": "TURN LEFT", "speed": "A QUICK ACCELERATION"},),
         "answer": ((POINT,) * 6,),
@@ -109,7 +107,7 @@ def written(values: Values, tokens: bool = False) -> str:
 
 def test_the_papers_sample() -> None:
     """Figure 5b, rounded to 0.1 m."""
-    codes = "".join(f"<|visual_{code}|>" for code in range(VISUAL_CODES))
+    codes = "".join(f"<|visual_{code}|>" for code in range(PICTURE_CODES))
     points = ", ".join(["(-0.1,0.5)"] * 6)
     assert written(SAMPLE) == (
         "<perception>Object detections: object type: pedestrian, object id: 1, position: (-4.5, 3.2), "
@@ -164,7 +162,7 @@ def test_what_is_rendered_can_be_written_by_the_cursor(data: st.DataObject) -> N
 def test_a_picture_is_98_codes_and_nothing_else() -> None:
     sections = [token.section for token in compiled().render(SAMPLE)]
     assert list(dict.fromkeys(sections)) == list(VLA_WORLD_FORMAT.sections())
-    assert (VISUAL_CODES, VISUAL_SIZE) == (CODES, CODEBOOK_SIZE)
+    assert (PICTURE_CODES, PICTURE_CODEBOOK) == (CODES, CODEBOOK_SIZE)
     text = written(SAMPLE)
     for wrong in (
         text.replace("<|visual_97|>", ""),
@@ -262,7 +260,7 @@ def test_what_a_scene_teaches() -> None:
 
 
 def test_a_picture_is_taught_where_there_is_one() -> None:
-    codes = tuple(range(VISUAL_CODES))
+    codes = tuple(range(PICTURE_CODES))
     values = taught(lesson(picture=NextPicture("front_left", codes)))
     assert values.all("visual") == (codes, "CAM_FRONT_LEFT")
     assert "<visual><|visual_0|>" in written(values)
