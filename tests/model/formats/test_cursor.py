@@ -164,6 +164,28 @@ def test_given_sections_must_exist() -> None:
         CompiledFormat(TRAJ_ONLY.format, VOCABULARY).start({"plan": PLAN})
 
 
+@given(cf_vla_values(), st.sampled_from(["Action:", "Thinking:"]))
+def test_choices_can_be_made_beforehand(values: Values, picked: str) -> None:
+    cursor = COMPILED.start(picks={"branch": picked})
+    for token in COMPILED.render(values):
+        if token.section == "branch" and values["branch"] != picked:
+            # What is picked is forced; anything else cannot be written.
+            assert len(cursor.allowed().ids) == 1
+            assert token.id not in cursor.allowed().ids
+            return
+        cursor = cursor.advance(token.id)
+    assert cursor.done
+
+
+@pytest.mark.parametrize(
+    ("picks", "message"),
+    [({"mood": "Sure,"}, "no choice 'mood'"), ({"branch": "Sure,"}, "'branch' has no option 'Sure,'")],
+)
+def test_only_options_that_there_are_can_be_picked(picks: dict[str, str], message: str) -> None:
+    with pytest.raises(FormatError, match=message):
+        COMPILED.start(picks=picks)
+
+
 @given(cf_vla_values())
 def test_no_response_is_longer_than_the_longest(values: Values) -> None:
     assert len(COMPILED.render(values)) <= COMPILED.longest()
