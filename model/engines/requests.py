@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from model.driving.plan import Plan
 from model.driving.trajectory import GeometryError, check_trajectory
@@ -15,8 +16,11 @@ from model.formats.cursor import CompiledFormat, Cursor
 from model.formats.pieces import FormatError
 from model.formats.text import parse
 from model.network.codec import TrajectoryCodec
-from model.network.visual_codes import Frame, VisualCodes
 from model.network.vocabulary import Vocabulary
+
+if TYPE_CHECKING:
+    # Scheduling imports this module, and needs no torch.
+    from model.network.visual_codes import Frame, VisualCodes
 
 
 def begin(
