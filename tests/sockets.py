@@ -14,6 +14,13 @@ import uvicorn
 PATIENCE_S = 30
 
 
+def free_port() -> int:
+    """A port of this machine that nobody listens at."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port: int = listener.getsockname()[1]
+        return port
+
+
 @contextmanager
 def listening(
     app: Any, port: int = 0, server: uvicorn.Server | None = None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -29,6 +28,7 @@ from model.driving.scene import Scene
 from model.driving.scene_store import read_scenes
 from tests.deploy.tools import DEPLOY, ROOT
 from tests.service.serving import body
+from tests.sockets import free_port
 
 SERVE: Final[dict[str, Any]] = yaml.safe_load((DEPLOY / "ray" / "serve.yaml").read_text())
 SHIPPED: Final[dict[str, Any]] = SERVE["applications"][0]["deployments"][0]
@@ -48,8 +48,7 @@ def scene() -> Scene:
 def configuration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """serve.yaml, but for replicas that are small enough for any machine, and quick to come."""
     told = copy.deepcopy(SERVE)
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        told["http_options"] |= {"host": "127.0.0.1", "port": free.getsockname()[1]}
+    told["http_options"] |= {"host": "127.0.0.1", "port": free_port()}
     (application,) = told["applications"]
     del application["args"]["metrics_port"]
     application["runtime_env"]["env_vars"]["OMP_NUM_THREADS"] = "1"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import socket
 from pathlib import Path
 
 import pytest
@@ -17,15 +16,14 @@ from tests.docs.clean_clone import (
     lines,
     listed,
 )
+from tests.sockets import free_port
 
 ROOT = Path(__file__).parents[2]
 PAGES = ("README.md", "docs/own-cameras.md")
 
 
 def test_every_command_and_snippet_does_what_the_pages_say(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    follow_without_network(tmp_path, port)
+    follow_without_network(tmp_path, free_port())
 
 
 def test_what_is_left_out_stands_in_the_pages() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 import time
 
 import pytest
@@ -14,6 +13,7 @@ from loadtests.mix import BATCH_SCENES, Kind
 from loadtests.sending import Sender, Target, connected
 from tests.loadtests.scenes import labelled_scenes
 from tests.loadtests.stand_in import StandIn, standing_in
+from tests.sockets import free_port
 
 
 def sent(url: str, kind: Kind, timeout_s: float = 20) -> Exchange:
@@ -66,6 +66,4 @@ def test_failures_are_named() -> None:
         exchange = sent(url, Kind(n=1), timeout_s=0.2)
     assert exchange.verdict.problem == "timeout"
     assert exchange.latency_s >= 0.2
-    with socket.create_server(("127.0.0.1", 0)) as closed:
-        port = closed.getsockname()[1]
-    assert sent(f"http://127.0.0.1:{port}", Kind(n=1)).verdict.problem == "ConnectError"
+    assert sent(f"http://127.0.0.1:{free_port()}", Kind(n=1)).verdict.problem == "ConnectError"

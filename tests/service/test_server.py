@@ -36,7 +36,7 @@ from tests.model.driving.drives import labelled_scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem
-from tests.sockets import listening
+from tests.sockets import free_port, listening
 
 WAIT_S = 120
 
@@ -56,12 +56,6 @@ class SlowTeacher:
 
     async def close(self) -> None:
         pass
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        port: int = listener.getsockname()[1]
-        return port
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -44,6 +43,7 @@ from tests.clients.labelling.builds import GOOD
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import serve
+from tests.sockets import free_port
 
 START_WITHIN_S = 240
 KEY = "sk-of-a-test"
@@ -115,8 +115,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     known = folder / "known" / "vllm-0.32.0+cpu.dist-info"
     known.mkdir(parents=True)
     (known / "METADATA").write_text("Metadata-Version: 2.1\nName: vllm\nVersion: 0.32.0+cpu\n")
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(known.parent), os.getcwd()]),
         "HF_HUB_OFFLINE": "1",
