@@ -58,6 +58,8 @@ MAX_SEED: Final = 2**53 - 1
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Milliseconds = Annotated[float, Field(ge=0)]
+Temperature = Annotated[float, Field(ge=0, le=2, description="0 takes the likeliest allowed token.")]
+TopP = Annotated[float, Field(gt=0, le=1, description="Nucleus mass; 1 keeps all allowed tokens.")]
 Nearby = Annotated[float, Field(ge=-100_000, le=100_000, allow_inf_nan=False)]
 Length = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
 Pose = Annotated[list[Finite], Field(min_length=4, max_length=4, description="x, y, z in m, heading in rad")]
@@ -219,8 +221,8 @@ class ReflectControls(Asked):
         "null samples the branch.",
     )
     n: int = Field(default=6, ge=1, le=64, description="Draws.")
-    temperature: float = Field(default=1.0, ge=0, le=2, description="0 takes the likeliest allowed token.")
-    top_p: float = Field(default=1.0, gt=0, le=1, description="Nucleus mass; 1 keeps all allowed tokens.")
+    temperature: Temperature = 1.0
+    top_p: TopP = 1.0
     seed: int = Field(
         default=0,
         ge=0,

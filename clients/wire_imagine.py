@@ -21,7 +21,9 @@ from clients.wire import (
     ModelName,
     Nearby,
     Scene,
+    Temperature,
     Timing,
+    TopP,
 )
 
 SECONDS_AHEAD: Final = 0.5
@@ -32,8 +34,8 @@ class ImagineControls(Asked):
     """What the caller decides about decoding."""
 
     n: int = Field(default=1, ge=1, le=64, description="Pictures.")
-    temperature: float = Field(default=1.0, ge=0, le=2, description="0 takes the likeliest allowed token.")
-    top_p: float = Field(default=1.0, gt=0, le=1, description="Nucleus mass; 1 keeps all allowed tokens.")
+    temperature: Temperature = 1.0
+    top_p: TopP = 1.0
     seed: int = Field(
         default=0,
         ge=0,
