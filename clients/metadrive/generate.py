@@ -219,7 +219,7 @@ def write_block(
 ) -> None:
     """Generate one block in this process and put its file in place."""
     cameras = FRONT_CAMERAS + (SURROUND_CAMERAS if config.surround else ())
-    rig = Rig(tuple(camera.resized(config.width_px) for camera in cameras))
+    rig = Rig(tuple(camera.resized(config.width_px) for camera in cameras)) if config.pictures else None
     scenes: list[LabelledScene] = []
     outcomes: list[EpisodeOutcome] = []
     run = run_seed if pilot is None else _driven_by(pilot())
@@ -227,15 +227,19 @@ def write_block(
         made, outcome = run(seed, rig, config)
         scenes += made
         outcomes.append(outcome)
-    rig.close()
+    if rig is not None:
+        rig.close()
     described = json.dumps([asdict(outcome) for outcome in outcomes])
     for stale in out_dir.glob(f".{block_file(out_dir, seeds).name}.*.tmp"):
         stale.unlink(missing_ok=True)
     write_scenes(block_file(out_dir, seeds), scenes, {_EPISODES_KEY: described})
 
 
-def run_seed(seed: int, rig: Rig, config: GenerateConfig) -> tuple[list[LabelledScene], EpisodeOutcome]:
+def run_seed(
+    seed: int, rig: Rig | None, config: GenerateConfig
+) -> tuple[list[LabelledScene], EpisodeOutcome]:
     """One episode's scenes, and how it went."""
+    assert rig is not None, "the expert's scenes have pictures"
     started = time.monotonic()
     try:
         log = run_episode(seed, config.duration_s, drifts=config.drifts, lapses=config.lapses)
@@ -249,15 +253,14 @@ def run_seed(seed: int, rig: Rig, config: GenerateConfig) -> tuple[list[Labelled
 
 def _driven_by(
     pilot: Pilot,
-) -> Callable[[int, Rig, GenerateConfig], tuple[list[LabelledScene], EpisodeOutcome]]:
+) -> Callable[[int, Rig | None, GenerateConfig], tuple[list[LabelledScene], EpisodeOutcome]]:
     """What takes the place of `run_seed` where a model drives."""
 
-    def run(seed: int, rig: Rig, config: GenerateConfig) -> tuple[list[LabelledScene], EpisodeOutcome]:
+    def run(seed: int, rig: Rig | None, config: GenerateConfig) -> tuple[list[LabelledScene], EpisodeOutcome]:
         started = time.monotonic()
         every = max(1, round(config.stride_s / DriveConfig().replan_s))
         try:
-            looking = rig if config.pictures else None
-            made, drove = own_states(seed, pilot, looking, DriveConfig(config.duration_s), every)
+            made, drove = own_states(seed, pilot, rig, DriveConfig(config.duration_s), every)
         except (MapError, shapely.errors.GEOSException) as error:
             return [], EpisodeOutcome(seed, type(error).__name__, "", 0, 0, time.monotonic() - started)
         dropped = drove.plans // every - len(made)

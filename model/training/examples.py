@@ -21,7 +21,7 @@ from model.driving.labeller import expert_plan
 from model.driving.perceived import ROW_SIZE, Perceived, perceived_of, perceived_of_row
 from model.driving.plan import Plan, plan_from_bins
 from model.driving.reasoning import thoughts_of
-from model.driving.scene import CAMERAS, CLIP_FRAMES, NO_PICTURE, LabelledScene
+from model.driving.scene import CAMERAS, CLIP_FRAMES, LabelledScene
 from model.driving.scene_store import read_scenes, scene_files
 from model.driving.thoughts import Thoughts, read_thoughts
 from model.driving.tracks import tracks_of
@@ -31,7 +31,7 @@ from model.network.inputs import InputBuilder
 from model.network.track_features import track_features
 from model.training.dense import coarse, no_target, relative_motion
 
-CACHE_VERSION: Final = 6
+CACHE_VERSION: Final = 7
 DENSE_FAR_M: Final = 200.0
 """Ranges beyond are all the same to a dense target."""
 _NOTHING_KNOWN: Final = np.full(ROW_SIZE, np.nan, np.float32)
@@ -46,6 +46,7 @@ class Examples:
         picture_spans: int64 [N, cameras, 4, 2], first and last-plus-one byte of each picture.
         next_spans: int64 [N, `CAMERAS`, 2], of what each camera saw half a second later; empty where
             nothing is known.
+        pictured: bool [N], which examples have pictures; those of drives without cameras have none.
         history: float32 [N, 16, 4].
         route: float32 [N, 20, 2]; NaN where a scene has none.
         future: float32 [N, 64, 4].
@@ -65,6 +66,7 @@ class Examples:
     pictures: npt.NDArray[np.uint8]
     picture_spans: npt.NDArray[np.int64]
     next_spans: npt.NDArray[np.int64]
+    pictured: npt.NDArray[np.bool_]
     history: FloatArray
     route: FloatArray
     future: FloatArray
@@ -86,14 +88,6 @@ class Examples:
         """One encoded picture."""
         first, last = self.picture_spans[index, camera, frame]
         return self.pictures[first:last].tobytes()
-
-    @property
-    def pictured(self) -> npt.NDArray[np.bool_]:
-        """bool [N]: which examples have pictures; those of drives without cameras have none."""
-        spans = self.picture_spans.reshape(len(self), -1, 2)
-        alike = np.asarray((spans == spans[:, :1]).all(axis=(1, 2)))
-        alike[alike] = [self.picture(int(index), 0, 0) == NO_PICTURE for index in np.flatnonzero(alike)]
-        return ~alike
 
     def next_cameras(self, index: int) -> tuple[str, ...]:
         """The cameras whose picture half a second later is known."""
@@ -136,6 +130,7 @@ class Examples:
             spans = [span(picture) for camera in cameras for picture in scene.clip(camera).images]
             columns["picture_spans"].append(np.reshape(spans, (len(cameras), CLIP_FRAMES, 2)))
             later = {frame.camera: span(frame.image) for frame in labelled.next_frames}
+            columns["pictured"].append(scene.has_pictures)
             columns["next_spans"].append([later.get(camera, (0, 0)) for camera in CAMERAS])
             columns["history"].append(scene.history)
             columns["route"].append(
@@ -157,9 +152,12 @@ class Examples:
             columns["perceived"].append(_NOTHING_KNOWN if perceived is None else perceived.row())
             columns["episode"].append(labelled.seed)
             columns["scene_id"].append(scene.scene_id)
-        types: dict[str, Any] = {"picture_spans": np.int64, "plan_bins": np.int8, "dense_classes": np.uint8}
-        types["next_spans"] = np.int64
-        types |= {
+        types: dict[str, Any] = {
+            "picture_spans": np.int64,
+            "next_spans": np.int64,
+            "pictured": np.bool_,
+            "plan_bins": np.int8,
+            "dense_classes": np.uint8,
             "dense_range_log": np.float16,
             "dense_motion": np.float16,
             "episode": np.int64,

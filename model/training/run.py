@@ -178,13 +178,15 @@ def run(
 
 def _check_pictures(recipe: Recipe, examples: Examples, loaded: Loaded) -> None:
     """Raise ValueError unless pictures that a recipe teaches are there, and can be written as codes."""
+    if not recipe.picture_share:
+        return
     known = [bool(examples.next_cameras(index)) for index in range(len(examples))]
     if recipe.picture_share == 1 and not all(known):
         raise ValueError(
             f"recipe {recipe.name} teaches pictures half a second ahead, and {known.count(False)} scenes "
             "bring none: `looktwice scenes generate --next-frames` makes such scenes"
         )
-    if recipe.picture_share and any(known) and loaded.visual_codes is None:
+    if any(known) and loaded.visual_codes is None:
         raise ValueError(
             f"recipe {recipe.name} teaches pictures, and {loaded.card.name} has no codes for them: "
             "--visual-codes names the folder that `looktwice train visual-codes` made"
@@ -284,7 +286,9 @@ def _prepare(
         blur_share=recipe.blur_share,
         pictured=examples.pictured,
         mirror_reflected=loaded.settings.reflection == "phrases",
-        next_cameras=[examples.next_cameras(index) for index in range(len(examples))],
+        next_cameras=[examples.next_cameras(index) for index in range(len(examples))]
+        if recipe.picture_share
+        else (),
         picture_share=recipe.picture_share,
     )
     return learner, responses, sampler, collate
