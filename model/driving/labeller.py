@@ -97,9 +97,9 @@ def label_plan(future: npt.ArrayLike, history: npt.ArrayLike, lane_trace: LaneTr
     lane = None if lane_trace is None else _lane(lane_trace)
     changing = np.array([word != KEEP_LANE for word in lane or [KEEP_LANE] * len(speed)])
     return Plan(
-        longitudinal=_track(_longitudinal(speed, _slope(raw_speed, ACCELERATION_WINDOW))),
-        lateral=_track(_lateral(_smoothed(turned / STEP_S, SPEED_WINDOW), speed, changing)),
-        lane=None if lane is None else _track(lane),
+        longitudinal=labelled_track(_longitudinal(speed, _slope(raw_speed, ACCELERATION_WINDOW))),
+        lateral=labelled_track(_lateral(_smoothed(turned / STEP_S, SPEED_WINDOW), speed, changing)),
+        lane=None if lane is None else labelled_track(lane),
     )
 
 
@@ -164,8 +164,8 @@ def _sideways_speed(offset: Array, usable: BoolArray) -> Array:
     return np.interp(steps, steps[usable], speed[usable])
 
 
-def _track(words: list[str]) -> Track:
-    """Words of the 79 steps, history first, as the track of the 64 steps ahead."""
+def labelled_track(words: list[str]) -> Track:
+    """Words, of which the last 64 are of the steps ahead, as a track without actions below `MIN_DURATION`."""
     return track_from_words(_absorb_short(words[-TICKS:]))
 
 

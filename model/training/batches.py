@@ -26,6 +26,7 @@ from model.network.track_features import MIRRORED, without_route
 from model.network.visual_codes import VisualCodes, frame_of
 from model.network.vocabulary import Vocabulary
 from model.training.examples import Examples, example_frames
+from model.training.own_plans import OwnPlans
 from model.training.reflections import mirrored
 from model.training.soft_codes import SoftCodes
 from model.training.targets import SectionWeights, Target, make_target
@@ -115,6 +116,7 @@ class ResponseDataset(Dataset[Sample]):
         pictures: whether prompts have them.
         vision: what the tower sees in all examples, where it does not learn; else their patches are given.
         reflections: to be asked for by items.
+        own_plans: behind which trajectories are learned too, where nothing is reflected.
         visual_codes: of the checkpoint, where items are to teach pictures.
         seed: of the codes that are drawn.
 
@@ -134,9 +136,11 @@ class ResponseDataset(Dataset[Sample]):
         pictures: bool,
         vision: VisionCache | None = None,
         reflections: Sequence[Reflection] = (),
+        own_plans: OwnPlans | None = None,
         visual_codes: VisualCodes | None = None,
         seed: int = 0,
     ) -> None:
+        self._own_plans = own_plans
         self._visual_codes, self._next = visual_codes, dict[tuple[int, str, bool], NextPicture]()
         self._examples, self._inputs, self._reflections = examples, inputs, reflections
         self._codec, self._vision = codec, vision
@@ -179,7 +183,13 @@ class ResponseDataset(Dataset[Sample]):
         found = [self._reflections[place] for place in item.reflections]
         if item.mirror:
             found = [mirrored(each) for each in found]
-        reflections: Sequence[Reflection | None] = found or [None]
+        reflections: list[Reflection | None] = [*found] or [None]
+        if not found and self._own_plans is not None and item.task == self.reflecting:
+            # Nobody knows whether it deserves a second look: nothing but the trajectory is taught behind it.
+            own = self._own_plans.draw(
+                index, self._random, mirror=item.mirror, route=item.route, tracks=item.tracks
+            )
+            reflections.append(Reflection(own, "", judged=False))
         soft = [self._soft.draw(vector, self._random) for _ in reflections]
         lessons = [
             Lesson(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived, picture)

@@ -58,6 +58,7 @@ class Recipe:
         tracks_share, mirror_share, blur_share: shares of the examples with tracks, mirrored, and with no
             history but the present speed; see `Item`.
         picture_share: share of the examples with pictures half a second ahead that are taught one of them.
+        own_plans: learn trajectories behind plans of the model's own too, see `OwnPlans`.
         error_weight: nats that a metre of a code's expected error counts.
         head_weight: of a regression of the trajectory where its first code is written.
         reflections: what becomes of the reflections of a build: ``learned`` as counterfactual examples, or
@@ -81,6 +82,7 @@ class Recipe:
     mirror_share: float = 0.0
     blur_share: float = 0.0
     picture_share: float = 0.0
+    own_plans: bool = False
     error_weight: float = 0.0
     head_weight: float = 0.0
     reflections: Literal["learned", "scenes"] | None = None
@@ -147,7 +149,14 @@ NANO: Final[Mapping[str, Recipe]] = (
             replace(_READ, name="read-scene", steps=4000, batch_size=64),
             replace(_NANO, name="traj-only", steps=3000, tasks={"traj_only": 1.0}),
             replace(_NANO, name="meta-act"),
-            replace(_NANO, name="counterfactual", steps=3000, learning_rate=2.5e-4, reflections="learned"),
+            replace(
+                _NANO,
+                name="counterfactual",
+                steps=3000,
+                learning_rate=2.5e-4,
+                reflections="learned",
+                own_plans=True,
+            ),
         )
     }
     | {

@@ -40,6 +40,7 @@ from model.training.intents import (
 )
 from model.training.learner import ResponseLearner
 from model.training.outcomes import OutcomeLearner, ScenePlaces, collate_places
+from model.training.own_plans import OwnPlans
 from model.training.recipes import Recipe
 from model.training.reflections import OnExamples, reflections_on
 from model.training.trainer import LOG_FILE, LearnerTrainer, Validate
@@ -242,6 +243,7 @@ def _prepare(
         pictures=recipe.pictures,
         vision=vision,
         reflections=() if on_examples is None else on_examples.reflections,
+        own_plans=OwnPlans(loaded.model, examples, vision, recipe.seed) if recipe.own_plans else None,
         visual_codes=loaded.visual_codes,
         seed=recipe.seed,
     )

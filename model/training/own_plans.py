@@ -1,0 +1,127 @@
+"""Plans that the model might write itself, for trajectories to be learned behind.
+
+Learned behind the expert's plans alone, a trajectory trusts its plan too much: the plans that a model writes
+are often wrong. Writing them for every example would cost hours. The state of the small planner that the
+model writes its plans from costs nothing, and a linear reading of it says how likely each meta-action is.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from model.driving.labeller import labelled_track
+from model.driving.plan import GROUPS, TICKS, WORDS, Plan
+from model.driving.trajectory import FloatArray
+from model.network.intent import IntentTrunk
+from model.network.vla import LookTwiceVla
+from model.training.examples import Examples
+from model.training.intents import IntentDataset, collate_intents, read_facts
+from model.training.vision_cache import VisionCache
+
+_BATCH: Final = 256
+_EPOCHS: Final = 7
+_LEAST_STEPS: Final = 300
+_RATE: Final = 2e-3
+_SIZES: Final = [len(WORDS[group]) for group in GROUPS]
+
+
+class OwnPlans:
+    """Draws plans as the small planners of a checkpoint would write them.
+
+    Args:
+        vla: whose planners are read.
+        examples: to plan for.
+        vision: what its tower sees in them; None to plan from tracks alone.
+        seed: of the reading, and of what is misread where there are no pictures.
+    """
+
+    def __init__(
+        self, vla: LookTwiceVla, examples: Examples, vision: VisionCache | None, seed: int = 0
+    ) -> None:
+        self._has_route: npt.NDArray[np.bool_] = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
+        read = None if vision is None else read_facts(vla, examples, vision, seed)
+        data = IntentDataset(examples, read, route_share=1.0)
+        self._readings = {}
+        if vla.track_reader is not None:
+            self._readings[True] = _Reading(vla.track_reader, data, "tracks", seed)
+        if read is not None and vla.resampler is not None:
+            self._readings[False] = _Reading(vla.resampler.intent, data, "read", seed)
+
+    def draw(
+        self, index: int, random: np.random.Generator, *, mirror: bool, route: bool, tracks: bool
+    ) -> Plan:
+        """A plan for one example, as its prompt shows it.
+
+        Raises:
+            KeyError: the checkpoint has no planner for what the prompt shows.
+        """
+        scores = self._readings[tracks].scores(index, int(mirror), int(route and self._has_route[index]))
+        # One draw of noise a word, not one a tick: a plan is in doubt as a whole.
+        scores = scores + random.gumbel(size=(1, scores.shape[1])).astype(np.float32)
+        tracks_of_groups = {}
+        for group, each in zip(GROUPS, np.split(scores, np.cumsum(_SIZES)[:-1], axis=1), strict=True):
+            tracks_of_groups[group] = labelled_track([WORDS[group][best] for best in each.argmax(axis=1)])
+        return Plan(**tracks_of_groups)
+
+
+class _Reading:
+    """The states of one planner for all examples, and the linear reading of plans from them."""
+
+    def __init__(self, part: Any, data: IntentDataset, around: str, seed: int) -> None:
+        states, bins = [], []
+        with torch.inference_mode():
+            for mirror in (False, True):
+                for route in (False, True):
+                    rows, plans = _states(part, data, around, mirror=mirror, route=route)
+                    states.append(rows)
+                    bins.append(plans)
+        # [mirror, route, n, width]
+        self._states = torch.stack(states).view(2, 2, len(data), IntentTrunk.width).clone()
+        self._weight, self._bias = _fit(self._states.flatten(0, 2), torch.cat(bins).clone(), seed)
+
+    def scores(self, index: int, mirror: int, route: int) -> FloatArray:
+        """How likely each word is in each tick, log [64, words of all groups]."""
+        state = self._states[mirror, route, index].numpy()
+        scores: FloatArray = (self._weight @ state + self._bias).reshape(TICKS, sum(_SIZES))
+        return scores
+
+
+def _states(
+    part: Any, data: IntentDataset, around: str, *, mirror: bool, route: bool
+) -> tuple[Tensor, Tensor]:
+    states, bins = [], []
+    for start in range(0, len(data), _BATCH):
+        places = range(start, min(start + _BATCH, len(data)))
+        batch = collate_intents([data.look(place, mirror=mirror, route=route) for place in places])
+        states.append(part.state(batch[around], batch["history"], batch["route"], batch["has_route"]).float())
+        bins.append(batch["plan_bins"])
+    return torch.cat(states), torch.cat(bins)
+
+
+def _fit(states: Tensor, bins: Tensor, seed: int) -> tuple[FloatArray, FloatArray]:
+    """A linear reading of expert plans: weight and bias."""
+    words = nn.Linear(states.shape[1], TICKS * sum(_SIZES))
+    generator = torch.Generator().manual_seed(seed)
+    optimizer = torch.optim.AdamW(words.parameters(), _RATE)
+    batch = min(_BATCH, len(states))
+    steps = max(_LEAST_STEPS, _EPOCHS * len(states) // batch)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATE, steps)
+    for _ in range(steps):
+        places = torch.randint(len(states), (batch,), generator=generator)
+        scores = words(states[places]).view(len(places), TICKS, -1).split(_SIZES, dim=-1)
+        taught = bins[places].long()
+        losses = [
+            F.cross_entropy(each.flatten(0, 1), taught[:, number].flatten(), ignore_index=-1)
+            for number, each in enumerate(scores)
+        ]
+        optimizer.zero_grad()
+        torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        schedule.step()
+    return words.weight.detach().numpy(), words.bias.detach().numpy()

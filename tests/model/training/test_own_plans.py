@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.driving.plan import parse_plan
+from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from model.families.cf_vla.targets import PAPER_WEIGHTS
+from model.network.checkpoint import Loaded, load
+from model.training.batches import Item, ResponseDataset
+from model.training.examples import Examples
+from model.training.own_plans import OwnPlans
+from model.training.targets import Target
+from model.training.vision_cache import open_vision
+from tests.model.training.scenes import training_scene
+
+EXAMPLES = Examples.from_scenes((training_scene(index) for index in range(8)), (FRONT_WIDE, FRONT_TELE))
+
+
+@pytest.fixture(scope="module")
+def loaded(resampling_checkpoint: Path) -> Loaded:
+    return load(resampling_checkpoint)
+
+
+@pytest.fixture(scope="module")
+def own_plans(loaded: Loaded, tmp_path_factory: pytest.TempPathFactory) -> OwnPlans:
+    vision = open_vision(loaded, EXAMPLES, tmp_path_factory.mktemp("vision"), mirrored=True)
+    return OwnPlans(loaded.model, EXAMPLES, vision)
+
+
+@pytest.mark.parametrize("tracks", [False, True])
+@pytest.mark.parametrize("mirror", [False, True])
+def test_own_plans_are_near_what_was_learned(own_plans: OwnPlans, tracks: bool, mirror: bool) -> None:
+    random = np.random.default_rng(0)
+    right = []
+    for index in range(len(EXAMPLES)):
+        expert = EXAMPLES.plan(index).mirrored() if mirror else EXAMPLES.plan(index)
+        drawn = [own_plans.draw(index, random, mirror=mirror, route=True, tracks=tracks) for _ in range(10)]
+        right.append(np.mean([each.bins() == expert.bins() for each in drawn]))
+    assert np.mean(right) > 0.8
+
+
+def test_where_experts_differ_own_plans_differ(loaded: Loaded) -> None:
+    twins = Examples.from_scenes((training_scene(1) for _ in range(2)), (FRONT_WIDE, FRONT_TELE))
+    keeps, waits = (
+        parse_plan(f"- longitudinal\n  - 0.0s-6.4s: {word}\n").bins() for word in ("Keep Speed", "Wait")
+    )
+    own_plans = OwnPlans(loaded.model, replace(twins, plan_bins=np.stack([keeps, waits])), None)
+    random = np.random.default_rng(0)
+    drawn = [own_plans.draw(0, random, mirror=False, route=True, tracks=True) for _ in range(40)]
+    words = Counter(action.word for plan in drawn for action in plan.longitudinal or ())
+    assert min(words["Keep Speed"], words["Wait"]) >= 8
+    assert words["Keep Speed"] + words["Wait"] >= 36
+    segments = [len(plan.longitudinal or ()) for plan in drawn]
+    assert np.mean(segments) < 4, "in doubt as a whole, not tick by tick"
+
+
+def test_a_reader_of_tracks_alone_plans_from_tracks_alone(loaded: Loaded) -> None:
+    own_plans = OwnPlans(loaded.model, EXAMPLES, None)
+    with pytest.raises(KeyError):
+        own_plans.draw(0, np.random.default_rng(0), mirror=False, route=True, tracks=False)
+
+
+def test_behind_an_own_plan_nothing_but_the_trajectory_is_taught(loaded: Loaded, own_plans: OwnPlans) -> None:
+    def data(plans: OwnPlans | None) -> ResponseDataset:
+        return ResponseDataset(
+            EXAMPLES,
+            loaded.codec,
+            loaded.inputs,
+            loaded.vocabulary,
+            PAPER_WEIGHTS,
+            pictures=True,
+            own_plans=plans,
+        )
+
+    def taught(response: Target) -> str:
+        ids = [id for id, weight in zip(response.ids, response.weights, strict=True) if weight > 0]
+        return loaded.vocabulary.decode(ids)
+
+    behind = data(own_plans)
+    [alone] = data(None)[Item(1, "cf_vla", True, tracks=True)].responses
+    expert, own = behind[Item(1, "cf_vla", True, tracks=True)].responses
+    assert taught(expert).startswith("Meta Actions:")
+    assert taught(alone).startswith("Meta Actions:")
+    assert taught(own).startswith("\n<|traj_future_start|>")
+    [at_once] = behind[Item(1, "traj_only", True, tracks=True)].responses
+    assert len(at_once.ids) < len(own.ids)
