@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -16,7 +15,6 @@ from model.driving.facts import mirrored
 from model.driving.scene_store import read_scenes, scene_files
 from model.driving.tracks import tracks_of
 from model.driving.trajectory import FloatArray
-from model.driving.whole_files import written_whole
 from model.network.codec import TrajectoryCodec
 from model.network.small_planner import SmallInputs, SmallKind, SmallPlanner
 from model.network.track_features import MIRRORED, track_features
@@ -64,7 +62,7 @@ class SmallExamples:
 
     @classmethod
     def read(cls, folders: Sequence[Path]) -> SmallExamples:
-        """The scenes of files or folders; those without a route are left out."""
+        """The scenes of files or folders that have a route; raises ValueError where there are none."""
         columns: dict[str, list[FloatArray | int]] = {
             name: [] for name in ("history", "route", "tracks", "future", "episode")
         }
@@ -79,23 +77,12 @@ class SmallExamples:
                     columns["tracks"].append(track_features(tracks_of(labelled.agents), scene.route))
                     columns["future"].append(labelled.future)
                     columns["episode"].append(labelled.seed)
-        arrays = {name: np.array(values) for name, values in columns.items()}
-        return cls.of_arrays(**arrays)
-
-    @classmethod
-    def of_arrays(
-        cls,
-        history: FloatArray,
-        route: FloatArray,
-        tracks: FloatArray,
-        future: FloatArray,
-        episode: FloatArray,
-    ) -> SmallExamples:
-        """From arrays [n, ...]; raises ValueError where there are none."""
-        if not len(history):
+        if not columns["history"]:
             raise ValueError("there are no scenes with a route to learn from")
-        inputs = SmallInputs(*(torch.from_numpy(part) for part in (history, route, tracks)))
-        return cls(inputs, torch.from_numpy(future), torch.from_numpy(episode))
+        history, route, tracks, future, episode = (
+            torch.from_numpy(np.array(values)) for values in columns.values()
+        )
+        return cls(SmallInputs(history, route, tracks), future, episode)
 
     def joined(self, other: SmallExamples) -> SmallExamples:
         """These examples and others."""
@@ -108,28 +95,6 @@ class SmallExamples:
         return SmallExamples(
             inputs, torch.cat([self.futures, other.futures]), torch.cat([self.episodes, other.episodes])
         )
-
-    def save(self, path: Path) -> None:
-        """Keep the examples in one file, whole or not at all."""
-        inputs = self.inputs
-        with written_whole(path) as temporary, temporary.open("wb") as file:
-            np.savez(
-                file,
-                history=inputs.history.numpy(),
-                route=inputs.route.numpy(),
-                tracks=inputs.tracks.numpy(),
-                future=self.futures.numpy(),
-                episode=self.episodes.numpy(),
-            )
-
-    @classmethod
-    def load(cls, path: Path) -> SmallExamples:
-        """What `save` kept; raises ValueError for a file that holds something else."""
-        try:
-            with np.load(path) as arrays:
-                return cls.of_arrays(**{name: arrays[name] for name in arrays.files})
-        except (OSError, TypeError, BadZipFile) as error:
-            raise ValueError(f"{path} holds no examples of small planners: {error}") from error
 
     def mirrored(self) -> SmallExamples:
         """The same scenes with left and right swapped."""
@@ -225,13 +190,10 @@ def train_small(
         scenes: files or folders of labelled scenes.
         target: folder to write.
         validation: scenes to measure it on.
-        own: files of its own states (`SmallExamples.save`).
+        own: files or folders of scenes of its own states.
     """
     examples = SmallExamples.read(scenes)
-    states = None
-    for path in own:
-        loaded = SmallExamples.load(path)
-        states = loaded if states is None else states.joined(loaded)
+    states = SmallExamples.read(own) if own else None
     planner = fit_small(kind, examples, codec, settings, states, on_step)
     figures: dict[str, float] = {}
     if validation is not None:

@@ -95,8 +95,7 @@ def _driver(
     if service is not None and small is not None:
         raise ValueError("either --service or --small drives, not both")
     if small is not None:
-        pilot = SmallPilot(small)
-        return f"{pilot.name} {pilot.revision}", partial(SmallPilot, small)
+        return SmallPilot(small).described, partial(SmallPilot, small)
     if service is None:
         return None, None
     if not pictures:

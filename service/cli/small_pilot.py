@@ -27,6 +27,11 @@ class SmallPilot:
         self.name = self._planner.kind
         self.revision = hashlib.sha256((folder / WEIGHTS_FILE).read_bytes()).hexdigest()[:12]
 
+    @property
+    def described(self) -> str:
+        """What manifests of its drives call it."""
+        return f"{self.name} {self.revision}"
+
     def plan(self, scene: Scene) -> Planned:
         """See `Pilot.plan`."""
         began_s = time.perf_counter()

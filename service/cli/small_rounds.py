@@ -1,30 +1,29 @@
 """Small planners, trained round by round: drive, let the expert say what it would do, learn from it.
 
-Every round leaves a folder of its own, so a killed run goes on with the round that it was in.
+Every round leaves a folder of its own with the scenes that its planner met, as `scenes generate --small`
+makes them, so a killed run goes on with the round that it was in.
 """
 
 from __future__ import annotations
 
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import typer
 from rich.progress import Progress, TextColumn
 
-from clients.metadrive.drive import DriveConfig
-from clients.metadrive.maps import MapError
-from clients.metadrive.own_states import own_states
-from model.driving.scene import LabelledScene, split_of_seed
+from clients.metadrive.generate import GenerateConfig, generate
+from model.driving.scene import split_of_seed
 from model.network.codec import TrajectoryCodec
-from model.network.small_planner import WEIGHTS_FILE, SmallKind, small_inputs
-from model.training.small import SmallExamples, SmallSettings, train_small
+from model.network.small_planner import WEIGHTS_FILE, SmallKind
+from model.training.small import SmallSettings, train_small
 from service.cli.small_pilot import SmallPilot
 
 FIRST_ROUND_SEED: Final = 200_000
 """Training seeds that no scenes are made of by default; every round drives new ones."""
-_STATES_FILE: Final = "own-states.npz"
+_SCENES: Final = "scenes"
 _SECONDS: Final = 38.0
 
 
@@ -50,15 +49,13 @@ def train_small_in_rounds(
     for number in range(rounds + 1):
         folder = target / f"round-{number}"
         if number:
-            states = folder / _STATES_FILE
-            if not states.exists():
-                first = FIRST_ROUND_SEED + (number - 1) * episodes
-                _collect(target / f"round-{number - 1}", range(first, first + episodes), states)
-            own.append(states)
+            own.append(folder / _SCENES)
+            first = FIRST_ROUND_SEED + (number - 1) * episodes
+            _drive(target / f"round-{number - 1}", range(first, first + episodes), own[-1])
         if not (folder / WEIGHTS_FILE).exists():
             _train(kind, scenes, codec, folder, settings, validation, own)
     for file in (target / f"round-{rounds}").iterdir():
-        if file.name != _STATES_FILE:
+        if file.is_file():
             shutil.copyfile(file, target / file.name)
 
 
@@ -87,36 +84,14 @@ def _train(
         typer.echo(f"{kind} {folder.name} {name} {value:.3f}")
 
 
-def _collect(planner: Path, seeds: range, path: Path) -> None:
-    """Drive ``seeds`` and keep the labelled states in one file."""
+def _drive(planner: Path, seeds: range, out: Path) -> None:
+    """Let a planner drive ``seeds`` and label what it meets, unless that was done before."""
     for seed in (seeds[0], seeds[-1]):
         if split_of_seed(seed) != "train":
             raise ValueError(f"seed {seed} is not a training seed: fewer rounds or episodes, please")
-    pilot = SmallPilot(planner)
-    states: list[LabelledScene] = []
-    collisions = 0
-    with Progress() as progress:
-        task = progress.add_task(f"{path.parent.name}: driving", total=len(seeds))
-        for seed in seeds:
-            try:
-                found, drove = own_states(seed, pilot, config=DriveConfig(_SECONDS))
-            except MapError:
-                continue
-            finally:
-                progress.advance(task)
-            states += found
-            collisions += drove.ended == "collision"
-    typer.echo(f"{path.parent.name}: {len(states)} own states, {collisions} collisions")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _examples(states).save(path)
-
-
-def _examples(states: list[LabelledScene]) -> SmallExamples:
-    inputs = small_inputs([state.given(route=True, tracks=True) for state in states], "teacher")
-    return SmallExamples.of_arrays(
-        inputs.history.numpy(),
-        inputs.route.numpy(),
-        inputs.tracks.numpy(),
-        np.stack([state.future for state in states]),
-        np.array([state.seed for state in states]),
+    config = GenerateConfig(
+        stride_s=1.0, duration_s=_SECONDS, dense=False, driver=SmallPilot(planner).described, pictures=False
     )
+    report = generate(out, seeds, workers=1, config=config, pilot=partial(SmallPilot, planner))
+    ends = ", ".join(f"{count} {outcome}" for outcome, count in sorted(report.outcomes.items()))
+    typer.echo(f"{out.parent.name}: {report.scenes} own states; {ends}")

@@ -1,0 +1,40 @@
+"""`train teacher --rounds`: a small planner drives, and learns from what it met."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from model.bundled import CHECKPOINT
+from model.driving.scene_store import read_scenes, write_scenes
+from model.network.small_planner import WEIGHTS_FILE, load_small
+from model.training.small import SmallSettings
+from service.cli.small_rounds import FIRST_ROUND_SEED, train_small_in_rounds
+from tests.model.training.scenes import training_scene
+
+
+def test_a_round_learns_from_what_the_planner_met_and_is_not_made_twice(tmp_path: Path) -> None:
+    scenes, target = tmp_path / "scenes.parquet", tmp_path / "teacher"
+    write_scenes(scenes, [training_scene(index) for index in range(6)])
+
+    def train() -> None:
+        train_small_in_rounds("teacher", scenes, CHECKPOINT, target, SmallSettings(steps=20), None, 1, 2)
+
+    train()
+    [met] = (target / "round-1" / "scenes").glob("*.parquet")
+    states = list(read_scenes(met))
+    assert {each.seed for each in states} <= {FIRST_ROUND_SEED, FIRST_ROUND_SEED + 1}
+    assert not any(each.scene.has_pictures for each in states)
+    assert load_small(target).kind == "teacher"
+    assert (target / WEIGHTS_FILE).read_bytes() == (target / "round-1" / WEIGHTS_FILE).read_bytes()
+    made = {file: file.stat().st_mtime_ns for file in (target / "round-1").rglob("*.*t*")}
+    train()
+    for file in (met, target / "round-1" / WEIGHTS_FILE):
+        assert file.stat().st_mtime_ns == made[file]
+
+
+def test_rounds_are_for_planners_that_see(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="rounds are for the teacher"):
+        train_small_in_rounds("blind", tmp_path, CHECKPOINT, tmp_path / "blind", SmallSettings(), None, 1, 2)
+    assert not (tmp_path / "blind").exists()
