@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import pyarrow.parquet as pq
 import shapely
@@ -222,9 +222,9 @@ def write_block(
     rig = Rig(tuple(camera.resized(config.width_px) for camera in cameras)) if config.pictures else None
     scenes: list[LabelledScene] = []
     outcomes: list[EpisodeOutcome] = []
-    run = run_seed if pilot is None else _driven_by(pilot())
+    driver = None if pilot is None else pilot()
     for seed in seeds:
-        made, outcome = run(seed, rig, config)
+        made, outcome = run_seed(seed, rig, config, driver)
         scenes += made
         outcomes.append(outcome)
     if rig is not None:
@@ -235,39 +235,39 @@ def write_block(
     write_scenes(block_file(out_dir, seeds), scenes, {_EPISODES_KEY: described})
 
 
+class _Made(NamedTuple):
+    """Scenes of an episode; how it ended, on a road of which blocks, and how many scenes there might be."""
+
+    scenes: list[LabelledScene]
+    ended: str
+    blocks: str
+    possible: int
+
+
 def run_seed(
-    seed: int, rig: Rig | None, config: GenerateConfig
+    seed: int, rig: Rig | None, config: GenerateConfig, pilot: Pilot | None = None
 ) -> tuple[list[LabelledScene], EpisodeOutcome]:
-    """One episode's scenes, and how it went."""
-    assert rig is not None, "the expert's scenes have pictures"
+    """One episode's scenes, driven by a pilot or the expert, and how it went."""
     started = time.monotonic()
     try:
-        log = run_episode(seed, config.duration_s, drifts=config.drifts, lapses=config.lapses)
-        made = list(labelled_scenes(log, rig, config.stride_s, config.dense, with_next=config.next_frames))
+        made = _of_expert(seed, rig, config) if pilot is None else _of_pilot(seed, pilot, rig, config)
     except (MapError, shapely.errors.GEOSException) as error:
         return [], EpisodeOutcome(seed, type(error).__name__, "", 0, 0, time.monotonic() - started)
-    dropped = len(window_steps(log, config.stride_s)) - len(made)
-    seconds = round(time.monotonic() - started, 2)
-    return made, EpisodeOutcome(seed, log.outcome, log.road_map.blocks, len(made), dropped, seconds)
+    count, seconds = len(made.scenes), round(time.monotonic() - started, 2)
+    return made.scenes, EpisodeOutcome(seed, made.ended, made.blocks, count, made.possible - count, seconds)
 
 
-def _driven_by(
-    pilot: Pilot,
-) -> Callable[[int, Rig | None, GenerateConfig], tuple[list[LabelledScene], EpisodeOutcome]]:
-    """What takes the place of `run_seed` where a model drives."""
+def _of_expert(seed: int, rig: Rig | None, config: GenerateConfig) -> _Made:
+    assert rig is not None, "the expert's scenes have pictures"
+    log = run_episode(seed, config.duration_s, drifts=config.drifts, lapses=config.lapses)
+    scenes = list(labelled_scenes(log, rig, config.stride_s, config.dense, with_next=config.next_frames))
+    return _Made(scenes, log.outcome, log.road_map.blocks, len(window_steps(log, config.stride_s)))
 
-    def run(seed: int, rig: Rig | None, config: GenerateConfig) -> tuple[list[LabelledScene], EpisodeOutcome]:
-        started = time.monotonic()
-        every = max(1, round(config.stride_s / DriveConfig().replan_s))
-        try:
-            made, drove = own_states(seed, pilot, rig, DriveConfig(config.duration_s), every)
-        except (MapError, shapely.errors.GEOSException) as error:
-            return [], EpisodeOutcome(seed, type(error).__name__, "", 0, 0, time.monotonic() - started)
-        dropped = drove.plans // every - len(made)
-        seconds = round(time.monotonic() - started, 2)
-        return made, EpisodeOutcome(seed, drove.ended, "", len(made), dropped, seconds)
 
-    return run
+def _of_pilot(seed: int, pilot: Pilot, rig: Rig | None, config: GenerateConfig) -> _Made:
+    every = max(1, round(config.stride_s / DriveConfig().replan_s))
+    scenes, drove = own_states(seed, pilot, rig, DriveConfig(config.duration_s), every)
+    return _Made(scenes, drove.ended, "", drove.plans // every)
 
 
 def write_manifest(out_dir: Path, config: GenerateConfig) -> dict[str, Any]:

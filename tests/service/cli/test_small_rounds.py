@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from clients.metadrive import simulator
 from model.bundled import CHECKPOINT
 from model.driving.scene_store import read_scenes, write_scenes
 from model.network.small_planner import WEIGHTS_FILE, load_small
@@ -15,6 +16,8 @@ from tests.model.training.scenes import training_scene
 
 
 def test_a_round_learns_from_what_the_planner_met_and_is_not_made_twice(tmp_path: Path) -> None:
+    if not simulator.is_installed():
+        pytest.skip("MetaDrive is not installed (make sim)")
     scenes, target = tmp_path / "scenes.parquet", tmp_path / "teacher"
     write_scenes(scenes, [training_scene(index) for index in range(6)])
 
