@@ -13,7 +13,7 @@ from starlette.requests import Request
 from starlette.responses import StreamingResponse
 
 import clients.wire as wire
-from model.driving.plan import parse_plan
+from model.driving.plan import Plan
 from model.engines.engine import (
     DraftFinished,
     SectionFinished,
@@ -21,6 +21,7 @@ from model.engines.engine import (
 )
 from model.families.family import Family
 from model.families.registry import family_named
+from model.formats.pieces import Values
 from service.answers import wire_branch, wire_plan, wire_times, wire_trajectory
 from service.callers import CallerLeft, while_connected
 from service.errors import problem_document
@@ -114,17 +115,15 @@ async def streamed(
 def _data(event: Happened, family: Family, told: dict[int, str]) -> list[tuple[str, Written]]:
     match event:
         case TextWritten(index, section, text) if section == family.reflection:
-            return _text(index, text, told)
-        case SectionFinished(index, section, text) if section == family.reflection:
-            # What was not told yet; spaces around the text belong to the format.
-            rest = text.strip().removeprefix(told.get(index, ""))
-            return _text(index, rest, told)
-        case SectionFinished(index, section, text) if family.branch and section == family.branch.name:
-            branch = wire_branch(looked_twice=family.branch.reflecting in text)
+            # Words that are made of values are told when these are there.
+            return [] if family.reflection_text is not None else _text(index, text, told)
+        case SectionFinished(index, section, _, values) if section == family.reflection:
+            words = family.reflected(Values({section: values})) or ""
+            return _text(index, words.removeprefix(told.get(index, "")), told)
+        case SectionFinished(index, section, _, values) if family.branch and section == family.branch.name:
+            branch = wire_branch(looked_twice=family.branch.reflecting in values)
             return [("branch", wire.BranchTaken(index=index, branch=branch))]
-        case SectionFinished(index, section, text) if section in family.plans:
-            # The words that lead to a plan's first bullet belong to the format.
-            plan = parse_plan(text[text.index("- ") :])
+        case SectionFinished(index, section, _, (Plan() as plan, *_)) if section in family.plans:
             name = "plan" if section == family.first_plan else "revised_plan"
             return [(name, wire.PlanWritten(index=index, plan=wire_plan(plan)))]
         case DraftFinished(draw):
@@ -145,12 +144,10 @@ def _data(event: Happened, family: Family, told: dict[int, str]) -> list[tuple[s
 
 
 def _text(index: int, text: str, told: dict[int, str]) -> list[tuple[str, Written]]:
-    before = told.get(index, "")
-    new = text if before else text.lstrip()
-    if not new:
+    if not text:
         return []
-    told[index] = before + new
-    return [("thinking", wire.ThinkingWritten(index=index, text=new))]
+    told[index] = told.get(index, "") + text
+    return [("thinking", wire.ThinkingWritten(index=index, text=text))]
 
 
 def _event(name: str, data: BaseModel) -> bytes:

@@ -16,6 +16,7 @@ from model.driving.plan import Plan
 from model.driving.scene import CAMERAS, Scene
 from model.driving.trajectory import TEN_HZ_S, FloatArray, at_10_hz
 from model.families.family import Attempt, Foreseen
+from model.formats.pieces import Value
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
@@ -141,7 +142,7 @@ class PlanRequest:
         format: a response format the checkpoint was trained on.
         controls: what the caller decides.
         attempt: to be refined; needed exactly where the format's family refines one.
-        live: tell of free text as it is written (`TextWritten`), not only when its section is finished.
+        live: tell of free text as it is written (`TextWritten`), and what finished sections say.
     """
 
     request_id: str
@@ -216,7 +217,7 @@ class Started:
 
 @dataclass(frozen=True)
 class TextWritten:
-    """A draw has written more of a section of free text."""
+    """A draw has written more of the free text of a section."""
 
     index: int
     section: str
@@ -225,11 +226,19 @@ class TextWritten:
 
 @dataclass(frozen=True)
 class SectionFinished:
-    """A draw has finished a section of its format."""
+    """A draw has finished a section of its format.
+
+    Attributes:
+        index: of the draw.
+        section: its name.
+        text: as it is written.
+        values: what it says; empty where the request is not live.
+    """
 
     index: int
     section: str
     text: str
+    values: tuple[Value, ...] = ()
 
 
 @dataclass(frozen=True)

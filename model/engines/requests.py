@@ -108,6 +108,7 @@ def read(
     text = vocabulary.decode(ids)
     values = parse(response.cursor.compiled, text, given_plans(request, family))
     reading = family.read(values, lambda codes: codec.decode(request.scene.history[None], [codes])[0])
+    thinking = family.reflected(values)
     counts = dict(Counter(token.section for token in response.tokens))
     return [
         Draw(
@@ -116,7 +117,7 @@ def read(
             plan=reading.plan,
             branch=reading.branch,
             think_probability=response.think_probability,
-            thinking=reading.reflection,
+            thinking=thinking,
             revised_plan=reading.revised_plan,
             trajectory=check_trajectory(reading.trajectory, family.times_s),
             codes=reading.codes,
@@ -126,7 +127,7 @@ def read(
             cut=response.cut,
             times_s=family.times_s,
             ids=ids,
-            reasons=None if reason_mask is None or reading.reflection is None else reason_mask.statements,
+            reasons=None if reason_mask is None or thinking is None else reason_mask.statements,
             logprobs=tuple(response.logprobs) if request.controls.logprobs else (),
             section_logprobs=_by_section(response) if request.controls.logprobs else {},
             foreseen=reading.foreseen,

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from model.driving.plan import Plan
 from model.engines.engine import Cut
 from model.formats.cursor import Cursor, Token
+from model.formats.pieces import Values
+from model.formats.text import parse_beginning
 from model.network.vocabulary import Vocabulary
 
 _HALF_A_CHARACTER: Final = "\ufffd"
@@ -65,16 +69,27 @@ class Response:
         return finished
 
     def new_text(self, vocabulary: Vocabulary) -> SectionText | None:
-        """What was written of a free text since this was last asked; None outside of free text."""
-        if self.cursor.stop_id is None:
+        """What a free text has grown by since this was last asked; None outside of free text."""
+        count = self.cursor.text_tokens
+        if count is None:
             self.streamed = 0
             return None
-        section = self.cursor.section
-        text = vocabulary.decode([token.id for token in self.tokens if token.section == section])
+        text = vocabulary.decode([token.id for token in self.tokens[len(self.tokens) - count :]])
+        # What may turn out to be the stop is not told before it does not.
+        text = text[: len(text) - self.cursor.stop_characters]
         if len(text) <= self.streamed or text.endswith(_HALF_A_CHARACTER):
             return None
         new, self.streamed = text[self.streamed :], len(text)
-        return SectionText(section, new)
+        return SectionText(self.cursor.section, new)
+
+    def values(self, vocabulary: Vocabulary, given: Mapping[str, Plan]) -> Values:
+        """The values of the sections that are finished; of others there may be some.
+
+        Args:
+            given: plans that the response began with, by section.
+        """
+        text = vocabulary.decode([token.id for token in self.tokens])
+        return parse_beginning(self.cursor.compiled, text, given)
 
     def _finished(self, section: str, then: str, vocabulary: Vocabulary) -> list[SectionText]:
         """``section``, when the next token belongs to another."""

@@ -12,7 +12,17 @@ from model.driving.plan import Plan
 from model.driving.scene import CAMERAS
 from model.driving.thoughts import Thoughts
 from model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, check_times
-from model.formats.pieces import Format, FormatError, Values, choices, with_picks
+from model.formats.pieces import (
+    Format,
+    FormatError,
+    Section,
+    Value,
+    Values,
+    choices,
+    holds,
+    walk,
+    with_picks,
+)
 
 
 class FamilyError(ValueError):
@@ -158,8 +168,6 @@ class Reading:
         codes: the trajectory codes that it was decoded from, if any.
         plan: the first one, or the one that the caller gave.
         branch: the option that was taken.
-        reflection: what is wrong with the first plan, in words; without a plan, the thoughts that lead to the
-            trajectory.
         revised_plan: what takes its place.
         foreseen: what is perceived and foreseen before that.
     """
@@ -168,7 +176,6 @@ class Reading:
     codes: tuple[int, ...] = ()
     plan: Plan | None = None
     branch: str | None = None
-    reflection: str | None = None
     revised_plan: Plan | None = None
     foreseen: Foreseen | None = None
 
@@ -225,6 +232,8 @@ class Family:
         first_plan: the section of the plan that it writes first, and that callers may give.
         branch: where it may take a second look, which is a reflection, a revised plan, or both.
         reflection: the section where it says what is wrong with its first plan, or thinks without one.
+        reflection_text: the values of that section in words, None where they say nothing. Not needed where
+            the section has one value, which is a text.
         revised_plan: the section of the plan that takes the first one's place.
         teach: the values of the response that a labelled scene teaches; None where nothing is trained.
         title: what tables of measures call it; its name without one.
@@ -233,8 +242,8 @@ class Family:
         imagination: where it may imagine a picture.
 
     Raises:
-        FamilyError: the format lacks a section, the branch or the imagination that is declared, or times do
-            not ascend.
+        FamilyError: the format lacks a section, the branch or the imagination that is declared, times do not
+            ascend, or a reflection of several values lacks a `reflection_text`.
     """
 
     format: Format
@@ -246,6 +255,7 @@ class Family:
     first_plan: str | None = None
     branch: Branch | None = None
     reflection: str | None = None
+    reflection_text: Callable[[tuple[Value, ...]], str | None] | None = None
     revised_plan: str | None = None
     teach: Callable[[Lesson], Values] | None = None
     title: str | None = None
@@ -270,6 +280,10 @@ class Family:
             if self.reflection is None and self.revised_plan is None:
                 raise FamilyError(f"family {self.name!r}: a second look writes a reflection or a plan")
             _check_branch(self.name, self.format, self.branch)
+        if self.reflection is not None and self.reflection_text is None:
+            for section in walk(self.format.body):
+                if isinstance(section, Section) and section.name == self.reflection:
+                    _check_one_value(self.name, section)
         if self.imagination is not None:
             self._check_imagination(self.imagination)
 
@@ -292,6 +306,13 @@ class Family:
         """The sections of plans, the one that counts first where several are written."""
         return tuple(each for each in (self.revised_plan, self.first_plan) if each is not None)
 
+    def reflected(self, values: Values) -> str | None:
+        """What a response says in its reflection, in words; None where it has none, or says nothing."""
+        said = () if self.reflection is None else values.all(self.reflection)
+        if not said:
+            return None
+        return str(said[0]) if self.reflection_text is None else self.reflection_text(said)
+
     @property
     def looks_twice(self) -> bool:
         """Whether it reflects upon a plan of its own, as counterfactual examples teach."""
@@ -300,6 +321,15 @@ class Family:
     def in_dialect(self, reflection: ReflectionLanguage) -> Family:
         """The family of a checkpoint whose reflections are so written."""
         return replace(self, format=self.dialects.get(reflection, self.format))
+
+
+def _check_one_value(family: str, section: Section) -> None:
+    count = holds(section.body)
+    if count != 1:
+        held = "several values" if count is None else f"{count} values"
+        raise FamilyError(
+            f"family {family!r}: section {section.name!r} holds {held}; say by reflection_text how they read"
+        )
 
 
 def _check_branch(family: str, format: Format, branch: Branch) -> None:

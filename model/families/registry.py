@@ -23,7 +23,8 @@ from model.families.vla_world import VLA_WORLD
 GROUP: Final = "looktwice.families"
 """The entry points that declare families."""
 
-_OURS: Final = {family.name: family for family in (CF_VLA, TRAJ_ONLY, ELF_VLA, ELF_VLA_REFINE, VLA_WORLD)}
+OURS: Final = {family.name: family for family in (CF_VLA, TRAJ_ONLY, ELF_VLA, ELF_VLA_REFINE, VLA_WORLD)}
+"""The families of LookTwice itself, by name."""
 
 
 @cache
@@ -34,12 +35,12 @@ def family_named(name: str) -> Family:
         FamilyError: nobody declares it, more than one package does, or it cannot be loaded.
     """
     found = list(entry_points(group=GROUP, name=name))
-    if name in _OURS and not found:
-        return _OURS[name]
+    if name in OURS and not found:
+        return OURS[name]
     if not found:
-        known = sorted({*_OURS, *(each.name for each in entry_points(group=GROUP))})
+        known = sorted({*OURS, *(each.name for each in entry_points(group=GROUP))})
         raise FamilyError(f"no model family {name!r}; known are {', '.join(known)}")
-    if len(found) > 1 or name in _OURS:
+    if len(found) > 1 or name in OURS:
         raise FamilyError(f"model family {name!r} is declared more than once: {', '.join(map(str, found))}")
     return _loaded(found[0])
 

@@ -415,6 +415,16 @@ class Cursor:
             return self.compiled.text(piece).stop[state.matched]
         return None
 
+    @property
+    def text_tokens(self) -> int | None:
+        """Within free text: how many of its tokens are written; None elsewhere."""
+        return self.active.state.used if isinstance(self.active, InText) else None
+
+    @property
+    def stop_characters(self) -> int:
+        """Within free text: with how many characters of its stop it ends, so that they may not be of it."""
+        return self.active.state.seen if isinstance(self.active, InText) else 0
+
     def _at(self, active: Active, written: Written) -> Cursor:
         return Cursor(self.compiled, active, self.section, self.rest, written)
 

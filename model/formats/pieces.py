@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from model.driving.plan import Plan
 
@@ -76,6 +76,10 @@ class Values:
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.by_section)
+
+
+NOTHING: Final = Values({})
+"""No values at all."""
 
 
 class Texts:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 
 from model.driving.plan import Plan
 from model.formats.cursor import CompiledFormat
@@ -44,9 +45,24 @@ def parse(compiled: CompiledFormat, text: str, given: Mapping[str, Plan] | None 
     reader.read(compiled.body(given), reader.section(""))
     if reader.position != len(text):
         raise reader.error("expected the end of the response")
-    return Values(
-        {name: tuple(value for _, value in parts) for name, parts in reader.sections.items() if parts}
-    )
+    return reader.values()
+
+
+def parse_beginning(compiled: CompiledFormat, text: str, given: Mapping[str, Plan] | None = None) -> Values:
+    """The values of the beginning of a response, which ends anywhere behind what a cursor has written.
+
+    Sections that are finished have all their values; what is said of the one that is being written may be
+    less, or other, than it will be.
+
+    Args:
+        compiled, given: as of `parse`.
+        text: the response so far.
+    """
+    reader = _Reader(compiled, text)
+    # What is not written yet cannot be read.
+    with suppress(FormatError):
+        reader.read(compiled.body(given), reader.section(""))
+    return reader.values()
 
 
 class _Reader:
@@ -58,6 +74,12 @@ class _Reader:
     def section(self, name: str) -> _Parts:
         """The values of a section so far."""
         return self.sections.setdefault(name, [])
+
+    def values(self) -> Values:
+        """All that was read so far."""
+        return Values(
+            {name: tuple(value for _, value in parts) for name, parts in self.sections.items() if parts}
+        )
 
     def read(self, piece: Piece, values: _Parts) -> None:
         """Read ``piece`` from the position on, its values into ``values``."""

@@ -231,8 +231,9 @@ def test_free_text_may_think_anything(elf: Loaded) -> None:
     compiled = CompiledFormat(ELF_VLA.format, elf.vocabulary)
     poses = ", ".join(["[1.0, -0.1, 0.00]"] * 8)
     text = f"<think>A lorry < 5 m ahead.\nSo I wait.</think><answer>{poses}</answer><|im_end|>"
-    read = ELF_VLA.read(parse(compiled, text), lambda codes: np.zeros((64, 4), np.float32))
-    assert read.reflection == "A lorry < 5 m ahead.\nSo I wait."
+    values = parse(compiled, text)
+    read = ELF_VLA.read(values, lambda codes: np.zeros((64, 4), np.float32))
+    assert ELF_VLA.reflected(values) == "A lorry < 5 m ahead.\nSo I wait."
     np.testing.assert_allclose(read.trajectory, [[1.0, -0.1, 0.0, 0.0]] * 8, rtol=1e-6)
     for wrong in (
         text.replace(poses, poses[:-19]),

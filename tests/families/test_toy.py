@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import AsyncGenerator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,6 @@ from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.torch.runner import Runner
 from model.evaluation.open_loop import evaluate_draws
 from model.families.family import Lesson
-from model.families.registry import GROUP, family_named
 from model.formats.cursor import CompiledFormat
 from model.formats.text import parse
 from model.network.checkpoint import Loaded, load
@@ -49,18 +48,10 @@ from tests.service.serving import serve
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def checkpoint(toy_family: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of the family, which an installed package declares."""
-    installed = tmp_path_factory.mktemp("installed")
-    about = installed / "toy-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: toy\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(f"[{GROUP}]\ntoy = tests.families.toy:TOY\n")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(installed)
-        folder = Path(tmp_path_factory.mktemp("toy") / "checkpoint")
-        yield write_untrained(folder, narrow=True, settings=VlaSettings(name="toy", formats=("toy",)))
-    family_named.cache_clear()
+    folder = tmp_path_factory.mktemp("toy") / "checkpoint"
+    return write_untrained(folder, narrow=True, settings=VlaSettings(name="toy", formats=("toy",)))
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +122,8 @@ def test_it_plans_over_http_and_is_evaluated(checkpoint: Path) -> None:
 def test_it_is_streamed_in_the_words_of_the_wire(toy: Loaded) -> None:
     [draw] = planned(toy, n=1, thinking="always")
     happened: list[Happened] = [
-        TextWritten(0, "why", " It"),
-        SectionFinished(0, "why", " It rains.\n"),
+        TextWritten(0, "why", "It"),
+        SectionFinished(0, "why", " It rains.\n", ("It rains.",)),
         Judged(draw, agreement(None, "It rains.", None, draw.trajectory, noisy_scene(1).history)),
     ]
 
@@ -141,7 +132,7 @@ def test_it_is_streamed_in_the_words_of_the_wire(toy: Loaded) -> None:
             for event in happened:
                 yield event
 
-        first, metrics = SectionFinished(0, "mood", "Hmm,"), Metrics(CollectorRegistry())
+        first, metrics = SectionFinished(0, "mood", "Hmm,", ("Hmm,",)), Metrics(CollectorRegistry())
         return [event async for event in told_events(first, events(), "toy", metrics)]
 
     branch, it, rains, trajectory = asyncio.run(told())

@@ -124,20 +124,20 @@ class ScriptedEngine:
             yield Started()
             draws = [self._timed(_draw(request, index)) for index in range(request.controls.n)]
             for draw in draws:
-                yield SectionFinished(draw.index, "plan", str(draw.plan))
+                yield _finished(draw.index, "plan", draw.plan)
             await self.may_finish.wait()
             if self.failure_later is not None:
                 raise self.failure_later
             # Later draws finish first, as they may in a batch.
             for draw in reversed(draws):
-                yield SectionFinished(draw.index, "branch", draw.branch or "")
+                yield _finished(draw.index, "branch", draw.branch)
                 if draw.thinking is not None:
                     if request.controls.deadline_ms is not None:
                         yield DraftFinished(self._timed(_draft(request, draw)))
-                    for word in draw.thinking.split(" ")[:-1] if request.live else ():
-                        yield TextWritten(draw.index, "thinking", f" {word}")
-                    yield SectionFinished(draw.index, "thinking", f" {draw.thinking}\n")
-                    yield SectionFinished(draw.index, "revised_plan", str(draw.revised_plan))
+                    for number, word in enumerate(draw.thinking.split(" ")[:-1] if request.live else ()):
+                        yield TextWritten(draw.index, "thinking", f" {word}" if number else word)
+                    yield _finished(draw.index, "thinking", draw.thinking)
+                    yield _finished(draw.index, "revised_plan", draw.revised_plan)
                 cut = None if draw.thinking is None or request.controls.deadline_ms is None else self.cut
                 yield DrawFinished(replace(draw, cut=cut))
         except (GeneratorExit, asyncio.CancelledError):
@@ -158,6 +158,11 @@ class ScriptedEngine:
     def _timed(self, draw: Draw) -> Draw:
         trajectory = at_times(draw.trajectory, TEN_HZ_S, self.times_s)
         return replace(draw, trajectory=trajectory, times_s=self.times_s)
+
+
+def _finished(index: int, section: str, value: Plan | str | None) -> SectionFinished:
+    """A section of one value."""
+    return SectionFinished(index, section, str(value), () if value is None else (value,))
 
 
 def _draw(request: PlanRequest, index: int) -> Draw:

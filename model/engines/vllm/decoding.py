@@ -25,10 +25,11 @@ from model.engines.engine import (
 from model.engines.least_error import Expected, LeastError, least_error
 from model.engines.logprobs import reported
 from model.engines.reason_mask import ReasonMask
-from model.engines.requests import leads_to_reflection, read
+from model.engines.requests import given_plans, leads_to_reflection, read
 from model.engines.response import Response, SectionText
 from model.families.family import Branch, Family
 from model.formats.cursor import Allowed, Cursor
+from model.formats.pieces import NOTHING
 from model.network.checkpoint import Parts
 
 IntArray = npt.NDArray[np.int64]
@@ -283,8 +284,11 @@ class Decoding:
             self._happened.put_nowait(DrawFinished(finished))
 
     def _tell(self, draw: _Walk, sections: Iterable[SectionText]) -> None:
-        for section in sections:
-            self._happened.put_nowait(SectionFinished(draw.index, *section))
+        finished, said = list(sections), NOTHING
+        if finished and self._request.live:
+            said = draw.values(self._parts.vocabulary, given_plans(self._request, self._family))
+        for section in finished:
+            self._happened.put_nowait(SectionFinished(draw.index, *section, said.all(section.name)))
 
 
 def _alike(draws: Iterable[_Walk]) -> Iterable[list[_Walk]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from model.driving.plan import Plan
-from model.families.cf_vla.format import BRANCH, PLAN, REFLECTION, REVISED_PLAN, TRAJECTORY
+from model.families.cf_vla.format import BRANCH, PLAN, REVISED_PLAN, TRAJECTORY
 from model.families.family import Decode, Reading
 from model.families.trajectory_codes import codes_in
 from model.formats.pieces import Values
@@ -13,12 +13,11 @@ def read(values: Values, decode: Decode) -> Reading:
     """The parts of a response; raises `FormatError` where a section holds several values."""
     codes = codes_in(values[TRAJECTORY])
     plan, revised = values.get(PLAN), values.get(REVISED_PLAN)
-    branch, reflection = values.get(BRANCH), values.get(REFLECTION)
+    branch = values.get(BRANCH)
     return Reading(
         trajectory=decode(codes),
         codes=codes,
         plan=plan if isinstance(plan, Plan) else None,
         branch=branch if isinstance(branch, str) else None,
-        reflection=reflection if isinstance(reflection, str) else None,
         revised_plan=revised if isinstance(revised, Plan) else None,
     )

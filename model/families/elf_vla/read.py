@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from model.families.elf_vla.format import ANSWER, THINK, read_poses
+from model.families.elf_vla.format import ANSWER, read_poses
 from model.families.family import Decode, Reading
 from model.formats.pieces import Values
 
 
 def read(values: Values, decode: Decode) -> Reading:
-    """Its thoughts and its poses. Nothing is decoded: there are no codes."""
-    return Reading(read_poses(values[ANSWER]), reflection=str(values[THINK]))
+    """Its poses. Nothing is decoded: there are no codes."""
+    return Reading(read_poses(values[ANSWER]))

@@ -5,7 +5,7 @@ from typing import Final
 from model.families.family import Family, Imagination
 from model.families.vla_world import format as its
 from model.families.vla_world.inputs import INPUTS
-from model.families.vla_world.read import read
+from model.families.vla_world.read import read, thoughts_text
 from model.families.vla_world.targets import teach
 
 _TASK: Final = (
@@ -22,6 +22,7 @@ VLA_WORLD: Final = Family(
     inputs=INPUTS,
     trajectory=its.ANSWER,
     reflection=its.THINK,
+    reflection_text=thoughts_text,
     read=read,
     times_s=its.TIMES_S,
     teach=teach,

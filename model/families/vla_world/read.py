@@ -14,12 +14,14 @@ _CAMERAS = {written: camera for camera, written in its.CAMERA_OPTIONS.items()}
 
 
 def read(values: Values, decode: Decode) -> Reading:
-    """Its waypoints, its thoughts where it has any, and what it foresees. A trajectory has no codes."""
-    return Reading(
-        its.read_trajectory(values[its.ANSWER]),
-        reflection=its.told_thoughts(values[its.THINK]) or None,
-        foreseen=_foreseen(values),
-    )
+    """Its waypoints and what it foresees. A trajectory has no codes."""
+    return Reading(its.read_trajectory(values[its.ANSWER]), foreseen=_foreseen(values))
+
+
+def thoughts_text(values: tuple[Value, ...]) -> str | None:
+    """The text of its thoughts; None where nobody comes near."""
+    [notable] = values
+    return its.told_thoughts(notable) or None
 
 
 def _foreseen(values: Values) -> Foreseen:

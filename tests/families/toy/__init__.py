@@ -27,14 +27,10 @@ def drive(speeds_ms: tuple[float, ...]) -> FloatArray:
 
 
 def read(values: Values, decode: Decode) -> Reading:
-    """The drive, and the reason for doubt. Nothing is decoded: there are no codes."""
-    speeds, why = values["speeds"], values.get("why")
+    """The drive. Nothing is decoded: there are no codes."""
+    speeds = values["speeds"]
     assert isinstance(speeds, tuple)
-    return Reading(
-        trajectory=drive(tuple(float(str(speed)) for speed in speeds)),
-        branch=str(values["mood"]),
-        reflection=None if why is None else str(why),
-    )
+    return Reading(drive(tuple(float(str(speed)) for speed in speeds)), branch=str(values["mood"]))
 
 
 def teach(lesson: Lesson) -> Values:

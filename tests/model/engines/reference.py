@@ -139,16 +139,15 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
         ).logits[0, -1]
     text = loaded.vocabulary.decode([token.id for token in tokens])
     history = request.scene.history[None]
-    reading = family.read(
-        parse(compiled, text, given), lambda codes: loaded.codec.decode(history, [codes])[0]
-    )
+    values = parse(compiled, text, given)
+    reading = family.read(values, lambda codes: loaded.codec.decode(history, [codes])[0])
     draw = Draw(
         index=index,
         text=text,
         plan=reading.plan,
         branch=reading.branch,
         think_probability=think_probability,
-        thinking=reading.reflection,
+        thinking=family.reflected(values),
         revised_plan=reading.revised_plan,
         trajectory=reading.trajectory,
         codes=reading.codes,

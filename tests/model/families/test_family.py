@@ -8,7 +8,7 @@ import pytest
 from model.families.cf_vla import CF_VLA
 from model.families.family import Branch, FamilyError
 from model.families.traj_only import TRAJ_ONLY
-from model.formats.pieces import Choice, Format, Literal, Option, Section, Sequence
+from model.formats.pieces import NOTHING, Choice, Format, Literal, Option, Section, Sequence, Values
 
 
 def branching(*texts: str, times: int = 1) -> Format:
@@ -22,6 +22,16 @@ def test_the_branch_is_a_choice_of_the_format() -> None:
     assert replace(changed, branch=way, reflection="way").branch == way
     with pytest.raises(FamilyError, match="a second look writes a reflection or a plan"):
         replace(changed, branch=way)
+
+
+def test_a_reflection_of_several_values_is_told_in_words() -> None:
+    two = Section("why", Sequence((Choice((Option("a"), Option("b"))), Choice((Option("c"), Option("d"))))))
+    speaking = replace(TRAJ_ONLY, format=Format("made up", two), trajectory="why")
+    with pytest.raises(FamilyError, match="section 'why' holds 2 values; say by reflection_text"):
+        replace(speaking, reflection="why")
+    told = replace(speaking, reflection="why", reflection_text=lambda values: " and ".join(map(str, values)))
+    assert told.reflected(Values({"why": ("a", "d")})) == "a and d"
+    assert told.reflected(NOTHING) is None
 
 
 @pytest.mark.parametrize(

@@ -176,12 +176,12 @@ def test_a_picture_is_98_codes_and_nothing_else() -> None:
 
 def test_thoughts_are_read_in_the_words_that_are_written() -> None:
     reading = read(SAMPLE, lambda codes: pytest.fail("there are no codes"))
-    assert reading.reflection == told_thoughts(SAMPLE["think"])
-    assert f"<think>{reading.reflection}</think>" in written(SAMPLE)
+    assert VLA_WORLD.reflected(SAMPLE) == told_thoughts(SAMPLE["think"])
+    assert f"<think>{VLA_WORLD.reflected(SAMPLE)}</think>" in written(SAMPLE)
     assert (reading.trajectory.shape, reading.codes, reading.branch) == ((6, 4), (), None)
     np.testing.assert_allclose(reading.trajectory[:, :2], [[0.5, 0.1]] * 6, rtol=1e-6)
     silent = Values({**SAMPLE.by_section, "think": ((),)})
-    assert read(silent, lambda codes: pytest.fail("there are no codes")).reflection is None
+    assert VLA_WORLD.reflected(silent) is None
 
 
 def test_every_camera_can_be_asked_for() -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from model.formats.cursor import CompiledFormat, Cursor, Token
 from model.formats.pieces import FormatError
-from model.formats.text import parse
+from model.formats.text import parse, parse_beginning
 from tests.model.formats.strategies import VOCABULARY, compiled_formats, values_of
 
 
@@ -49,6 +49,17 @@ def test_what_is_rendered_can_be_written_by_the_cursor(data: st.DataObject, comp
         assert token.section == cursor.section
         cursor = cursor.advance(token.id)
     assert cursor.done
+
+
+@given(compiled_formats(), st.integers(0, 2**32 - 1))
+def test_a_finished_section_says_what_it_says_in_the_end(compiled: CompiledFormat, seed: int) -> None:
+    tokens = walk(compiled.start(), seed)
+    whole = parse(compiled, VOCABULARY.decode(ids_of(tokens)))
+    for place in range(1, len(tokens) + 1):
+        section = tokens[place - 1].section
+        if section not in {token.section for token in tokens[place:]}:
+            beginning = parse_beginning(compiled, VOCABULARY.decode(ids_of(tokens[:place])))
+            assert beginning.all(section) == whole.all(section)
 
 
 @given(compiled_formats(), st.integers(0, 2**32 - 1))

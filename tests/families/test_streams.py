@@ -1,0 +1,86 @@
+"""Of every family, what a stream sends of a draw adds up to what the answer without streaming says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final, get_args
+
+import numpy as np
+import pytest
+
+import clients.wire as wire
+from clients.answers import PlanResult, Told
+from clients.planner import PlannerClient, attempt_at, plan_request
+from model.driving.phrases import ReflectionLanguage
+from model.engines.torch.engine import TorchEngine, TorchSettings
+from model.families.registry import OURS, family_named
+from model.network.settings import VlaSettings
+from service.settings import Settings
+from tests.checkpoints import noisy_scene, write_untrained
+from tests.service.serving import Served, serve
+
+FORMATS: Final = (*OURS, "toy")
+SCENE: Final = noisy_scene(1, route=True)
+
+
+@pytest.fixture(scope="module", params=get_args(ReflectionLanguage))
+def served(
+    request: pytest.FixtureRequest, toy_family: None, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Served[TorchEngine]]:
+    """An untrained checkpoint that writes all formats, in either language of reflections."""
+    settings = VlaSettings(name="all", formats=FORMATS, reflection=request.param)
+    checkpoint = write_untrained(Path(tmp_path_factory.mktemp("all")) / "all", narrow=True, settings=settings)
+    with serve(TorchEngine(checkpoint, TorchSettings(rows=8, products=None)), Settings()) as running:
+        yield running
+
+
+def asked(format: str, **controls: Any) -> wire.PlanRequest:
+    family = family_named(format)
+    draft = np.zeros((len(family.times_s), 4), np.float32)
+    attempt = attempt_at(draft, "Drive.", family.times_s) if family.refines else None
+    settings = wire.Controls(n=3, seed=5, numbers="drawn", **controls)
+    return plan_request(SCENE, settings, format=format, attempt=attempt)
+
+
+def told_of(index: int, events: list[tuple[str, Told]]) -> dict[str, Any]:
+    """What the events say of a draw, put together."""
+    told: dict[str, Any] = {}
+    for name, data in events:
+        match data:
+            case wire.PlanWritten(index=of, plan=plan) if of == index:
+                told[name] = plan.text
+            case wire.BranchTaken(index=of, branch=branch) if of == index:
+                told[name] = branch
+            case wire.ThinkingWritten(index=of, text=text) if of == index:
+                told[name] = told.get(name, "") + text
+            case wire.TrajectoryWritten(index=of) if of == index:
+                assert name == "trajectory"
+                told |= data.model_dump(exclude={"index"})
+    return told
+
+
+def answered(draw: wire.Draw, told: dict[str, Any]) -> dict[str, Any]:
+    """The same fields of a whole answer, and every other one that it could have been told of and was."""
+    plans = {name: plan.text for name in ("plan", "revised_plan") if (plan := getattr(draw, name))}
+    fields = {name: getattr(draw, name) for name in ("branch", "thinking") if getattr(draw, name) is not None}
+    names = set(wire.TrajectoryWritten.model_fields) - {"index"}
+    return plans | fields | draw.model_dump(include=names)
+
+
+@pytest.mark.parametrize("thinking", ["always", "adaptive"])
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_parts_are_the_whole(served: Served[TorchEngine], format: str, thinking: str) -> None:
+    request = asked(format, thinking=thinking, temperature=1.2)
+    plain = served.http.post("/v1/plan", json=request.model_dump())
+    assert plain.status_code == 200, plain.text
+    draws = wire.PlanResponse.model_validate_json(plain.content).draws
+    with PlannerClient(served.url) as planner:
+        events = list(planner.stream(request))
+    name, done = events[-1]
+    assert name == "done"
+    assert isinstance(done, PlanResult)
+    assert [draw.thinking for draw in done.draws] == [draw.thinking for draw in draws]
+    for draw in draws:
+        told = told_of(draw.index, events)
+        assert told == answered(draw, told)
