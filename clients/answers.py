@@ -11,7 +11,6 @@ from email.utils import parsedate_to_datetime
 from typing import Final, TypeVar
 
 import httpx
-from httpx_sse import ServerSentEvent
 from pydantic import BaseModel, ValidationError
 
 from clients import wire
@@ -215,10 +214,11 @@ def _problem(response: httpx.Response) -> PlannerError:
         problem = wire.Problem.model_validate_json(response.content)
     except ValidationError:
         return BadAnswer(f"{response.url} answered {response.status_code} without a problem document")
-    return _typed(problem, retry_after_s(response))
+    return typed(problem, retry_after_s(response))
 
 
-def _typed(problem: wire.Problem, wait_s: float | None = None) -> PlannerProblem:
+def typed(problem: wire.Problem, wait_s: float | None = None) -> PlannerProblem:
+    """The typed error for a problem document."""
     kind: type[PlannerProblem] = ServiceFailed
     if problem.status in BUSY_STATUSES:
         kind = ServiceBusy
@@ -229,7 +229,7 @@ def _typed(problem: wire.Problem, wait_s: float | None = None) -> PlannerProblem
 
 def plan_result(response: httpx.Response) -> PlanResult:
     """The typed result of POST /v1/plan; raises `PlannerError`."""
-    return _planned(read(response, wire.PlanResponse), response)
+    return planned(read(response, wire.PlanResponse), response)
 
 
 def batch_results(response: httpx.Response) -> list[PlanResult | PlannerProblem]:
@@ -237,15 +237,16 @@ def batch_results(response: httpx.Response) -> list[PlanResult | PlannerProblem]
     results: list[PlanResult | PlannerProblem] = []
     for result in read(response, wire.BatchResponse).results:
         if result.response is not None:
-            results.append(_planned(result.response, response))
+            results.append(planned(result.response, response))
         elif result.problem is not None:
-            results.append(_typed(result.problem))
+            results.append(typed(result.problem))
         else:
             raise BadAnswer(f"{response.url} gave a result without an answer and without a problem")
     return results
 
 
-def _planned(answered: wire.PlanResponse, response: httpx.Response) -> PlanResult:
+def planned(answered: wire.PlanResponse, response: httpx.Response) -> PlanResult:
+    """The typed result of what was ``answered`` in ``response``; raises `BadAnswer`."""
     with _contract(response):
         draws = tuple(_draw(draw) for draw in answered.draws)
         if answered.agreed >= len(draws):
@@ -260,49 +261,13 @@ def _planned(answered: wire.PlanResponse, response: httpx.Response) -> PlanResul
     )
 
 
-Told = (
-    wire.PlanWritten
-    | wire.BranchTaken
-    | wire.ThinkingWritten
-    | wire.TrajectoryWritten
-    | PlanResult
-    | ReflectResult
-)
-"""What a stream tells; see `clients.wire.EVENTS`."""
-
-
-def told(event: ServerSentEvent, response: httpx.Response) -> Told | None:
-    """What an event of a stream tells; None for one of a later version.
-
-    Args:
-        event: of the stream.
-        response: that it came in; its path decides what the last event holds.
-
-    Raises:
-        PlannerError: the event is an error, or not of the contract.
-    """
-    name, data = event.event, event.data
-    try:
-        if name == "done" and response.url.path == "/v1/reflect":
-            return _reflected(wire.ReflectResponse.model_validate_json(data), response)
-        if name == "done":
-            return _planned(wire.PlanResponse.model_validate_json(data), response)
-        if name not in wire.EVENTS:
-            return None
-        event_data = wire.EVENTS[name].model_validate_json(data)
-    except ValidationError as error:
-        raise BadAnswer(f"{response.url} told of something else than {name}: {error}") from error
-    if isinstance(event_data, wire.Problem):
-        raise _typed(event_data)
-    return event_data
-
-
 def reflect_result(response: httpx.Response) -> ReflectResult:
     """The typed result of POST /v1/reflect; raises `PlannerError`."""
-    return _reflected(read(response, wire.ReflectResponse), response)
+    return reflected(read(response, wire.ReflectResponse), response)
 
 
-def _reflected(answered: wire.ReflectResponse, response: httpx.Response) -> ReflectResult:
+def reflected(answered: wire.ReflectResponse, response: httpx.Response) -> ReflectResult:
+    """The typed result of what was ``answered`` in ``response``; raises `BadAnswer`."""
     with _contract(response):
         plan = parse_plan(answered.plan.text)
         draws = tuple(_looked_at(draw) for draw in answered.draws)

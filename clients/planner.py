@@ -39,13 +39,11 @@ from clients.answers import (
     RequestRefused,
     ServiceBusy,
     ServiceFailed,
-    Told,
     batch_results,
     plan_result,
     read,
     reflect_result,
     retry_after_s,
-    told,
     unreachable,
 )
 from clients.requests import (
@@ -56,6 +54,7 @@ from clients.requests import (
     refine_request,
     reflect_request,
 )
+from clients.streams import ImagineTold, Told, told, told_of_pictures
 from clients.wire_values import with_pictures
 from model.driving.outcome import Outcome
 from model.driving.plan import Plan
@@ -66,6 +65,7 @@ __all__ = [
     "Access",
     "AsyncPlannerClient",
     "BadAnswer",
+    "ImagineTold",
     "LookedAt",
     "Patience",
     "PlanResult",
@@ -189,6 +189,24 @@ class PlannerClient:
                 read(response, wire.PlanResponse)
             for event in EventSource(response).iter_sse():
                 if (data := told(event, response)) is not None:
+                    yield event.event, data
+
+    def stream_imagine(self, asked: wire_imagine.ImagineRequest) -> Iterator[tuple[str, ImagineTold]]:
+        """Pictures as they are written: names and data of `clients.wire_imagine.EVENTS`, at last ``done``.
+
+        Args:
+            asked: see `imagine_request`.
+
+        Raises:
+            PlannerError: as of `stream`.
+        """
+        body = self._body(asked.model_copy(update={"stream": True}))
+        with _told_errors(), self._http.stream("POST", "/v1/imagine", **body) as response:
+            if response.status_code != 200:
+                response.read()
+                read(response, wire_imagine.ImagineResponse)
+            for event in EventSource(response).iter_sse():
+                if (data := told_of_pictures(event, response)) is not None:
                     yield event.event, data
 
     def reflect(
@@ -347,6 +365,20 @@ class AsyncPlannerClient:
                     read(response, wire.PlanResponse)
                 async for event in EventSource(response).aiter_sse():
                     if (data := told(event, response)) is not None:
+                        yield event.event, data
+
+    async def stream_imagine(
+        self, asked: wire_imagine.ImagineRequest
+    ) -> AsyncGenerator[tuple[str, ImagineTold]]:
+        """Pictures as they are written; see `PlannerClient.stream_imagine`."""
+        body = self._body(asked.model_copy(update={"stream": True}))
+        with _told_errors():
+            async with self._http.stream("POST", "/v1/imagine", **body) as response:
+                if response.status_code != 200:
+                    await response.aread()
+                    read(response, wire_imagine.ImagineResponse)
+                async for event in EventSource(response).aiter_sse():
+                    if (data := told_of_pictures(event, response)) is not None:
                         yield event.event, data
 
     async def reflect(

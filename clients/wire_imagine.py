@@ -20,6 +20,7 @@ from clients.wire import (
     Length,
     ModelName,
     Nearby,
+    Problem,
     Scene,
     Temperature,
     Timing,
@@ -28,6 +29,10 @@ from clients.wire import (
 
 SECONDS_AHEAD: Final = 0.5
 PICTURE_CODES: Final = 98
+ROW_CODES: Final = 14
+"""A row of a picture; progress is told row by row."""
+
+Index = Annotated[int, Field(ge=0, description="0..n-1.")]
 
 
 class ImagineControls(Asked):
@@ -57,9 +62,12 @@ class ImagineRequest(Asked):
         description="Whose picture is to be imagined; it need not be among the cameras of the scene."
     )
     controls: ImagineControls = Field(default=ImagineControls(), description="n pictures are made.")
+    stream: bool = Field(
+        default=False, description="Answer with server-sent events, as pictures are written."
+    )
 
 
-class PerceivedObject(Answered):
+class SeenObject(Answered):
     """One road user or obstacle that the model tells of, now, in the ego frame."""
 
     kind: AgentKind
@@ -67,17 +75,33 @@ class PerceivedObject(Answered):
     y_m: Nearby
     length_m: Length
     width_m: Length
+
+
+class PerceivedObject(SeenObject):
+    """The same, with what the model says of it in the end."""
+
     near_s: float | None = Field(
         description="When the model expects it in the safe zone around the ego; null for never."
     )
 
 
-class Perception(Answered):
+class Edges(Answered):
+    """How far the edges of the road are."""
+
+    left_m: float = Field(ge=0, description="From the ego's left side to the edge of the road.")
+    right_m: float = Field(ge=0, description="The same on the right.")
+
+
+class Seen(Edges):
+    """What the model sees around the ego, before it thinks of what comes of it."""
+
+    objects: list[SeenObject] = Field(description="The nearest first, at most 8.")
+
+
+class Perception(Edges):
     """What the model sees around the ego."""
 
     objects: list[PerceivedObject] = Field(description="The nearest first, at most 8.")
-    left_m: float = Field(ge=0, description="From the ego's left side to the edge of the road.")
-    right_m: float = Field(ge=0, description="The same on the right.")
 
 
 class Prediction(Answered):
@@ -88,10 +112,10 @@ class Prediction(Answered):
     direction: str = Field(description="Left, Forward or Right.")
 
 
-class ImaginedPicture(Answered):
-    """One of the n pictures, and what the model said before it."""
+class Picture(Answered):
+    """One of the n pictures; data of the event `picture`."""
 
-    index: int = Field(ge=0, description="0..n-1.")
+    index: Index
     image: str = Field(description="PNG in base64, 224 x 112 pixels, painted of the codes.")
     codes: Annotated[
         list[int],
@@ -101,6 +125,11 @@ class ImaginedPicture(Answered):
             description="98 codes of 0..999, row by row from the upper left, 14 in a row.",
         ),
     ]
+
+
+class ImaginedPicture(Picture):
+    """One of the n pictures, and what the model said before it."""
+
     logprob: float = Field(
         le=0,
         allow_inf_nan=False,
@@ -121,3 +150,36 @@ class ImagineResponse(Answered):
     seconds: float = Field(description="How far ahead the pictures are.")
     pictures: list[ImaginedPicture]
     timing: Timing
+
+
+class PerceptionWritten(Answered):
+    """Data of the event `perception`."""
+
+    index: Index
+    perception: Seen
+
+
+class PredictionWritten(Answered):
+    """Data of the event `prediction`."""
+
+    index: Index
+    prediction: Prediction
+
+
+class CodesWritten(Answered):
+    """Data of the event `codes`: how far the picture is written."""
+
+    index: Index
+    written: int = Field(ge=0, le=PICTURE_CODES, description="Whole rows of 14 codes; at last all 98.")
+
+
+Event = PerceptionWritten | PredictionWritten | CodesWritten | Picture | Problem
+
+EVENTS: Final[dict[str, type[Event]]] = {
+    "perception": PerceptionWritten,
+    "prediction": PredictionWritten,
+    "codes": CodesWritten,
+    "picture": Picture,
+    "error": Problem,
+}
+"""Server-sent events and their data; `done` ends the stream with what the answer would have been without."""

@@ -12,16 +12,20 @@ import clients.wire_imagine as wire_imagine
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from service.callers import while_connected
 from service.examples import example_imagining
-from service.imagining import imagine_answer, imagining_of
-from service.openapi import PACKED, payloads, problems
+from service.imagining import ImagineTeller, imagine_answer, imagining_of
+from service.openapi import answers_and_stream, payloads, problems
 from service.parts import Parts
 from service.payloads import payload_route
-from service.planning import last
+from service.planning import Planned, last
 from service.planning_routes import REFUSALS, arrival_of, respond
 from service.problems import CANNOT_IMAGINE
+from service.streaming import server_sent, streamed
 
 EXAMPLES: Final[dict[str, Example]] = {
-    "what the left camera will see": {"value": example_imagining((FRONT_WIDE, FRONT_TELE))}
+    "what the left camera will see": {"value": example_imagining((FRONT_WIDE, FRONT_TELE))},
+    "the same, told as it is written": {
+        "value": example_imagining((FRONT_WIDE, FRONT_TELE)) | {"stream": True}
+    },
 }
 
 
@@ -32,7 +36,7 @@ def imagine_router(parts: Parts) -> APIRouter:
     @router.post(
         "/v1/imagine",
         response_model=wire_imagine.ImagineResponse,
-        responses=problems(*REFUSALS, CANNOT_IMAGINE) | PACKED,
+        responses=problems(*REFUSALS, CANNOT_IMAGINE) | answers_and_stream(*wire_imagine.EVENTS),
         openapi_extra=payloads(wire_imagine.ImagineRequest),
     )
     async def imagine(
@@ -40,13 +44,24 @@ def imagine_router(parts: Parts) -> APIRouter:
     ) -> Any:
         """What a camera will see in half a second: n pictures, and what the model perceives and predicts."""
         arrival = arrival_of(request)
+        imagining = imagining_of(asked, parts.lifecycle.card)
+        events = parts.planning.events(imagining.planning, arrival)
 
-        async def work() -> wire_imagine.ImagineResponse:
-            imagining = imagining_of(asked, parts.lifecycle.card)
-            planned = await last(parts.planning.events(imagining.planning, arrival))
+        async def answer(planned: Planned) -> wire_imagine.ImagineResponse:
             # On a thread: painting must not hold up the answers of others.
             return await asyncio.to_thread(imagine_answer, imagining, planned, arrival)
 
+        async def work() -> wire_imagine.ImagineResponse:
+            return await answer(await last(events))
+
+        if asked.stream:
+            return await streamed(
+                request,
+                events,
+                ImagineTeller(imagining.imagination),
+                lambda told: server_sent(told, answer, arrival.request_id),
+                parts.metrics,
+            )
         return respond(request, await while_connected(request, work()))
 
     return router

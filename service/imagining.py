@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import clients.wire as wire
 import clients.wire_imagine as wire_imagine
 from model.driving.images import encode_png
-from model.engines.engine import Draw, ModelCard
-from model.families.family import Imagination
+from model.driving.perceived import Perceived, PerceivedAgent
+from model.engines.engine import CodesWritten, Draw, ModelCard, SectionFinished
+from model.families.family import Imagination, Predicted
 from model.families.registry import family_named
-from service.planning import Arrival, Planned
+from service.planning import Arrival, Begun, Paint, Planned
+from service.planning import Told as Happened
 from service.problems import CANNOT_IMAGINE, UNKNOWN_FORMAT, ProblemError
 
 _DECIMALS = 4
+
+Written = (
+    wire_imagine.PerceptionWritten
+    | wire_imagine.PredictionWritten
+    | wire_imagine.CodesWritten
+    | wire_imagine.Picture
+)
+"""The data of an event."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +68,7 @@ def imagining_of(asked: wire_imagine.ImagineRequest, card: ModelCard) -> Imagini
             **dict(asked.controls), thinking="adaptive", imagine="always", camera=asked.camera, logprobs=True
         ),
         format=format,
+        stream=asked.stream,
     )
     return Imagining(format, imagination, asked.camera, planning)
 
@@ -75,6 +88,56 @@ def imagine_answer(imagining: Imagining, planned: Planned, arrival: Arrival) -> 
     )
 
 
+class ImagineTeller:
+    """Tells of pictures that are being written.
+
+    Args:
+        imagination: of the family that writes them.
+    """
+
+    def __init__(self, imagination: Imagination) -> None:
+        self._imagination = imagination
+        self._paint: Paint | None = None
+        self._rows: dict[int, int] = {}
+
+    async def __call__(self, event: Happened) -> list[tuple[str, Written]]:
+        """Events of `clients.wire_imagine.EVENTS` with their data."""
+        imagination = self._imagination
+        match event:
+            case Begun(paint):
+                self._paint = paint
+            case SectionFinished(index, section, _, values) if section == imagination.perception:
+                seen = _seen(imagination.perceived(values))
+                return [("perception", wire_imagine.PerceptionWritten(index=index, perception=seen))]
+            case SectionFinished(index, section, _, values) if section == imagination.prediction:
+                prediction = _prediction(imagination.predicted(values))
+                return [("prediction", wire_imagine.PredictionWritten(index=index, prediction=prediction))]
+            case CodesWritten(index, section, count) if section == imagination.section:
+                return self._progress(index, count)
+            case SectionFinished(index, section, _, values) if section == imagination.section:
+                codes = imagination.pictured(values).codes
+                assert self._paint is not None, "an engine begins before it writes"
+                # On a thread: painting must not hold up the answers of others.
+                image = await asyncio.to_thread(_png, self._paint, codes)
+                picture = wire_imagine.Picture(index=index, image=image, codes=list(codes))
+                return [*self._progress(index, len(codes)), ("picture", picture)]
+        return []
+
+    def _progress(self, index: int, count: int) -> list[tuple[str, Written]]:
+        """Told when further rows are whole."""
+        rows = count // wire_imagine.ROW_CODES
+        if rows <= self._rows.get(index, 0):
+            return []
+        self._rows[index] = rows
+        written = rows * wire_imagine.ROW_CODES
+        return [("codes", wire_imagine.CodesWritten(index=index, written=written))]
+
+
+def _png(paint: Paint, codes: Sequence[int]) -> str:
+    """A picture in base64; takes some ms."""
+    return base64.b64encode(encode_png(paint(codes))).decode()
+
+
 def _picture(imagination: Imagination, planned: Planned, draw: Draw) -> wire_imagine.ImaginedPicture:
     foreseen = draw.foreseen
     assert foreseen is not None
@@ -82,28 +145,41 @@ def _picture(imagination: Imagination, planned: Planned, draw: Draw) -> wire_ima
     perceived, codes = foreseen.perceived, list(foreseen.picture.codes)
     return wire_imagine.ImaginedPicture(
         index=draw.index,
-        image=base64.b64encode(encode_png(planned.paint(codes))).decode(),
+        image=_png(planned.paint, codes),
         codes=codes,
         # Above 0 by rounding alone.
         logprob=min(0.0, draw.section_logprobs[imagination.section]),
         perception=wire_imagine.Perception(
             objects=[
-                wire_imagine.PerceivedObject(
-                    kind=agent.kind,
-                    x_m=round(agent.x_m, _DECIMALS),
-                    y_m=round(agent.y_m, _DECIMALS),
-                    length_m=agent.length_m,
-                    width_m=agent.width_m,
-                    near_s=agent.near_s,
-                )
+                wire_imagine.PerceivedObject(**dict(_object(agent)), near_s=agent.near_s)
                 for agent in perceived.agents
             ],
             left_m=perceived.left_m,
             right_m=perceived.right_m,
         ),
-        prediction=wire_imagine.Prediction(
-            x_m=round(foreseen.x_m, _DECIMALS),
-            y_m=round(foreseen.y_m, _DECIMALS),
-            direction=foreseen.direction,
-        ),
+        prediction=_prediction(Predicted(foreseen.x_m, foreseen.y_m, foreseen.direction)),
+    )
+
+
+def _seen(perceived: Perceived) -> wire_imagine.Seen:
+    return wire_imagine.Seen(
+        objects=list(map(_object, perceived.agents)), left_m=perceived.left_m, right_m=perceived.right_m
+    )
+
+
+def _object(agent: PerceivedAgent) -> wire_imagine.SeenObject:
+    return wire_imagine.SeenObject(
+        kind=agent.kind,
+        x_m=round(agent.x_m, _DECIMALS),
+        y_m=round(agent.y_m, _DECIMALS),
+        length_m=agent.length_m,
+        width_m=agent.width_m,
+    )
+
+
+def _prediction(predicted: Predicted) -> wire_imagine.Prediction:
+    return wire_imagine.Prediction(
+        x_m=round(predicted.x_m, _DECIMALS),
+        y_m=round(predicted.y_m, _DECIMALS),
+        direction=predicted.direction,
     )

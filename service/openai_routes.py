@@ -31,7 +31,8 @@ from service.payloads import payload_route
 from service.planning import Planned, last
 from service.planning_routes import REFUSALS, arrival_of
 from service.problems import DRAINING, ENGINE_FAILED, NOT_READY, UNAUTHORIZED, UNKNOWN_MODEL, ProblemError
-from service.streaming import Told, Written, streamed
+from service.streaming import streamed
+from service.telling import PlanTeller, Written
 
 _ANSWERS: Final[Responses] = {
     200: {
@@ -69,7 +70,11 @@ def openai_router(parts: Parts) -> APIRouter:
             if not chat.stream:
                 return JSONResponse(completion.whole(await while_connected(request, last(events))))
             return await streamed(
-                request, events, lambda told: _chunks(told, completion), format_of(asked, card), parts.metrics
+                request,
+                events,
+                PlanTeller(format_of(asked, card)),
+                lambda told: _chunks(told, completion),
+                parts.metrics,
             )
         except ProblemError as problem:
             raise ChatPlaces(chat).problem(problem) from problem
@@ -88,7 +93,9 @@ def openai_router(parts: Parts) -> APIRouter:
     return router
 
 
-async def _chunks(told: AsyncGenerator[Told], completion: Completion) -> AsyncGenerator[bytes]:
+async def _chunks(
+    told: AsyncGenerator[tuple[str, Written] | Planned], completion: Completion
+) -> AsyncGenerator[bytes]:
     async with aclosing(told):
         try:
             async for event in told:

@@ -48,6 +48,12 @@ def event_stream(description: str, *names: str) -> dict[str, Any]:
     return {SSE_MEDIA_TYPE: {"schema": schema}}
 
 
+def answers_and_stream(*names: str) -> Responses:
+    """Of a route that answers in msgpack where that is accepted, and in events of these names on request."""
+    stream = event_stream("With stream: true. One event of it.", *names, "done")
+    return {200: {"content": PACKED[200]["content"] | stream}}
+
+
 def problems(*kinds: Kind) -> Responses:
     """What a route declares about its errors; 421 and 500 can occur anywhere."""
     by_status: dict[int, list[Kind]] = {}

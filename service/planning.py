@@ -52,6 +52,7 @@ _ANSWERING_MS: Final = 3
 """Of a deadline, left for writing the answer."""
 
 Asked = wire.PlanRequest | wire.ReflectRequest
+Paint = Callable[[Sequence[int]], npt.NDArray[np.uint8]]
 _Held = TypeVar("_Held")
 
 log = structlog.stdlib.get_logger()
@@ -100,10 +101,21 @@ class Planned:
     card: ModelCard
     timing: wire.Timing
     deadline: wire.Deadline | None
-    paint: Callable[[Sequence[int]], npt.NDArray[np.uint8]]
+    paint: Paint
 
 
-Told = Event | Judged | Planned
+@dataclass(frozen=True)
+class Begun:
+    """The engine has begun with a scene.
+
+    Attributes:
+        paint: as of `Planned`.
+    """
+
+    paint: Paint
+
+
+Told = Event | Begun | Judged | Planned
 """What a scene's events are here: the engine's, and what is made of them."""
 
 
@@ -153,7 +165,7 @@ class Planning:
     async def events(self, asked: Asked, arrival: Arrival) -> AsyncGenerator[Told]:
         """What happens to a scene, at last the whole of it; closing it early frees everything.
 
-        Finished draws are told as `Judged`.
+        `Started` is told as `Begun`, finished draws as `Judged`.
 
         Raises:
             ProblemError: at the first iteration where it is not let in; later where it fails.
@@ -183,7 +195,9 @@ class Planning:
                             if isinstance(event, Started):
                                 place.began()
                                 began_s = time.monotonic()
-                            elif isinstance(event, DraftFinished):
+                                yield Begun(engine.paint)
+                                continue
+                            if isinstance(event, DraftFinished):
                                 drafts[event.draw.index] = event.draw
                             elif isinstance(event, DrawFinished):
                                 draw = event.draw

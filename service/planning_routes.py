@@ -21,7 +21,7 @@ from service.errors import problem_document, validated
 from service.examples import example_reflection, example_request
 from service.idempotency import NotKept
 from service.intake import format_of
-from service.openapi import PACKED, Responses, event_stream, payloads, problems
+from service.openapi import PACKED, answers_and_stream, payloads, problems
 from service.parts import Parts
 from service.payloads import packed, payload_route
 from service.planning import Arrival, Asked, Planned, last
@@ -59,6 +59,7 @@ from service.problems import (
     unforeseen,
 )
 from service.streaming import server_sent, streamed
+from service.telling import PlanTeller
 
 log = structlog.stdlib.get_logger()
 
@@ -67,12 +68,6 @@ _TRY_AGAIN: Final = frozenset((429, 500, 503, 504))
 PLAN_EXAMPLES: dict[str, Example] = {"straight on": {"value": example_request((FRONT_WIDE, FRONT_TELE))}}
 REFLECT_EXAMPLES: dict[str, Example] = {
     "is it right to go on?": {"value": example_reflection((FRONT_WIDE, FRONT_TELE))}
-}
-STREAM: Responses = {
-    200: {
-        "content": PACKED[200]["content"]
-        | event_stream("With stream: true. One event of it.", *wire.EVENTS, "done")
-    }
 }
 REFUSALS = (
     *(INVALID_JSON, INVALID_BODY, UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE),
@@ -108,7 +103,7 @@ def planning_router(parts: Parts) -> APIRouter:
     @router.post(
         "/v1/plan",
         response_model=wire.PlanResponse,
-        responses=refusals | STREAM,
+        responses=refusals | answers_and_stream(*wire.EVENTS),
         openapi_extra=payloads(wire.PlanRequest),
     )
     async def plan(
@@ -122,7 +117,7 @@ def planning_router(parts: Parts) -> APIRouter:
     @router.post(
         "/v1/reflect",
         response_model=wire.ReflectResponse,
-        responses=refusals | STREAM,
+        responses=refusals | answers_and_stream(*wire.EVENTS),
         openapi_extra=payloads(wire.ReflectRequest),
     )
     async def reflect(
@@ -200,14 +195,16 @@ async def _one(
         return made(planned, arrival.request_id)
 
     if asked.stream:
-        if idempotency_key is not None:
-            raise ProblemError(INVALID_REQUEST, f"{wire.IDEMPOTENCY_KEY_HEADER} cannot go with stream: true")
-        events = parts.planning.events(asked, arrival)
+        refuse_key(idempotency_key)
+
+        async def done(planned: Planned) -> BaseModel:
+            return answer(planned)
+
         return await streamed(
             request,
-            events,
-            lambda told: server_sent(told, answer, arrival.request_id),
-            format_of(asked, parts.lifecycle.card),
+            parts.planning.events(asked, arrival),
+            PlanTeller(format_of(asked, parts.lifecycle.card)),
+            lambda told: server_sent(told, done, arrival.request_id),
             parts.metrics,
         )
 
@@ -215,6 +212,12 @@ async def _one(
         return respond(request, answer(await last(parts.planning.events(asked, arrival))))
 
     return await _once(request, parts, arrival, idempotency_key, asked, work)
+
+
+def refuse_key(idempotency_key: str | None) -> None:
+    """Raise `ProblemError` for a stream that comes with a key."""
+    if idempotency_key is not None:
+        raise ProblemError(INVALID_REQUEST, f"{wire.IDEMPOTENCY_KEY_HEADER} cannot go with stream: true")
 
 
 async def _once(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from contextlib import aclosing
-from typing import Final
+from typing import Final, TypeVar
 
 import structlog
 from fastapi.sse import format_sse_event
@@ -13,20 +13,10 @@ from starlette.requests import Request
 from starlette.responses import StreamingResponse
 
 import clients.wire as wire
-from model.driving.plan import Plan
-from model.engines.engine import (
-    DraftFinished,
-    SectionFinished,
-    TextWritten,
-)
-from model.families.family import Family
-from model.families.registry import family_named
-from model.formats.pieces import Values
-from service.answers import wire_branch, wire_plan, wire_times, wire_trajectory
 from service.callers import CallerLeft, while_connected
 from service.errors import problem_document
 from service.metrics import Metrics
-from service.planning import Judged, Planned
+from service.planning import Planned
 from service.planning import Told as Happened
 from service.problems import ProblemError, unforeseen
 
@@ -35,28 +25,25 @@ log = structlog.stdlib.get_logger()
 _NO_BUFFERING: Final = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
 """Proxies must not hold events back."""
 
-Written = wire.PlanWritten | wire.BranchTaken | wire.ThinkingWritten | wire.TrajectoryWritten
-"""The data of an event."""
-Told = tuple[str, Written] | Planned
-"""An event of `clients.wire.EVENTS` with its data; at last the whole scene."""
+Data = TypeVar("Data", bound=BaseModel)
+Tell = Callable[[Happened], Awaitable[Sequence[tuple[str, Data]]]]
+"""What an event of a scene is in the wire's words: events with their data, none where it is not told of."""
 
 
 async def told_events(
-    first: Happened, events: AsyncGenerator[Happened], format: str, metrics: Metrics
-) -> AsyncGenerator[Told]:
-    """What happens to a scene in the wire's words; closing it early frees everything.
+    first: Happened, events: AsyncGenerator[Happened], tell: Tell[Data], metrics: Metrics
+) -> AsyncGenerator[tuple[str, Data] | Planned]:
+    """What happens to a scene, told; at last the whole of it. Closing it early frees everything.
 
     Args:
         first: was asked for already, so that a scene that is not let in gets a plain problem.
         events: what follows.
-        format: that the response is in.
+        tell: the words of the endpoint.
         metrics: where a failure is counted, as no status shows it.
 
     Raises:
         ProblemError: whatever went wrong; the status is sent, so nothing but an event can tell.
     """
-    told: dict[int, str] = {}
-    family = family_named(format)
     async with aclosing(events):
         try:
             event: Happened | None = first
@@ -64,7 +51,7 @@ async def told_events(
                 if isinstance(event, Planned):
                     yield event
                     return
-                for each in _data(event, family, told):
+                for each in await tell(event):
                     yield each
                 event = await anext(events, None)
         except ProblemError as error:
@@ -78,13 +65,18 @@ async def told_events(
 
 
 async def server_sent(
-    told: AsyncGenerator[Told], answer: Callable[[Planned], BaseModel], request_id: str
+    told: AsyncGenerator[tuple[str, Data] | Planned],
+    answer: Callable[[Planned], Awaitable[BaseModel]],
+    request_id: str,
 ) -> AsyncGenerator[bytes]:
     """The bytes of a stream; ``answer`` makes the last event's data."""
     async with aclosing(told):
         try:
             async for event in told:
-                yield _event("done", answer(event)) if isinstance(event, Planned) else _event(*event)
+                if isinstance(event, Planned):
+                    yield _event("done", await answer(event))
+                else:
+                    yield _event(*event)
         except ProblemError as error:
             yield _event("error", problem_document(error, request_id))
 
@@ -92,11 +84,11 @@ async def server_sent(
 async def streamed(
     request: Request,
     events: AsyncGenerator[Happened],
-    sent: Callable[[AsyncGenerator[Told]], AsyncGenerator[bytes]],
-    format: str,
+    tell: Tell[Data],
+    sent: Callable[[AsyncGenerator[tuple[str, Data] | Planned]], AsyncGenerator[bytes]],
     metrics: Metrics,
 ) -> StreamingResponse:
-    """A scene's events as they come, in the bytes that ``sent`` makes of them.
+    """A scene's events as they come, in the words of ``tell`` and the bytes that ``sent`` makes of these.
 
     Waits for the first event: so a scene that is not let in gets a status of its own.
 
@@ -108,46 +100,8 @@ async def streamed(
     except CallerLeft:
         await events.aclose()
         raise
-    told = told_events(first, events, format, metrics)
+    told = told_events(first, events, tell, metrics)
     return StreamingResponse(sent(told), media_type=wire.SSE_MEDIA_TYPE, headers=_NO_BUFFERING)
-
-
-def _data(event: Happened, family: Family, told: dict[int, str]) -> list[tuple[str, Written]]:
-    match event:
-        case TextWritten(index, section, text) if section == family.reflection:
-            # Words that are made of values are told when these are there.
-            return [] if family.reflection_text is not None else _text(index, text, told)
-        case SectionFinished(index, section, _, values) if section == family.reflection:
-            words = family.reflected(Values({section: values})) or ""
-            return _text(index, words.removeprefix(told.get(index, "")), told)
-        case SectionFinished(index, section, _, values) if family.branch and section == family.branch.name:
-            branch = wire_branch(looked_twice=family.branch.reflecting in values)
-            return [("branch", wire.BranchTaken(index=index, branch=branch))]
-        case SectionFinished(index, section, _, (Plan() as plan, *_)) if section in family.plans:
-            name = "plan" if section == family.first_plan else "revised_plan"
-            return [(name, wire.PlanWritten(index=index, plan=wire_plan(plan)))]
-        case DraftFinished(draw):
-            trajectory = wire.TrajectoryWritten(
-                index=draw.index, trajectory=wire_trajectory(draw), times_s=wire_times(draw)
-            )
-            return [("draft_trajectory", trajectory)]
-        case Judged(draw, agreement):
-            trajectory = wire.TrajectoryWritten(
-                index=draw.index,
-                trajectory=wire_trajectory(draw),
-                times_s=wire_times(draw),
-                consistent=agreement.consistent,
-                disagreements=list(agreement.disagreements),
-            )
-            return [("trajectory", trajectory)]
-    return []
-
-
-def _text(index: int, text: str, told: dict[int, str]) -> list[tuple[str, Written]]:
-    if not text:
-        return []
-    told[index] = told.get(index, "") + text
-    return [("thinking", wire.ThinkingWritten(index=index, text=text))]
 
 
 def _event(name: str, data: BaseModel) -> bytes:

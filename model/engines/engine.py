@@ -142,7 +142,8 @@ class PlanRequest:
         format: a response format the checkpoint was trained on.
         controls: what the caller decides.
         attempt: to be refined; needed exactly where the format's family refines one.
-        live: tell of free text as it is written (`TextWritten`), and what finished sections say.
+        live: tell of free text and codes as they are written (`TextWritten`, `CodesWritten`), and what
+            finished sections say.
     """
 
     request_id: str
@@ -225,6 +226,15 @@ class TextWritten:
 
 
 @dataclass(frozen=True)
+class CodesWritten:
+    """A draw has written so many of the codes of a section that it is within; at least one."""
+
+    index: int
+    section: str
+    count: int
+
+
+@dataclass(frozen=True)
 class SectionFinished:
     """A draw has finished a section of its format.
 
@@ -258,7 +268,7 @@ class DraftFinished:
     draw: Draw
 
 
-Event = Started | TextWritten | SectionFinished | DraftFinished | DrawFinished
+Event = Started | TextWritten | CodesWritten | SectionFinished | DraftFinished | DrawFinished
 
 
 @dataclass(frozen=True)

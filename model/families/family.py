@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 from model.driving.perceived import Perceived
 from model.driving.phrases import ReflectionLanguage
@@ -12,6 +13,9 @@ from model.driving.plan import Plan
 from model.driving.scene import CAMERAS
 from model.driving.thoughts import Thoughts
 from model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, check_times
+from model.families.prompts import Attempt as Attempt
+from model.families.prompts import Situation as Situation
+from model.families.prompts import TextInputs as TextInputs
 from model.formats.pieces import (
     Format,
     FormatError,
@@ -44,49 +48,6 @@ class Branch:
     reflecting: str
 
 
-@dataclass(frozen=True, eq=False)
-class Attempt:
-    """An answer that was given to a scene before, to be refined.
-
-    Attributes:
-        trajectory: float32 [t, 4], the draft, at the times of the family that refines it.
-        feedback: what is said of it.
-    """
-
-    trajectory: FloatArray
-    feedback: str
-
-
-@dataclass(frozen=True, eq=False)
-class Situation:
-    """What text inputs are made of: what a scene and an example of training both know.
-
-    Attributes:
-        history: float32 [16, 4].
-        route: float32 [20, 2]; None where the prompt has none.
-        attempt: given exactly to families that refine one.
-        camera: whose next picture is to be imagined, one of `CAMERAS`; None where nobody asks for one.
-    """
-
-    history: FloatArray
-    route: FloatArray | None = None
-    attempt: Attempt | None = None
-    camera: str | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class TextInputs:
-    """What a prompt says of a scene in words and numbers, such as the present speed or a command.
-
-    Attributes:
-        format: of the text, which stands at the end of the prompt; tokenised by pieces, as responses are.
-        values: of the format's sections; numbers must lie on their grid.
-    """
-
-    format: Format
-    values: Callable[[Situation], Values]
-
-
 @dataclass(frozen=True)
 class Imagination:
     """The choice at which a response imagines a picture of a camera or does not; controls may decide it.
@@ -97,6 +58,9 @@ class Imagination:
         camera: the name of the choice of the camera.
         cameras: how the format writes each of `CAMERAS`.
         section: that holds the picture's codes.
+        perception, prediction: the sections before it, of what is around and of where the ego will be.
+        perceived, predicted, pictured: what the values of these three sections say. When somebody comes near
+            may be written later: a perception alone does not tell.
     """
 
     name: str
@@ -105,6 +69,11 @@ class Imagination:
     camera: str
     cameras: Mapping[str, str]
     section: str
+    perception: str
+    prediction: str
+    perceived: Callable[[tuple[Value, ...]], Perceived]
+    predicted: Callable[[tuple[Value, ...]], Predicted]
+    pictured: Callable[[tuple[Value, ...]], NextPicture]
 
     def picks(self, imagines: bool | None, camera: str | None) -> dict[str, str]:
         """The options that are decided, by choice.
@@ -139,6 +108,14 @@ class NextPicture:
     def __post_init__(self) -> None:
         if self.camera not in CAMERAS:
             raise FamilyError(f"unknown camera {self.camera!r}; known are {', '.join(CAMERAS)}")
+
+
+class Predicted(NamedTuple):
+    """Where the ego will be in half a second, in its frame of now, and its turn: Left, Forward or Right."""
+
+    x_m: float
+    y_m: float
+    direction: str
 
 
 @dataclass(frozen=True)
@@ -264,8 +241,10 @@ class Family:
     imagination: Imagination | None = None
 
     def __post_init__(self) -> None:
+        imagination = self.imagination
         declared = (
-            None if self.imagination is None else self.imagination.section,
+            *(() if imagination is None else (imagination.section, imagination.perception)),
+            None if imagination is None else imagination.prediction,
             *(self.trajectory, self.first_plan, self.reflection, self.revised_plan),
             None if self.branch is None else self.branch.name,
         )
@@ -284,8 +263,8 @@ class Family:
             for section in walk(self.format.body):
                 if isinstance(section, Section) and section.name == self.reflection:
                     _check_one_value(self.name, section)
-        if self.imagination is not None:
-            self._check_imagination(self.imagination)
+        if imagination is not None:
+            self._check_imagination(imagination)
 
     def _check_imagination(self, imagination: Imagination) -> None:
         try:

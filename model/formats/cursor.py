@@ -421,6 +421,11 @@ class Cursor:
         return self.active.state.used if isinstance(self.active, InText) else None
 
     @property
+    def codes_written(self) -> int | None:
+        """Before a code: how many of its piece are written; None elsewhere."""
+        return self.active.place if isinstance(self.active, AtCode) else None
+
+    @property
     def stop_characters(self) -> int:
         """Within free text: with how many characters of its stop it ends, so that they may not be of it."""
         return self.active.state.seen if isinstance(self.active, InText) else 0

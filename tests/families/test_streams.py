@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import clients.wire as wire
-from clients.answers import PlanResult, Told
-from clients.planner import PlannerClient, attempt_at, plan_request
+from clients.planner import PlannerClient, PlanResult, Told, attempt_at, plan_request
 from model.driving.phrases import ReflectionLanguage
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.families.registry import OURS, family_named

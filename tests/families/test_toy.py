@@ -36,6 +36,7 @@ from service.planning import Judged
 from service.planning import Told as Happened
 from service.settings import Settings
 from service.streaming import told_events
+from service.telling import PlanTeller
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.families.toy import TOY, drive
 from tests.model.driving.drives import MIDDLES_S, labelled_scene
@@ -133,7 +134,7 @@ def test_it_is_streamed_in_the_words_of_the_wire(toy: Loaded) -> None:
                 yield event
 
         first, metrics = SectionFinished(0, "mood", "Hmm,", ("Hmm,",)), Metrics(CollectorRegistry())
-        return [event async for event in told_events(first, events(), "toy", metrics)]
+        return [event async for event in told_events(first, events(), PlanTeller("toy"), metrics)]
 
     branch, it, rains, trajectory = asyncio.run(told())
     assert branch == ("branch", wire.BranchTaken(index=0, branch="Thinking:"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import AsyncGenerator, Sequence
+from collections.abc import AsyncGenerator, Iterator, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -15,6 +15,7 @@ from model.driving.perceived import Perceived, PerceivedAgent
 from model.driving.plan import GROUPS, Plan, parse_plan
 from model.driving.trajectory import FUTURE_STEPS, STEP_S, TEN_HZ_S, FloatArray, at_times, present_speed
 from model.engines.engine import (
+    CodesWritten,
     Cut,
     DraftFinished,
     Draw,
@@ -130,6 +131,9 @@ class ScriptedEngine:
                 raise self.failure_later
             # Later draws finish first, as they may in a batch.
             for draw in reversed(draws):
+                if draw.foreseen is not None:
+                    for event in _imagining(draw.index, draw.foreseen):
+                        yield event
                 yield _finished(draw.index, "branch", draw.branch)
                 if draw.thinking is not None:
                     if request.controls.deadline_ms is not None:
@@ -208,6 +212,18 @@ def _foreseen(camera: str | None, luck: random.Random) -> Foreseen:
     ahead = PerceivedAgent("vehicle", 20.0, 0.0, 4.5, 1.9, 2.0)
     picture = NextPicture(camera or "front", tuple(luck.randrange(1000) for _ in range(98)))
     return Foreseen(Perceived((ahead,), 1.7, 5.2), 5.0, 0.0, "Forward", picture)
+
+
+def _imagining(index: int, foreseen: Foreseen) -> Iterator[Event]:
+    """What is told while it is written, seven codes at a time."""
+    assert foreseen.picture is not None
+    ahead = {"kind": "vehicle", "lateral_m": 0.0, "forward_m": 20.0, "length_m": 4.5, "width_m": 1.9}
+    yield SectionFinished(index, "perception", "", ((ahead,), 1.7, 5.2))
+    yield SectionFinished(index, "prediction", "", ({"lateral_m": 0.0, "forward_m": 5.0}, "Forward"))
+    for count in range(7, 98, 7):
+        yield CodesWritten(index, "visual", count)
+    camera = f"CAM_{foreseen.picture.camera.upper()}"
+    yield SectionFinished(index, "visual", "", (foreseen.picture.codes, camera))
 
 
 def _draft(request: PlanRequest, draw: Draw) -> Draw:

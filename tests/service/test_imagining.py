@@ -18,9 +18,11 @@ import pytest
 from PIL import Image
 
 import clients.wire as wire
-from clients.planner import AsyncPlannerClient, PlannerClient, RequestRefused, imagine_request
-from clients.wire_imagine import ImagineControls, ImagineRequest, ImagineResponse
+from clients.planner import AsyncPlannerClient, PlannerClient, RequestRefused, ServiceBusy, imagine_request
+from clients.streams import ImagineTold
+from clients.wire_imagine import CodesWritten, ImagineControls, ImagineRequest, ImagineResponse
 from model.driving.scene import CAMERAS
+from model.engines.engine import EngineError
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.engines.torch.shortcuts import Shortcuts
 from model.network.checkpoint import load, save
@@ -126,6 +128,73 @@ def test_clients_imagine_too_in_both_kinds(served: Served[TorchEngine]) -> None:
     assert ImagineResponse.model_validate(msgpack.unpackb(packed.content)).pictures == told.pictures
 
 
+def events_of(served: Served[Any], **changes: Any) -> list[tuple[str, ImagineTold]]:
+    request = ImagineRequest.model_validate_json(json.dumps(asked(**changes)))
+    with PlannerClient(served.url) as planner:
+        return list(planner.stream_imagine(request))
+
+
+def test_a_stream_tells_of_pictures_as_they_are_written(served: Served[TorchEngine]) -> None:
+    plain = imagined(served, asked(controls={"n": 3, "seed": 1}))
+    events = events_of(served, controls={"n": 3, "seed": 1})
+    name, done = events[-1]
+    assert (name, isinstance(done, ImagineResponse)) == ("done", True)
+    assert isinstance(done, ImagineResponse)
+    assert done.pictures == plain.pictures
+    for picture in plain.pictures:
+        own = [(name, told) for name, told in events[:-1] if getattr(told, "index", None) == picture.index]
+        progress = [told.written for _, told in own if isinstance(told, CodesWritten)]
+        assert progress == sorted(set(progress))
+        # Row by row; guesses that are right may bring more than one.
+        assert set(progress) <= set(range(14, 99, 14))
+        assert progress[-1] == 98
+        assert [name for name, _ in own] == [
+            "perception",
+            "prediction",
+            *["codes"] * len(progress),
+            "picture",
+        ]
+        parts = {name: told.model_dump() for name, told in own}
+        seen = picture.perception.model_dump(exclude={"objects": {"__all__": {"near_s"}}})
+        assert parts["perception"]["perception"] == seen
+        assert parts["prediction"]["prediction"] == picture.prediction.model_dump()
+        assert parts["picture"] == picture.model_dump(include={"index", "image", "codes"})
+
+
+def test_a_stream_is_told_before_the_answer_is_there(served: Served[TorchEngine]) -> None:
+    async def stream() -> list[str]:
+        request = imagine_request(scene(), "front_left", ImagineControls(n=1, seed=3))
+        async with AsyncPlannerClient(served.url) as planner:
+            return [name async for name, _ in planner.stream_imagine(request)]
+
+    names = asyncio.run(stream())
+    # Without guesses, as this camera is not in the scene, every row is told.
+    assert names == ["perception", "prediction", *["codes"] * 7, "picture", "done"]
+
+
+def test_what_cannot_be_streamed_gets_a_status(served: Served[TorchEngine]) -> None:
+    problem(served.http.post(PATH, json=asked(camera="rear", stream=True)), "unknown-camera")
+    history = [[0.0] * 4] * 15 + [[9.0] * 4]
+    changed = asked(stream=True)["scene"] | {"history": history}
+    problem(served.http.post(PATH, json=asked(stream=True, scene=changed)), "invalid-history")
+
+
+def test_leaving_a_stream_ends_the_work() -> None:
+    engine = ScriptedEngine()
+    engine.card_shown = replace(CARD, formats=("cf_vla", "vla_world"), paints=True)
+    with serve(engine, Settings()) as served:
+        served.in_loop(engine.may_finish.clear)
+        with served.http.stream("POST", PATH, json=asked(stream=True)) as answer:
+            assert answer.status_code == 200
+            assert served.metric("looktwice_plans_in_flight") == 1
+        served.until(lambda: len(engine.cancelled) == 1)
+        served.until(lambda: served.metric("looktwice_plans_in_flight") == 0)
+        served.in_loop(engine.may_finish.set)
+        engine.failure_later = EngineError("broke on the way")
+        with pytest.raises(ServiceBusy, match="the log has why"):
+            events_of(served)
+
+
 def test_plans_imagine_as_the_caller_decides(served: Served[TorchEngine]) -> None:
     with PlannerClient(served.url) as planner:
         choices: dict[wire.Imagine, float] = {"always": 1.0, "never": 0.0}
@@ -202,4 +271,4 @@ def test_the_described_example_is_served(served: Served[TorchEngine]) -> None:
     content = described["requestBody"]["content"]["application/json"]
     for example in content["examples"].values():
         assert ImagineRequest.model_validate_json(json.dumps(example["value"]))
-        assert imagined(served, example["value"]).pictures
+        assert events_of(served, **example["value"])[-1][0] == "done"

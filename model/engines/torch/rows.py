@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.engine import Event, SectionFinished, TextWritten
+from model.engines.engine import CodesWritten, Event, SectionFinished, TextWritten
 from model.engines.least_error import least_error
 from model.engines.requests import given_plans, leads_to_reflection
 from model.engines.response import Response, SectionText
@@ -126,6 +126,8 @@ class Row(Response):
         ]
         if plan_request.live and (new := self.new_text(vocabulary)):
             events += [TextWritten(index, *new) for index in self.draws]
+        if plan_request.live and (codes := self.cursor.codes_written):
+            events += [CodesWritten(index, self.cursor.section, codes) for index in self.draws]
         return events
 
     def _controlled(

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from model.engines.engine import (
     MAX_DRAWS,
+    CodesWritten,
     DrawFinished,
     EngineError,
     Event,
@@ -249,6 +250,8 @@ class Decoding:
                 self._tell(draw, draw.append(wanted, self._parts.vocabulary, logprob))
                 if self._request.live and (new := draw.new_text(self._parts.vocabulary)):
                     self._happened.put_nowait(TextWritten(draw.index, *new))
+                if self._request.live and (codes := draw.cursor.codes_written):
+                    self._happened.put_nowait(CodesWritten(draw.index, draw.cursor.section, codes))
             if not alone and fits and wanted == token and not draw.cursor.ending:
                 continue
             self._tell(draw, draw.append_forced(self._parts.vocabulary))

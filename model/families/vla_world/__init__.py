@@ -5,7 +5,7 @@ from typing import Final
 from model.families.family import Family, Imagination
 from model.families.vla_world import format as its
 from model.families.vla_world.inputs import INPUTS
-from model.families.vla_world.read import read, thoughts_text
+from model.families.vla_world.read import perceived, pictured, predicted, read, thoughts_text
 from model.families.vla_world.targets import teach
 
 _TASK: Final = (
@@ -28,7 +28,14 @@ VLA_WORLD: Final = Family(
     teach=teach,
     title="perceive-think-answer",
     imagination=Imagination(
-        its.IMAGINE, its.IMAGINED, its.UNSEEN, its.CAMERA, cameras=its.CAMERA_OPTIONS, section=its.VISUAL
+        *(its.IMAGINE, its.IMAGINED, its.UNSEEN, its.CAMERA),
+        cameras=its.CAMERA_OPTIONS,
+        section=its.VISUAL,
+        perception=its.PERCEPTION,
+        prediction=its.PREDICTION,
+        perceived=perceived,
+        predicted=predicted,
+        pictured=pictured,
     ),
 )
 """perception, prediction, a picture or none, think, action, answer"""

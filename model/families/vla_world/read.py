@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 from model.driving.perceived import Perceived, PerceivedAgent
-from model.families.family import Decode, Foreseen, NextPicture, Reading
+from model.families.family import Decode, Foreseen, NextPicture, Predicted, Reading
 from model.families.vla_world import format as its
 from model.formats.pieces import Value, Values
 
@@ -24,16 +24,29 @@ def thoughts_text(values: tuple[Value, ...]) -> str | None:
     return its.told_thoughts(notable) or None
 
 
-def _foreseen(values: Values) -> Foreseen:
-    objects, left_m, right_m = cast("tuple[Value, float, float]", values.all(its.PERCEPTION))
-    point, direction = values.all(its.PREDICTION)
+def perceived(values: tuple[Value, ...], thoughts: Value = ()) -> Perceived:
+    """What a perception says; when somebody comes near, the thoughts tell."""
+    objects, left_m, right_m = cast("tuple[Value, float, float]", values)
+    return Perceived(tuple(_agents(objects, thoughts)), left_m, right_m)
+
+
+def predicted(values: tuple[Value, ...]) -> Predicted:
+    """What a prediction says."""
+    point, direction = values
     [(x_m, y_m)] = its.read_points((point,)).tolist()
-    picture = None
-    if its.VISUAL in values:
-        codes, camera = cast("tuple[tuple[int, ...], str]", values.all(its.VISUAL))
-        picture = NextPicture(_CAMERAS[camera], tuple(codes))
-    agents = tuple(_agents(objects, values[its.THINK]))
-    return Foreseen(Perceived(agents, left_m, right_m), x_m, y_m, str(direction), picture)
+    return Predicted(x_m, y_m, str(direction))
+
+
+def pictured(values: tuple[Value, ...]) -> NextPicture:
+    """The picture that is imagined."""
+    codes, camera = cast("tuple[tuple[int, ...], str]", values)
+    return NextPicture(_CAMERAS[camera], tuple(codes))
+
+
+def _foreseen(values: Values) -> Foreseen:
+    picture = pictured(values.all(its.VISUAL)) if its.VISUAL in values else None
+    seen = perceived(values.all(its.PERCEPTION), values[its.THINK])
+    return Foreseen(seen, *predicted(values.all(its.PREDICTION)), picture)
 
 
 def _agents(objects: Value, thoughts: Value) -> list[PerceivedAgent]:
