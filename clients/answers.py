@@ -202,14 +202,15 @@ def retry_after_s(response: httpx.Response) -> float | None:
 def read(response: httpx.Response, answer: type[_Answer]) -> _Answer:
     """The body of ``response`` as ``answer``; raises `PlannerError`."""
     if response.status_code != 200:
-        raise _problem(response)
+        raise problem_of(response)
     try:
         return answer.model_validate_json(response.content)
     except ValidationError as error:
         raise BadAnswer(f"{response.url} did not answer as the contract says: {error}") from error
 
 
-def _problem(response: httpx.Response) -> PlannerError:
+def problem_of(response: httpx.Response) -> PlannerError:
+    """The typed error of a response that is not 200."""
     try:
         problem = wire.Problem.model_validate_json(response.content)
     except ValidationError:

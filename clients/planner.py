@@ -17,7 +17,7 @@ from collections.abc import AsyncGenerator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self, TypedDict
+from typing import Self, TypedDict, TypeVar
 
 import httpx
 import msgpack
@@ -41,6 +41,7 @@ from clients.answers import (
     ServiceFailed,
     batch_results,
     plan_result,
+    problem_of,
     read,
     reflect_result,
     retry_after_s,
@@ -54,7 +55,15 @@ from clients.requests import (
     refine_request,
     reflect_request,
 )
-from clients.streams import ImagineTold, Told, told, told_of_pictures
+from clients.streams import (
+    ImagineTold,
+    RefineTold,
+    Tell,
+    Told,
+    told,
+    told_of_pictures,
+    told_of_refinements,
+)
 from clients.wire_values import with_pictures
 from model.driving.outcome import Outcome
 from model.driving.plan import Plan
@@ -75,6 +84,7 @@ __all__ = [
     "PlannerProblem",
     "PlannerTimeout",
     "PlannerUnreachable",
+    "RefineTold",
     "ReflectResult",
     "RequestRefused",
     "ServiceBusy",
@@ -87,6 +97,9 @@ __all__ = [
     "refine_request",
     "reflect_request",
 ]
+
+
+_Told = TypeVar("_Told")
 
 
 @dataclass(frozen=True)
@@ -182,14 +195,7 @@ class PlannerClient:
         Raises:
             PlannerError: before the first event or at the place of the one that failed.
         """
-        asked = asked.model_copy(update={"stream": True})
-        with _told_errors(), self._http.stream("POST", _path_of(asked), **self._body(asked)) as response:
-            if response.status_code != 200:
-                response.read()
-                read(response, wire.PlanResponse)
-            for event in EventSource(response).iter_sse():
-                if (data := told(event, response)) is not None:
-                    yield event.event, data
+        return self._stream(_path_of(asked), asked, told)
 
     def stream_imagine(self, asked: wire_imagine.ImagineRequest) -> Iterator[tuple[str, ImagineTold]]:
         """Pictures as they are written: names and data of `clients.wire_imagine.EVENTS`, at last ``done``.
@@ -200,14 +206,18 @@ class PlannerClient:
         Raises:
             PlannerError: as of `stream`.
         """
-        body = self._body(asked.model_copy(update={"stream": True}))
-        with _told_errors(), self._http.stream("POST", "/v1/imagine", **body) as response:
-            if response.status_code != 200:
-                response.read()
-                read(response, wire_imagine.ImagineResponse)
-            for event in EventSource(response).iter_sse():
-                if (data := told_of_pictures(event, response)) is not None:
-                    yield event.event, data
+        return self._stream("/v1/imagine", asked, told_of_pictures)
+
+    def stream_refine(self, asked: wire_refine.RefineRequest) -> Iterator[tuple[str, RefineTold]]:
+        """Refinements as they are written: names and data of `clients.wire_refine.EVENTS`, at last ``done``.
+
+        Args:
+            asked: see `refine_request`.
+
+        Raises:
+            PlannerError: as of `stream`.
+        """
+        return self._stream("/v1/refine", asked, told_of_refinements)
 
     def reflect(
         self,
@@ -306,6 +316,16 @@ class PlannerClient:
             self._http.build_request("POST", path, **self._body(asked, request_id)), deadline_ms
         )
 
+    def _stream(self, path: str, asked: BaseModel, tell: Tell[_Told]) -> Iterator[tuple[str, _Told]]:
+        body = self._body(asked.model_copy(update={"stream": True}))
+        with _told_errors(), self._http.stream("POST", path, **body) as response:
+            if response.status_code != 200:
+                response.read()
+                raise problem_of(response)
+            for event in EventSource(response).iter_sse():
+                if (data := tell(event, response)) is not None:
+                    yield event.event, data
+
     def _body(self, asked: BaseModel, request_id: str | None = None) -> _Body:
         return _body(asked, request_id, packed=self._packed)
 
@@ -354,32 +374,17 @@ class AsyncPlannerClient:
         batch = wire.BatchRequest(requests=list(asked))
         return batch_results(await self._ask("/v1/plan/batch", batch))
 
-    async def stream(self, asked: wire.PlanRequest | wire.ReflectRequest) -> AsyncGenerator[tuple[str, Told]]:
+    def stream(self, asked: wire.PlanRequest | wire.ReflectRequest) -> AsyncGenerator[tuple[str, Told]]:
         """What a draw writes, as it is written; see `PlannerClient.stream`."""
-        asked = asked.model_copy(update={"stream": True})
-        body = self._body(asked)
-        with _told_errors():
-            async with self._http.stream("POST", _path_of(asked), **body) as response:
-                if response.status_code != 200:
-                    await response.aread()
-                    read(response, wire.PlanResponse)
-                async for event in EventSource(response).aiter_sse():
-                    if (data := told(event, response)) is not None:
-                        yield event.event, data
+        return self._stream(_path_of(asked), asked, told)
 
-    async def stream_imagine(
-        self, asked: wire_imagine.ImagineRequest
-    ) -> AsyncGenerator[tuple[str, ImagineTold]]:
+    def stream_imagine(self, asked: wire_imagine.ImagineRequest) -> AsyncGenerator[tuple[str, ImagineTold]]:
         """Pictures as they are written; see `PlannerClient.stream_imagine`."""
-        body = self._body(asked.model_copy(update={"stream": True}))
-        with _told_errors():
-            async with self._http.stream("POST", "/v1/imagine", **body) as response:
-                if response.status_code != 200:
-                    await response.aread()
-                    read(response, wire_imagine.ImagineResponse)
-                async for event in EventSource(response).aiter_sse():
-                    if (data := told_of_pictures(event, response)) is not None:
-                        yield event.event, data
+        return self._stream("/v1/imagine", asked, told_of_pictures)
+
+    def stream_refine(self, asked: wire_refine.RefineRequest) -> AsyncGenerator[tuple[str, RefineTold]]:
+        """Refinements as they are written; see `PlannerClient.stream_refine`."""
+        return self._stream("/v1/refine", asked, told_of_refinements)
 
     async def reflect(
         self,
@@ -453,6 +458,19 @@ class AsyncPlannerClient:
     ) -> httpx.Response:
         request = self._http.build_request("POST", path, **self._body(asked, request_id))
         return await self._send(request, deadline_ms)
+
+    async def _stream(
+        self, path: str, asked: BaseModel, tell: Tell[_Told]
+    ) -> AsyncGenerator[tuple[str, _Told]]:
+        body = self._body(asked.model_copy(update={"stream": True}))
+        with _told_errors():
+            async with self._http.stream("POST", path, **body) as response:
+                if response.status_code != 200:
+                    await response.aread()
+                    raise problem_of(response)
+                async for event in EventSource(response).aiter_sse():
+                    if (data := tell(event, response)) is not None:
+                        yield event.event, data
 
     def _body(self, asked: BaseModel, request_id: str | None = None) -> _Body:
         return _body(asked, request_id, packed=self._packed)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import httpx
 from httpx_sse import ServerSentEvent
 from pydantic import BaseModel, ValidationError
 
-from clients import wire, wire_imagine
+from clients import wire, wire_imagine, wire_refine
 from clients.answers import BadAnswer, PlanResult, ReflectResult, planned, reflected, typed
 
 Told = (
@@ -29,9 +29,19 @@ ImagineTold = (
     | wire_imagine.ImagineResponse
 )
 """What a stream of pictures tells; see `clients.wire_imagine.EVENTS`."""
+RefineTold = (
+    wire_refine.DraftJudged
+    | wire.PlanWritten
+    | wire.BranchTaken
+    | wire.ThinkingWritten
+    | wire.TrajectoryWritten
+    | wire_refine.RefineResponse
+)
+"""What a stream of refinements tells; see `clients.wire_refine.EVENTS`."""
 
-_Data = TypeVar("_Data", bound=BaseModel)
-_Done = TypeVar("_Done")
+_Told = TypeVar("_Told")
+Tell = Callable[[ServerSentEvent, httpx.Response], _Told | None]
+"""Makes of an event of a response what it tells; None for an event of a later version."""
 
 
 def told(event: ServerSentEvent, response: httpx.Response) -> Told | None:
@@ -50,20 +60,27 @@ def told(event: ServerSentEvent, response: httpx.Response) -> Told | None:
             return reflected(wire.ReflectResponse.model_validate_json(data), response)
         return planned(wire.PlanResponse.model_validate_json(data), response)
 
-    return _told(event, response, wire.EVENTS, done)
+    return cast("Told | None", _told(event, response, wire.EVENTS, done))
 
 
 def told_of_pictures(event: ServerSentEvent, response: httpx.Response) -> ImagineTold | None:
     """The same of a stream of pictures."""
-    return _told(event, response, wire_imagine.EVENTS, wire_imagine.ImagineResponse.model_validate_json)
+    done = wire_imagine.ImagineResponse.model_validate_json
+    return cast("ImagineTold | None", _told(event, response, wire_imagine.EVENTS, done))
+
+
+def told_of_refinements(event: ServerSentEvent, response: httpx.Response) -> RefineTold | None:
+    """The same of a stream of refinements."""
+    done = wire_refine.RefineResponse.model_validate_json
+    return cast("RefineTold | None", _told(event, response, wire_refine.EVENTS, done))
 
 
 def _told(
     event: ServerSentEvent,
     response: httpx.Response,
-    events: Mapping[str, type[_Data | wire.Problem]],
-    done: Callable[[str], _Done],
-) -> _Data | _Done | None:
+    events: Mapping[str, type[BaseModel]],
+    done: Callable[[str], object],
+) -> object:
     name = event.event
     try:
         if name == "done":

@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Discriminator, Field, Tag
 
+import clients.wire as wire
 from clients.wire import (
     MAX_FEEDBACK_CHARACTERS,
     Answered,
@@ -75,6 +76,9 @@ class RefineRequest(Asked):
         default=0.8, description="Of auto: a draft whose score is at least this is told to be right."
     )
     controls: ReflectControls = Field(default=ReflectControls(), description="n refinements are made.")
+    stream: bool = Field(
+        default=False, description="Answer with server-sent events, as refinements are written."
+    )
 
 
 class DraftFeedback(Answered):
@@ -96,12 +100,9 @@ class Refinement(Draw):
     )
 
 
-class RefineResponse(Answered):
-    """Answer of POST /v1/refine."""
+class DraftJudged(Answered):
+    """What is known of the draft before it is refined; data of the event `feedback`."""
 
-    request_id: str
-    model: ModelName
-    format: str = Field(description="The model's first format that refines.")
     feedback: DraftFeedback
     foresight: Foresight | None = Field(
         description="How the future that feedback and scores are made in was foreseen: the tracks go on at "
@@ -112,9 +113,23 @@ class RefineResponse(Answered):
         description="Sub-scores that count and are not known on the road: scores are partial ones."
     )
     before: TrajectoryScore | None = Field(description="What the draft is worth; null without tracks.")
+
+
+class RefineResponse(DraftJudged):
+    """Answer of POST /v1/refine."""
+
+    request_id: str
+    model: ModelName
+    format: str = Field(description="The model's first format that refines.")
     draws: list[Refinement]
     agreed: int = Field(
         ge=0, description="Index of the refinement whose trajectory is nearest to all others'."
     )
     timing: Timing
     deadline: Deadline | None = Field(default=None, description="Null where none was set.")
+
+
+Event = wire.Event | DraftJudged
+
+EVENTS: Final[dict[str, type[Event]]] = {"feedback": DraftJudged, **wire.EVENTS}
+"""Server-sent events and their data; `done` ends the stream with what the answer would have been without."""

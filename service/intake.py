@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -48,8 +49,26 @@ MAX_TURN_RAD: Final = 0.5
 """Between history rows: 290 degrees a second. More is a heading in degrees."""
 
 
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """What a scene says in numbers, checked.
+
+    Attributes:
+        history: float32 [16, 4].
+        route: float32 [20, 2]; None where it is unknown.
+        tracks: None where nobody tracks.
+    """
+
+    history: FloatArray
+    route: FloatArray | None
+    tracks: tuple[Track, ...] | None
+
+
 def engine_request(
-    asked: wire.PlanRequest | wire.ReflectRequest, card: ModelCard, engine_id: str
+    asked: wire.PlanRequest | wire.ReflectRequest,
+    card: ModelCard,
+    engine_id: str,
+    geometry: Geometry | None = None,
 ) -> PlanRequest:
     """The engine's request for what was ``asked``; a plan to be reflected upon is the first one.
 
@@ -57,6 +76,7 @@ def engine_request(
         asked: a request whose shapes the schema has checked.
         card: the model that is to answer.
         engine_id: unique among running requests, which a caller's request id need not be.
+        geometry: of its scene, where that is checked already.
 
     Raises:
         ProblemError: pictures, geometry, plan, attempt, controls, format or cameras that cannot be served.
@@ -79,7 +99,8 @@ def engine_request(
         prefill = None if given is None else plan_of(given, "/controls/prefill")
         controls = _controls(asked.controls, prefill, asked.controls.imagine, asked.controls.camera)
         attempt = _attempt(asked.attempt, format)
-    return PlanRequest(engine_id, scene_of(asked.scene), format, controls, attempt, live=asked.stream)
+    scene = scene_of(asked.scene, geometry)
+    return PlanRequest(engine_id, scene, format, controls, attempt, live=asked.stream)
 
 
 def format_of(asked: wire.PlanRequest | wire.ReflectRequest, card: ModelCard) -> str:
@@ -118,25 +139,38 @@ def _attempt(asked: wire.Attempt | None, format: str) -> Attempt | None:
         raise at(INVALID_ATTEMPT, f"{pointer}/trajectory", str(error)) from None
 
 
-def scene_of(asked: wire.Scene) -> Scene:
-    """A scene; raises `ProblemError` for pictures and geometry that cannot be accepted."""
-    history, route = history_of(asked), route_of(asked)
+def geometry_of(asked: wire.Scene) -> Geometry:
+    """What a scene says in numbers; raises `ProblemError` for what cannot be."""
+    return Geometry(_history_of(asked), _route_of(asked), _tracks_of(asked))
+
+
+def scene_of(asked: wire.Scene, geometry: Geometry | None = None) -> Scene:
+    """A scene.
+
+    Args:
+        asked: whose shapes the schema has checked.
+        geometry: of it, where that is checked already.
+
+    Raises:
+        ProblemError: pictures and geometry that cannot be accepted.
+    """
+    known = geometry or geometry_of(asked)
     clips = tuple(
         Clip(clip.camera, tuple(_images(clip.images, f"/scene/clips/{number}/images")))
         for number, clip in enumerate(asked.clips)
     )
     try:
-        return Scene(asked.scene_id, clips, history, route, tracks_of(asked))
+        return Scene(asked.scene_id, clips, known.history, known.route, known.tracks)
     except SceneError as error:
         raise at(INVALID_CLIP, "/scene/clips", str(error)) from None
 
 
-def tracks_of(asked: wire.Scene) -> tuple[Track, ...] | None:
+def _tracks_of(asked: wire.Scene) -> tuple[Track, ...] | None:
     """Its tracks; raises `ProblemError` for one that cannot be."""
     return None if asked.tracks is None else tuple(map(_track, range(len(asked.tracks)), asked.tracks))
 
 
-def route_of(asked: wire.Scene) -> FloatArray | None:
+def _route_of(asked: wire.Scene) -> FloatArray | None:
     """Its route; raises `ProblemError` for one that leads nowhere."""
     try:
         return None if asked.route is None else check_route(asked.route)
@@ -162,7 +196,7 @@ def _images(given: Iterable[str | bytes], pointer: str) -> Iterable[bytes]:
         yield image
 
 
-def history_of(asked: wire.Scene) -> FloatArray:
+def _history_of(asked: wire.Scene) -> FloatArray:
     """Its history; raises `ProblemError` for one that no car can have driven."""
     pointer = "/scene/history"
     try:

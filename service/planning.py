@@ -32,7 +32,7 @@ from model.engines.engine import (
     Started,
 )
 from service.admission import Admission, Full, Place, whole_seconds
-from service.intake import engine_request
+from service.intake import Geometry, engine_request
 from service.lifecycle import Lifecycle
 from service.metrics import Metrics
 from service.problems import (
@@ -162,17 +162,24 @@ class Planning:
             wait_s = None if error.retry_after_s is None else whole_seconds(error.retry_after_s)
             raise ProblemError(RATE_LIMITED, str(error), retry_after_s=wait_s) from None
 
-    async def events(self, asked: Asked, arrival: Arrival) -> AsyncGenerator[Told]:
+    async def events(
+        self, asked: Asked, arrival: Arrival, geometry: Geometry | None = None
+    ) -> AsyncGenerator[Told]:
         """What happens to a scene, at last the whole of it; closing it early frees everything.
 
         `Started` is told as `Begun`, finished draws as `Judged`.
+
+        Args:
+            asked: the scene, and what is to be done with it.
+            arrival: of the request.
+            geometry: of the scene, where that is checked already.
 
         Raises:
             ProblemError: at the first iteration where it is not let in; later where it fails.
         """
         with self._lifecycle.accepted(), let_in(self._admission.place(asked.controls.n)) as place:
             await self.spend(arrival.owner, asked.controls.n)
-            async with aclosing(self._plan(asked, arrival, place)) as events:
+            async with aclosing(self._plan(asked, arrival, place, geometry)) as events:
                 async for event in events:
                     yield event
 
@@ -181,12 +188,14 @@ class Planning:
         async with self._admission.place_in_turn(asked.controls.n) as place:
             return await last(self._plan(asked, arrival, place))
 
-    async def _plan(self, asked: Asked, arrival: Arrival, place: Place) -> AsyncGenerator[Told]:
+    async def _plan(
+        self, asked: Asked, arrival: Arrival, place: Place, geometry: Geometry | None = None
+    ) -> AsyncGenerator[Told]:
         endpoint = "reflect" if isinstance(asked, wire.ReflectRequest) else "plan"
         draws, drafts, agreements = list[Draw](), dict[int, Draw](), dict[int, Agreement]()
         with self._lifecycle.engine() as engine, self._traces.planning(asked, engine.card) as span:
             checking_s = time.monotonic()
-            request = await self._checked(asked, engine.card, arrival)
+            request = await self._checked(asked, engine.card, arrival, geometry)
             submitted_s = began_s = time.monotonic()
             try:
                 with self._metrics.plans_in_flight.track_inprogress():
@@ -233,10 +242,12 @@ class Planning:
                 deadline = wire.Deadline(met=deadline_met, cut=cut)
             yield Planned(tuple(draws), agreements, drafts, engine.card, timing, deadline, engine.paint)
 
-    async def _checked(self, asked: Asked, card: ModelCard, arrival: Arrival) -> PlanRequest:
+    async def _checked(
+        self, asked: Asked, card: ModelCard, arrival: Arrival, geometry: Geometry | None
+    ) -> PlanRequest:
         engine_id = f"{arrival.request_id}/{secrets.token_hex(4)}"
         # On a thread: megabytes of base64 must not hold up the answers of others.
-        request = await asyncio.to_thread(engine_request, asked, card, engine_id)
+        request = await asyncio.to_thread(engine_request, asked, card, engine_id, geometry)
         if (deadline_ms := request.controls.deadline_ms) is None:
             return request
         left_ms = deadline_ms - round(1000 * (time.monotonic() - arrival.since_s)) - _ANSWERING_MS

@@ -93,7 +93,7 @@ def planning_router(parts: Parts) -> APIRouter:
     """The endpoints that the engine works for."""
 
     def check_open(request: Request, *, batch: bool = False) -> None:
-        if not _made_before(request, parts):
+        if not made_before(request, parts):
             parts.planning.check_open(batch=batch)
 
     router = APIRouter(route_class=payload_route(check_open), tags=["planning"])
@@ -157,13 +157,13 @@ def planning_router(parts: Parts) -> APIRouter:
                 raise NotKept(answer)
             return answer
 
-        return await _once(request, parts, arrival, idempotency_key, asked, work)
+        return await once(request, parts, arrival, idempotency_key, asked, work)
 
     router.include_router(batches)
     return router
 
 
-def _made_before(request: Request, parts: Parts) -> bool:
+def made_before(request: Request, parts: Parts) -> bool:
     """Whether a request's answer was made, or is being made: to give it again costs nothing."""
     key = request.headers.get(wire.IDEMPOTENCY_KEY_HEADER)
     return key is not None and parts.idempotency.knows(request.state.owner, key)
@@ -211,7 +211,7 @@ async def _one(
     async def work() -> Response:
         return respond(request, answer(await last(parts.planning.events(asked, arrival))))
 
-    return await _once(request, parts, arrival, idempotency_key, asked, work)
+    return await once(request, parts, arrival, idempotency_key, asked, work)
 
 
 def refuse_key(idempotency_key: str | None) -> None:
@@ -220,7 +220,7 @@ def refuse_key(idempotency_key: str | None) -> None:
         raise ProblemError(INVALID_REQUEST, f"{wire.IDEMPOTENCY_KEY_HEADER} cannot go with stream: true")
 
 
-async def _once(
+async def once(
     request: Request,
     parts: Parts,
     arrival: Arrival,
@@ -228,6 +228,11 @@ async def _once(
     asked: BaseModel,
     work: Callable[[], Awaitable[Response]],
 ) -> Response:
+    """What ``work`` answers to what was ``asked``, or answered before for the same key; see `Idempotency`.
+
+    Raises:
+        CallerLeft: nobody waits for it, and it came without a key.
+    """
     try:
         if idempotency_key is not None:
             same = request.url.path.encode() + packed(asked.model_dump(warnings=False))

@@ -7,49 +7,85 @@ from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Body, Request
 from fastapi.openapi.models import Example
+from starlette.responses import Response
 
 import clients.wire_refine as wire_refine
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from service.callers import while_connected
 from service.examples import example_refinement
-from service.openapi import PACKED, payloads, problems
+from service.openapi import answers_and_stream, payloads, problems
 from service.parts import Parts
 from service.payloads import payload_route
-from service.planning import last
-from service.planning_routes import REFUSALS, arrival_of, respond
+from service.planning import Planned, last
+from service.planning_routes import (
+    REFUSALS,
+    IdempotencyKey,
+    arrival_of,
+    made_before,
+    once,
+    refuse_key,
+    respond,
+)
 from service.problems import INVALID_FEEDBACK, INVALID_TRAJECTORY, NEEDS_TRACKS
-from service.refining import refine_answer, refining_of
+from service.refining import RefineTeller, Refining, refine_answer, refining_of
+from service.streaming import server_sent, streamed
 
+_DRAFT: Final = example_refinement((FRONT_WIDE, FRONT_TELE))
 EXAMPLES: Final[dict[str, Example]] = {
-    "a draft that does not brake": {"value": example_refinement((FRONT_WIDE, FRONT_TELE))}
+    "a draft that does not brake": {"value": _DRAFT},
+    "the same, told as it is refined": {"value": _DRAFT | {"stream": True}},
 }
 
 
 def refine_router(parts: Parts) -> APIRouter:
     """The endpoint; refinements take places as draws of /v1/plan do."""
-    router = APIRouter(route_class=payload_route(lambda _: parts.planning.check_open()), tags=["planning"])
+
+    def check_open(request: Request) -> None:
+        if not made_before(request, parts):
+            parts.planning.check_open()
+
+    router = APIRouter(route_class=payload_route(check_open), tags=["planning"])
+    refusals = problems(*REFUSALS, INVALID_TRAJECTORY, INVALID_FEEDBACK, NEEDS_TRACKS)
 
     @router.post(
         "/v1/refine",
         response_model=wire_refine.RefineResponse,
-        responses=problems(*REFUSALS, INVALID_TRAJECTORY, INVALID_FEEDBACK, NEEDS_TRACKS) | PACKED,
+        responses=refusals | answers_and_stream(*wire_refine.EVENTS),
         openapi_extra=payloads(wire_refine.RefineRequest),
     )
     async def refine(
-        request: Request, asked: Annotated[wire_refine.RefineRequest, Body(openapi_examples=EXAMPLES)]
+        request: Request,
+        asked: Annotated[wire_refine.RefineRequest, Body(openapi_examples=EXAMPLES)],
+        idempotency_key: IdempotencyKey = None,
     ) -> Any:
         """A draft and feedback on it: n refinements, with scores before and after by the sent objects."""
         arrival = arrival_of(request)
 
-        async def work() -> wire_refine.RefineResponse:
+        async def begin() -> Refining:
             # On a thread: numbers of a few ms must not hold up the answers of others.
-            refining = await asyncio.to_thread(refining_of, asked, parts.lifecycle.card)
-            planned = await last(parts.planning.events(refining.planning, arrival))
+            return await asyncio.to_thread(refining_of, asked, parts.lifecycle.card)
+
+        async def answer(refining: Refining, planned: Planned) -> wire_refine.RefineResponse:
             told = refining.feedback
             if told.correct is not None:
                 parts.metrics.feedback_told(told.written_by, correct=told.correct)
             return await asyncio.to_thread(refine_answer, refining, planned, arrival)
 
-        return respond(request, await while_connected(request, work()))
+        async def work() -> Response:
+            refining = await begin()
+            planned = await last(parts.planning.events(refining.planning, arrival, refining.geometry))
+            return respond(request, await answer(refining, planned))
+
+        if not asked.stream:
+            return await once(request, parts, arrival, idempotency_key, asked, work)
+        refuse_key(idempotency_key)
+        refining = await while_connected(request, begin())
+        return await streamed(
+            request,
+            parts.planning.events(refining.planning, arrival, refining.geometry),
+            RefineTeller(refining, arrival),
+            lambda told: server_sent(told, lambda planned: answer(refining, planned), arrival.request_id),
+            parts.metrics,
+        )
 
     return router

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -33,8 +33,9 @@ from model.engines.engine import Draw, ModelCard
 from model.families.registry import family_named
 from service.answers import plan_answer
 from service.feedback import CALLER, by_rule
-from service.intake import history_of, route_of, tracks_of
-from service.planning import Arrival, Planned
+from service.intake import Geometry, geometry_of
+from service.planning import Arrival, Begun, Planned
+from service.planning import Told as Happened
 from service.problems import (
     INVALID_FEEDBACK,
     INVALID_TRACKS,
@@ -45,6 +46,7 @@ from service.problems import (
     at,
 )
 from service.scoring import answer as score_answer
+from service.telling import PlanTeller, Written
 
 VERSION: Final[Version] = "v1.1"
 """PDMS, which the paper judges by."""
@@ -59,6 +61,7 @@ class Refining:
     Attributes:
         format: that refines it.
         planning: what the engine is asked.
+        geometry: of the scene, as the model takes it.
         feedback: what it is told of the draft.
         world: that plans are scored in; None where nothing around is known.
         before: the draft's scores in it.
@@ -66,6 +69,7 @@ class Refining:
 
     format: str
     planning: wire.PlanRequest
+    geometry: Geometry
     feedback: wire_refine.DraftFeedback
     world: World | None
     before: Scores | None
@@ -81,11 +85,10 @@ def refining_of(asked: wire_refine.RefineRequest, card: ModelCard) -> Refining:
     format = refining_format(card)
     draft, times_s = _draft(asked.draft)
     world, before = None, None
-    tracks = tracks_of(asked.scene)
-    if tracks is not None:
-        history, route = history_of(asked.scene), route_of(asked.scene)
+    geometry = geometry_of(asked.scene)
+    if geometry.tracks is not None:
         try:
-            world = world_ahead(history, route, tracks)
+            world = world_ahead(geometry.history, geometry.route, geometry.tracks)
         except ScoreError as error:
             # Of what is checked already, boxes alone can be too small; they are called by their places.
             raise at(INVALID_TRACKS, f"/scene/tracks/{error.place}", error.detail) from None
@@ -97,8 +100,11 @@ def refining_of(asked: wire_refine.RefineRequest, card: ModelCard) -> Refining:
     wanted_s = family_named(format).times_s
     if wanted_s[-1] > times_s[-1]:
         raise at(INVALID_TRAJECTORY, _POINTER, f"{format} refines drafts of {wanted_s[-1]:g} s")
+    scene = asked.scene
+    if "tracks" not in card.inputs:
+        scene, geometry = scene.model_copy(update={"tracks": None}), replace(geometry, tracks=None)
     planning = wire.PlanRequest(
-        scene=asked.scene if "tracks" in card.inputs else asked.scene.model_copy(update={"tracks": None}),
+        scene=scene,
         controls=wire.Controls(**dict(asked.controls)),
         format=format,
         attempt=wire.Attempt(
@@ -106,8 +112,9 @@ def refining_of(asked: wire_refine.RefineRequest, card: ModelCard) -> Refining:
             times_s=None if wanted_s == TEN_HZ_S else list(wanted_s),
             feedback=feedback.text,
         ),
+        stream=asked.stream,
     )
-    return Refining(format, planning, feedback, world, before)
+    return Refining(format, planning, geometry, feedback, world, before)
 
 
 def refining_format(card: ModelCard) -> str:
@@ -126,9 +133,9 @@ def refining_format(card: ModelCard) -> str:
 def refine_answer(refining: Refining, planned: Planned, arrival: Arrival) -> wire_refine.RefineResponse:
     """The answer of POST /v1/refine, once the refinements are there; they are scored here."""
     answer = plan_answer(planned, arrival.request_id)
-    before, after = None, list[TrajectoryScore | None]([None] * len(answer.draws))
-    if refining.world is not None and refining.before is not None:
-        before = score_answer(refining.world, refining.before, arrival.request_id)
+    judged = draft_judged(refining, arrival)
+    after = list[TrajectoryScore | None]([None] * len(answer.draws))
+    if refining.world is not None:
         after = _after(refining.world, planned.draws, arrival.request_id)
     total_ms = round(1000 * (time.monotonic() - arrival.since_s), 2)
     deadline, deadline_ms = answer.deadline, refining.planning.controls.deadline_ms
@@ -139,11 +146,7 @@ def refine_answer(refining: Refining, planned: Planned, arrival: Arrival) -> wir
         request_id=answer.request_id,
         model=answer.model,
         format=refining.format,
-        feedback=refining.feedback,
-        foresight=None if refining.world is None else CONSTANT_VELOCITY,
-        version=VERSION,
-        missing=[] if before is None else before.missing,
-        before=None if before is None else before.scores[0],
+        **dict(judged),
         draws=[
             wire_refine.Refinement(**dict(draw), after=after[place])
             for place, draw in enumerate(answer.draws)
@@ -152,6 +155,34 @@ def refine_answer(refining: Refining, planned: Planned, arrival: Arrival) -> wir
         timing=answer.timing.model_copy(update={"total_ms": total_ms}),
         deadline=deadline,
     )
+
+
+def draft_judged(refining: Refining, arrival: Arrival) -> wire_refine.DraftJudged:
+    """What is known of the draft before it is refined."""
+    before = None
+    if refining.world is not None and refining.before is not None:
+        before = score_answer(refining.world, refining.before, arrival.request_id)
+    return wire_refine.DraftJudged(
+        feedback=refining.feedback,
+        foresight=None if refining.world is None else CONSTANT_VELOCITY,
+        version=VERSION,
+        missing=[] if before is None else before.missing,
+        before=None if before is None else before.scores[0],
+    )
+
+
+class RefineTeller:
+    """Tells of the draft first, then of its refinements as of any draws."""
+
+    def __init__(self, refining: Refining, arrival: Arrival) -> None:
+        self._judged = draft_judged(refining, arrival)
+        self._tell = PlanTeller(refining.format)
+
+    async def __call__(self, event: Happened) -> list[tuple[str, Written | wire_refine.DraftJudged]]:
+        """Events of `clients.wire_refine.EVENTS` with their data."""
+        if isinstance(event, Begun):
+            return [("feedback", self._judged)]
+        return [*await self._tell(event)]
 
 
 def _draft(asked: list[list[float]]) -> tuple[FloatArray, tuple[float, ...]]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from clients import wire
-from service.intake import MAX_STEP_CHANGE_M, engine_request
+from service.intake import MAX_STEP_CHANGE_M, engine_request, geometry_of
 from service.problems import INVALID_ATTEMPT, INVALID_TRACKS, ProblemError
 from tests.service.scripted_engine import CARD
 from tests.service.serving import body
@@ -61,6 +61,15 @@ def test_any_two_rows_out_of_order_are_found(row: int) -> None:
         engine_request(with_history(rows), CARD, "id")
     assert f"{3 * 0.8:.1f} m" in caught.value.detail
     assert MAX_STEP_CHANGE_M < 3 * 0.8
+
+
+def test_geometry_that_is_checked_is_not_checked_again() -> None:
+    geometry = geometry_of(with_history(driven(np.full(15, 8.0))).scene)
+    unchecked = with_history(driven(np.full(15, 800.0)))
+    scene = engine_request(unchecked, CARD, "id", geometry).scene
+    np.testing.assert_array_equal(scene.history, geometry.history)
+    with pytest.raises(ProblemError, match="is it 10 Hz and metres"):
+        engine_request(unchecked, CARD, "id")
 
 
 def test_cameras_the_model_does_not_need_are_welcome() -> None:

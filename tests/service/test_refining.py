@@ -23,7 +23,7 @@ from clients.planner import (
     attempt_at,
     refine_request,
 )
-from clients.wire_refine import RefineRequest, RefineResponse, SectionsGiven
+from clients.wire_refine import DraftJudged, RefineRequest, RefineResponse, SectionsGiven
 from model.driving.pdm.feedback import Feedback, parse_feedback
 from model.driving.scene import Track
 from model.engines.torch.engine import TorchEngine, TorchSettings
@@ -104,6 +104,50 @@ def test_a_draw_and_feedback_on_it_are_planned_again(served: Served[TorchEngine]
         return result.draws[0].logprobs
 
     assert asyncio.run(asynchronously()) == told[1].logprobs
+
+
+def test_a_stream_tells_of_the_draft_first(served: Served[TorchEngine]) -> None:
+    request = refine_request(BEHIND_LEADER, DRAFT, controls=wire.ReflectControls(n=2, seed=4))
+    plain = refined(served, request)
+    with PlannerClient(served.url) as planner:
+        events = list(planner.stream_refine(request))
+    (first, judged), *told, (last, done) = events
+    assert (first, last) == ("feedback", "done")
+    assert isinstance(judged, DraftJudged)
+    assert isinstance(done, RefineResponse)
+    assert {name for name, _ in told} == {"thinking", "trajectory"}
+    assert judged.model_dump() == plain.model_dump(include=set(DraftJudged.model_fields))
+    assert (done.draws, done.before) == (plain.draws, plain.before)
+    for draw in plain.draws:
+        words = [data.text for _, data in told if isinstance(data, wire.ThinkingWritten)]
+        poses = [data.trajectory for _, data in told if isinstance(data, wire.TrajectoryWritten)]
+        assert draw.thinking in words
+        assert draw.trajectory in poses
+
+    async def asynchronously() -> list[str]:
+        async with AsyncPlannerClient(served.url) as planner:
+            return [name async for name, _ in planner.stream_refine(request)]
+
+    assert asyncio.run(asynchronously())[0] == "feedback"
+
+
+def test_a_key_gets_the_answer_that_was_made() -> None:
+    engine = ScriptedEngine()
+    engine.card_shown, engine.times_s = replace(CARD, formats=FORMATS), HALF_SECONDS
+    key = {"Idempotency-Key": "draft-1"}
+    with serve(engine, Settings()) as served:
+        first = served.http.post(PATH, json=asked(), headers=key)
+        again = served.http.post(PATH, json=asked(), headers=key)
+        assert (again.status_code, again.content) == (200, first.content)
+        assert again.headers["Idempotency-Replayed"] == "true"
+        assert len(engine.submitted) == 1
+        problem(served.http.post(PATH, json=asked(threshold=0.5), headers=key), "idempotency-key-reused")
+        problem(served.http.post(PATH, json=asked(stream=True), headers=key), "invalid-request")
+        # Where drafts are judged, and made again, history is the same, checked once.
+        history = [[0.0] * 4] * 15 + [[9.0] * 4]
+        changed = asked()["scene"] | {"history": history}
+        told = problem(served.http.post(PATH, json=asked(scene=changed)), "invalid-history")
+        assert told.errors[0].pointer == "/scene/history"
 
 
 def test_a_failing_draft_is_told_why_and_refined(served: Served[TorchEngine]) -> None:
