@@ -19,7 +19,7 @@ ROOMS = ("model/", "service/")
 
 OTHERWISE = {
     # Fields, events and words of the HTTP contract, which is CF-VLA's for all families.
-    "clients/wire.py": 4,
+    "clients/wire/plan.py": 4,
     "service/cli/plan.py": 3,
     "service/errors.py": 1,
     "service/examples.py": 2,

@@ -1,0 +1,67 @@
+"""The contract of GET /v1/models and POST /v1/models:load."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from clients.wire.base import Answered, Asked
+from clients.wire.label import TeacherName
+
+
+class ModelCard(Answered):
+    """What a loaded checkpoint is."""
+
+    name: str
+    revision: str = Field(description="Changes with the weights.")
+    engine: str = Field(description="torch or vllm.")
+    formats: list[str] = Field(description="Response formats it writes.")
+    refines: list[str] = Field(
+        default_factory=list, description="Of these, the ones that refine an attempt, which they need."
+    )
+    imagines: list[str] = Field(
+        default_factory=list, description="Of these, the ones that may imagine a picture half a second ahead."
+    )
+    paints: bool = Field(
+        default=False, description="Whether it can paint what it imagines, as POST /v1/imagine asks."
+    )
+    cameras: list[str] = Field(description="Cameras it needs; a scene must have a clip of each.")
+    image_size: Annotated[list[int], Field(min_length=2, max_length=2)] = Field(
+        description="Width and height in pixels that pictures are resized to."
+    )
+    parameters: int = Field(description="How many weights.")
+    inputs: list[str] = Field(
+        default_factory=lambda: ["route"],
+        description="What it takes of a scene beside pictures and history: route, tracks.",
+    )
+    details: dict[str, Any] = Field(default_factory=dict)
+
+
+class NamedModel(Answered):
+    """A model as clients of OpenAI's API expect it."""
+
+    id: str
+    object: Literal["model"] = "model"
+    created: int = Field(description="When the service began, in s since 1970.")
+    owned_by: str = "looktwice"
+
+
+class ModelList(Answered):
+    """Answer of GET /v1/models; `object` and `data` are for clients of OpenAI's API."""
+
+    object: Literal["list"] = "list"
+    data: list[NamedModel] = Field(default_factory=list)
+
+    models: list[ModelCard]
+    teacher: TeacherName | None = Field(
+        default=None, description="Who writes the labels of POST /v1/label; null where nobody does."
+    )
+
+
+class LoadRequest(Asked):
+    """Body of POST /v1/models:load."""
+
+    checkpoint: str = Field(
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$", description="Name of a folder among the checkpoints."
+    )

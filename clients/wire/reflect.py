@@ -1,0 +1,91 @@
+"""The contract of POST /v1/reflect: a scene and a plan in, n looks at it out."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from clients.wire.base import Answered, Asked, ModelName, Poses, Probability, TimesS, check_times
+from clients.wire.controls import PlanGiven, ReflectControls
+from clients.wire.plan import Cut, Deadline, Logprobs, Plan, Timing
+from clients.wire.scene import Scene
+
+Group = Literal["longitudinal", "lateral", "lane"]
+
+
+class ReflectRequest(Asked):
+    """Body of POST /v1/reflect."""
+
+    scene: Scene
+    plan: PlanGiven = Field(description="The plan to be looked at, from any planner: bullet text, or tracks.")
+    controls: ReflectControls = ReflectControls()
+    format: str | None = Field(
+        default=None,
+        max_length=40,
+        description="Response format; GET /v1/models lists them, the default first.",
+    )
+    stream: bool = Field(default=False, description="Answer with server-sent events, as draws are written.")
+
+
+class PlanChange(Answered):
+    """A stretch of one track in which the revised plan says something else than the given one."""
+
+    group: Group
+    start_s: float
+    end_s: float
+    proposed: str | None = Field(description="The word of the given plan; null where it has no such track.")
+    revised: str | None = Field(description="The word of the revised plan; null where it has none.")
+
+
+class Reflection(Answered):
+    """One of the n looks at the given plan."""
+
+    index: int = Field(ge=0, description="0..n-1.")
+    decision: Literal["keep", "revise"] = Field(
+        description="keep where the model would drive by the given plan, revise where it says otherwise."
+    )
+    thinking: str | None = Field(description="The reasoning; null without a second look.")
+    revised_plan: Plan | None = Field(description="The plan after reasoning; null without a second look.")
+    plan_iou: float = Field(
+        ge=0, le=1, description="Intersection over union of given and revised plan, in bins of 0.1 s."
+    )
+    changes: list[PlanChange] = Field(description="Where they do not, track by track; empty when kept.")
+    trajectory: Poses
+    times_s: TimesS = None
+    cut: Cut | None = Field(
+        default=None,
+        description="What the deadline did to the second look: skipped, shortened, or replaced by the draft.",
+    )
+    consistent: bool | None = Field(
+        default=None,
+        description="Whether the parts of the draw agree; null where nothing can be said.",
+    )
+    disagreements: list[str] = Field(
+        default_factory=list,
+        description="Which parts do not: plan_trajectory (the trajectory does something else than the plan "
+        "it follows), reason_change (the revised plan does not change as the reasoning asks for).",
+    )
+    reasons: list[str] | None = Field(
+        default=None,
+        description="The statements that the reflection could make, by what is in view; null without a "
+        "reflection, and where it could make any.",
+    )
+    tokens: dict[str, int] = Field(description="Tokens per section of the response.")
+    logprobs: Logprobs | None = Field(default=None, description="Null unless asked for.")
+
+    _timed = model_validator(mode="after")(check_times)
+
+
+class ReflectResponse(Answered):
+    """Answer of POST /v1/reflect."""
+
+    request_id: str
+    model: ModelName
+    plan: Plan = Field(description="The given plan, as the model read it.")
+    think_probability: Probability = Field(
+        description="Probability of a second look behind the given plan, the same for all draws."
+    )
+    draws: list[Reflection]
+    timing: Timing
+    deadline: Deadline | None = Field(default=None, description="Null where none was set.")
