@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import functools
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import pyarrow.parquet as pq
 
@@ -77,6 +78,10 @@ def view(labelled: LabelledScene) -> wire.LabelledScene:
         lane_lines=[rows(line, _DECIMALS) for line in labelled.lane_lines],
         tracks=wire_tracks(tracks_of(labelled.agents), _DECIMALS),
         tags=sorted(labelled.tags),
+        next_images=[
+            wire.NextImage(camera=cast(wire.Camera, each.camera), image=base64.b64encode(each.image).decode())
+            for each in labelled.next_frames
+        ],
     )
 
 

@@ -72,7 +72,7 @@ from clients.wire.plan import (
 from clients.wire.problem import Fault, Problem
 from clients.wire.reflect import Group, PlanChange, Reflection, ReflectRequest, ReflectResponse
 from clients.wire.scene import Clip, Image, Scene, Track
-from clients.wire.scenes import Agent, LabelledScene, SceneEntry, SceneFile, SceneList
+from clients.wire.scenes import Agent, LabelledScene, NextImage, SceneEntry, SceneFile, SceneList
 
 __all__ = [
     "Agent",
@@ -122,6 +122,7 @@ __all__ = [
     "NamedModel",
     "Nearby",
     "NearbyPoint",
+    "NextImage",
     "PART_SCHEME",
     "PROBLEM_MEDIA_TYPE",
     "Plan",

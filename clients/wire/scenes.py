@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from clients.wire.base import Answered, Length, Nearby, Point, Trajectory
+from clients.wire.base import Answered, Camera, Length, Nearby, Point, Trajectory
 from clients.wire.scene import Scene, Track
 
 
@@ -22,6 +22,13 @@ class Agent(Answered):
         max_length=80,
         description="80 poses (x, y in m, heading in rad) at 10 Hz, row 15 is now; null where absent.",
     )
+
+
+class NextImage(Answered):
+    """What one camera saw half a second after a scene."""
+
+    camera: Camera
+    image: str = Field(description="JPEG, PNG or WebP in base64.")
 
 
 class LabelledScene(Answered):
@@ -41,6 +48,11 @@ class LabelledScene(Answered):
         description="What a perfect tracker would tell of the agents, for `scene.tracks`.",
     )
     tags: list[str] = Field(description="What makes the scene difficult.")
+    next_images: list[NextImage] = Field(
+        default_factory=list,
+        description="What cameras saw half a second later, beside which imagined pictures can be held; empty "
+        "where that is not known.",
+    )
 
 
 class SceneEntry(Answered):

@@ -14,13 +14,15 @@ async function answer(response) {
   throw new Problem(body || { title: `The service answered ${response.status}`, detail: "without a reason" });
 }
 
+const unanswered = (error) => (error.name === "AbortError" ? error
+  : new Problem({ title: "The service does not answer", detail: "Is it still running? Then try again." }));
+
 async function ask(path, options) {
   let response;
   try {
     response = await fetch(path, options);
   } catch (error) {
-    if (error.name === "AbortError") throw error;
-    throw new Problem({ title: "The service does not answer", detail: "Is it still running? Then try again." });
+    throw unanswered(error);
   }
   return answer(response);
 }
@@ -49,6 +51,35 @@ export async function reflect(scene, text, controls, signal) {
     think_probability: body.think_probability,
   }));
   return { ...body, draws };
+}
+
+// One imagined picture, told of as it is written: names of events with their data.
+export async function imagine(asked, tell, signal) {
+  let response;
+  try {
+    response = await fetch("/v1/imagine", {
+      method: "POST",
+      headers: { "Content-Type": "application/json" },
+      body: JSON.stringify({ ...asked, stream: true }),
+      signal,
+    });
+  } catch (error) {
+    throw unanswered(error);
+  }
+  if (!response.ok) return answer(response);
+  let text = "";
+  const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
+  for (let part = await reader.read(); !part.done; part = await reader.read()) {
+    const events = (text + part.value).split("\n\n");
+    text = events.pop(); // not whole yet
+    for (const event of events) {
+      const fields = Object.fromEntries(event.split("\n").map((line) => line.split(/: (.*)/s, 2)));
+      const data = JSON.parse(fields.data);
+      if (fields.event === "error") throw new Problem(data);
+      tell(fields.event, data);
+    }
+  }
+  return null;
 }
 
 // Trajectories of a bundled scene, judged: rows of x, y, z, heading in, a verdict with facts for each out.
@@ -89,5 +120,6 @@ function labelled(content, name) {
     drivable: known.drivable || [],
     lane_lines: known.lane_lines || [],
     tags: known.tags || [],
+    next_images: known.next_images || [],
   };
 }

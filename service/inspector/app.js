@@ -5,6 +5,7 @@ import { drawBirdseye } from "./birdseye.js";
 import { showCameras } from "./cameras.js";
 import { byId, element } from "./dom.js";
 import { asked, canBeJudged, forgetFeedback, showFeedback } from "./feedback.js";
+import { allowImagining, imagine, showImaginable } from "./imagination.js";
 import { showDraw } from "./timeline.js";
 import { averageError } from "./times.js";
 
@@ -65,6 +66,7 @@ function showView(view) {
   forgetDraws();
   state.view = view;
   showCameras(view.scene);
+  showImaginable(view);
   byId("tags").replaceChildren(...view.tags.map((tag) => element("li", { textContent: tag.replaceAll("_", " ") })));
   byId("with-route").disabled = !view.scene.route;
   byId("with-tracks").disabled = !state.inputs.includes("tracks");
@@ -270,6 +272,7 @@ function listen() {
     event.preventDefault();
     attempt(lookTwice);
   });
+  byId("imagine").addEventListener("click", () => attempt(() => imagine(given(), controls().seed)));
   byId("why").addEventListener("click", () => attempt(judge));
   byId("thinking").addEventListener("change", showThreshold);
   byId("with-threshold").addEventListener("change", replan);
@@ -309,6 +312,7 @@ async function begin() {
 async function showModel() {
   const [card] = await api.models();
   state.inputs = card.inputs;
+  allowImagining(card);
   byId("model").textContent = `${card.name} ${card.revision} · ${card.engine} · ${card.cameras.length} cameras`;
 }
 

@@ -8,7 +8,7 @@ const TYPES = [["/9j/", "jpeg"], ["iVBOR", "png"], ["UklGR", "webp"]];
 let clips = [];
 let timer = 0;
 
-function source(base64) {
+export function source(base64) {
   const [, type] = TYPES.find(([start]) => base64.startsWith(start)) || ["", "jpeg"];
   return `data:image/${type};base64,${base64}`;
 }

@@ -31,6 +31,7 @@ from model.engines.engine import (
     TextWritten,
 )
 from model.families.family import Foreseen, NextPicture
+from model.formats.pieces import Value
 
 CARD: Final = ModelCard(
     name="scripted",
@@ -217,7 +218,7 @@ def _foreseen(camera: str | None, luck: random.Random) -> Foreseen:
 def _imagining(index: int, foreseen: Foreseen) -> Iterator[Event]:
     """What is told while it is written, seven codes at a time."""
     assert foreseen.picture is not None
-    ahead = {"kind": "vehicle", "lateral_m": 0.0, "forward_m": 20.0, "length_m": 4.5, "width_m": 1.9}
+    ahead: Value = {"kind": "vehicle", "lateral_m": 0.0, "forward_m": 20.0, "length_m": 4.5, "width_m": 1.9}
     yield SectionFinished(index, "perception", "", ((ahead,), 1.7, 5.2))
     yield SectionFinished(index, "prediction", "", ({"lateral_m": 0.0, "forward_m": 5.0}, "Forward"))
     for count in range(7, 98, 7):

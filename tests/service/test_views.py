@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import resource
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from model.driving.scene import NextFrame
 from model.driving.scene_store import write_scenes
 from service import scene_files, views
 from service.problems import ProblemError
@@ -33,6 +35,14 @@ def test_a_view_tells_everything_the_page_draws() -> None:
     assert (leader.kind, leader.length_m, leader.poses[15]) == ("vehicle", 4.5, [24.0, 0.0, 0.0])
     assert walker.poses[:4] == [None] * 4, "absent is null: JSON has no NaN"
     assert walker.poses[4] is not None
+
+
+def test_what_cameras_saw_next_is_told() -> None:
+    picture = labelled().scene.clips[0].images[0]
+    shown = view(replace(labelled(), next_frames=(NextFrame("back_left", picture),)))
+    [told] = shown.next_images
+    assert (told.camera, base64.b64decode(told.image)) == ("back_left", picture)
+    assert view(labelled()).next_images == []
 
 
 def test_bundled_scenes_can_be_planned_for_as_they_come(served: Served, engine: ScriptedEngine) -> None:
