@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -19,6 +18,7 @@ from model.driving.reflection_store import LabelledReflection
 from model.driving.scene import Scene
 from model.driving.scene_store import read_scenes
 from model.driving.trajectory import present_speed
+from model.driving.whole_files import written_whole
 
 MESSAGES_FILE: Final = "messages.jsonl"
 PARTS_FILE: Final = "trl.jsonl"
@@ -124,22 +124,23 @@ def write_messages(ledger: Ledger, label: Run, scenes: Path, folder: Path) -> in
         by_scene.setdefault(each.scene_id, []).append(each)
     pictures = folder / "images"
     pictures.mkdir(parents=True, exist_ok=True)
-    tagged, parted = (folder / f".{name}.{os.getpid()}" for name in (MESSAGES_FILE, PARTS_FILE))
     count = 0
-    with tagged.open("w") as tagged_lines, parted.open("w") as parted_lines:
+    with (
+        written_whole(folder / MESSAGES_FILE) as tagged,
+        written_whole(folder / PARTS_FILE) as parted,
+        written_whole(folder / "dataset_info.json") as info,
+        tagged.open("w") as tagged_lines,
+        parted.open("w") as parted_lines,
+    ):
         for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None):
             for each in by_scene.pop(labelled.scene.scene_id, []):
                 row = _row(labelled.scene, each, _write_images(labelled.scene, pictures))
                 tagged_lines.write(json.dumps(row) + "\n")
                 parted_lines.write(json.dumps(_in_parts(row)) + "\n")
                 count += 1
-    if by_scene:
-        tagged.unlink()
-        parted.unlink()
-        raise LedgerError(f"{len(by_scene)} labelled scenes are not at {scenes}, such as {min(by_scene)}")
-    os.replace(parted, folder / PARTS_FILE)
-    os.replace(tagged, folder / MESSAGES_FILE)
-    (folder / "dataset_info.json").write_text(json.dumps(_DATASET_INFO, indent=2) + "\n")
+        if by_scene:
+            raise LedgerError(f"{len(by_scene)} labelled scenes are not at {scenes}, such as {min(by_scene)}")
+        info.write_text(json.dumps(_DATASET_INFO, indent=2) + "\n")
     return count
 
 

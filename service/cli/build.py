@@ -327,6 +327,7 @@ def export(
     from clients.labelling.export import held_plans, reflections, right_plans, write_messages
     from clients.labelling.ledger import Ledger
     from model.driving.reflection_store import write_reflections
+    from model.driving.whole_files import written_whole
 
     with told(), Ledger(folder) as ledger:
         if (right_iou is not None or right_outcomes) and form != "parquet":
@@ -353,9 +354,11 @@ def export(
             count = write_messages(ledger, ledger.the_run("label", run), scenes, to)
         else:
             settings, _, found = _batch(ledger, scenes, plans_per_scene, seed, run)
-            asked = [json.dumps(line) + "\n" for line in batch_requests(ledger, found, settings)]
-            to.write_text("".join(asked))
-            count = len(asked)
+            count = 0
+            with written_whole(to) as temporary, temporary.open("w") as lines:
+                for line in batch_requests(ledger, found, settings):
+                    lines.write(json.dumps(line) + "\n")
+                    count += 1
         typer.echo(f"{count} written to {to}")
 
 
