@@ -31,7 +31,7 @@ from clients.labelling.teachers.teacher import (
 )
 from clients.planner import AsyncPlannerClient
 from model.driving.feedback_store import FeedbackRow
-from model.driving.hashing import annotations_hash, hash_of
+from model.driving.hashing import hash_of, judged_hash
 from model.driving.pdm.comfort import Version
 from model.driving.pdm.feedback import RuleFeedback
 from model.driving.pdm.judged import THRESHOLD, JudgedPlan
@@ -202,13 +202,13 @@ def feedback_jobs(
         entry = ledger.find(key_of(inference, labelled))
         for draw in sorted(chosen.get(entry.key, ())) if entry is not None else ():
             assert entry is not None
-            key = feedback_key(run, entry.key, draw, annotations_hash(labelled))
+            key = feedback_key(run, entry.key, draw, judged_hash(labelled))
             yield Job(key, entry.scene_id, Chosen(labelled, entry, draw))
 
 
-def feedback_key(run: Run, inferred: str, draw: int, annotations: str) -> str:
+def feedback_key(run: Run, inferred: str, draw: int, judged_by: str) -> str:
     """What the feedback on one response is found by."""
-    return hash_of(run.id, inferred, draw, annotations)
+    return hash_of(run.id, inferred, draw, judged_by)
 
 
 def writer(

@@ -39,3 +39,14 @@ def annotations_hash(labelled: LabelledScene) -> str:
     groups = ((labelled.future,), labelled.drivable, labelled.lane_lines, lanes)
     arrays = [part for group in groups for part in (len(group), *(array.tobytes() for array in group))]
     return hash_of(len(labelled.agents), *agents, *arrays, sorted(labelled.tags))
+
+
+def judged_hash(labelled: LabelledScene) -> str:
+    """Stands for all that plans in a scene are judged by: its annotations, and its lane map."""
+    known = labelled.lane_map
+    if known is None:
+        return annotations_hash(labelled)
+    lanes = [part for lane in known.lanes for part in (lane.lane_id, lane.on_route, lane.ring.tobytes())]
+    rings = [ring.tobytes() for ring in known.intersections]
+    rest = (known.centreline.tobytes(), known.has_lights)
+    return hash_of(annotations_hash(labelled), len(known.lanes), *lanes, len(rings), *rings, *rest)

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from model.bundled import SCENES
-from model.driving.hashing import annotations_hash, hash_of
+from model.driving.hashing import annotations_hash, hash_of, judged_hash
+from model.driving.lane_map import LaneArea, LaneMap
 from model.driving.scene_store import read_scenes
 from model.driving.trajectory import constant_velocity
 
@@ -33,3 +34,29 @@ def test_annotations_are_told_apart_by_whatever_a_teacher_may_read() -> None:
     ]
     assert len({annotations_hash(each) for each in changed}) == len(changed)
     assert annotations_hash(labelled) == annotations_hash(next(read_scenes(SCENES)))
+
+
+def test_what_plans_are_judged_by_holds_the_lane_map_too() -> None:
+    corner = np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 4.0]], np.float32)
+    first, *rest = (LaneArea(number, corner + number, on_route=number > 0) for number in range(2))
+    known = LaneMap((first, *rest), (corner,), corner, has_lights=False)
+    unknown = next(read_scenes(SCENES))
+    labelled = replace(unknown, lane_map=known)
+    changed = [
+        unknown,
+        labelled,
+        replace(labelled, tags=labelled.tags ^ {"turn"}),
+        *(
+            replace(labelled, lane_map=each)
+            for each in (
+                replace(known, lanes=tuple(rest)),
+                replace(known, lanes=(replace(first, on_route=not first.on_route), *rest)),
+                replace(known, lanes=(replace(first, ring=first.ring + 0.5), *rest)),
+                replace(known, intersections=()),
+                replace(known, centreline=known.centreline + 0.5),
+                replace(known, has_lights=not known.has_lights),
+            )
+        ),
+    ]
+    assert len({judged_hash(each) for each in changed}) == len(changed)
+    assert judged_hash(labelled) == judged_hash(replace(next(read_scenes(SCENES)), lane_map=known))
