@@ -58,7 +58,9 @@ def openai_router(parts: Parts) -> APIRouter:
     """The endpoint for clients of OpenAI's API."""
     router = APIRouter(route_class=payload_route(lambda _: parts.planning.check_open()), tags=["planning"])
 
-    @router.post("/v1/chat/completions", responses=problems(*REFUSALS, UNKNOWN_MODEL) | _ANSWERS)
+    refusals = problems(*REFUSALS, UNKNOWN_MODEL, dialect=True)
+
+    @router.post("/v1/chat/completions", responses=refusals | _ANSWERS)
     async def chat_completions(request: Request, chat: ChatRequest) -> Any:
         """Planning in OpenAI's dialect: pictures as image parts, a message per draw; see docs/http.md."""
         arrival = arrival_of(request)
@@ -81,7 +83,7 @@ def openai_router(parts: Parts) -> APIRouter:
 
     @router.get(
         "/v1/models/{name}",
-        responses=problems(UNAUTHORIZED, UNKNOWN_MODEL, NOT_READY, DRAINING, ENGINE_FAILED),
+        responses=problems(*(UNAUTHORIZED, UNKNOWN_MODEL, NOT_READY, DRAINING, ENGINE_FAILED), dialect=True),
     )
     async def model(name: str) -> wire.NamedModel:
         """One model, in OpenAI's dialect."""

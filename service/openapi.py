@@ -16,7 +16,8 @@ from clients.wire import (
     Problem,
 )
 from service.auth import OPEN_PATHS
-from service.problems import INTERNAL, MISDIRECTED, Kind
+from service.openai_errors import dialect_error, dialect_status
+from service.problems import INTERNAL, MISDIRECTED, Kind, ProblemError
 
 Responses = dict[int | str, dict[str, Any]]
 
@@ -54,17 +55,25 @@ def answers_and_stream(*names: str) -> Responses:
     return {200: {"content": PACKED[200]["content"] | stream}}
 
 
-def problems(*kinds: Kind) -> Responses:
-    """What a route declares about its errors; 421 and 500 can occur anywhere."""
+def problems(*kinds: Kind, dialect: bool = False) -> Responses:
+    """What a route declares about its errors; 421 and 500 can occur anywhere.
+
+    Args:
+        kinds: that it may answer with.
+        dialect: whether it tells them as OpenAI's clients expect.
+    """
     by_status: dict[int, list[Kind]] = {}
     for kind in (*kinds, MISDIRECTED, INTERNAL):
-        by_status.setdefault(kind.status, []).append(kind)
+        status = dialect_status(kind.status) if dialect else kind.status
+        by_status.setdefault(status, []).append(kind)
     return {
         status: {
             "model": Problem,
             "description": "; ".join(kind.title for kind in found),
             "content": {
-                PROBLEM_MEDIA_TYPE: {"examples": {kind.slug: {"value": _example(kind)} for kind in found}}
+                PROBLEM_MEDIA_TYPE: {
+                    "examples": {kind.slug: {"value": _example(kind, dialect=dialect)} for kind in found}
+                }
             },
         }
         for status, found in sorted(by_status.items())
@@ -122,11 +131,15 @@ def _move_problems(responses: dict[str, dict[str, Any]]) -> None:
             del responses[status]
 
 
-def _example(kind: Kind) -> dict[str, Any]:
-    return {
+def _example(kind: Kind, *, dialect: bool) -> dict[str, Any]:
+    document = {
         "type": kind.type,
         "title": kind.title,
         "status": kind.status,
         "detail": "…",
         "request_id": "0f3a5c",
     }
+    if dialect:
+        document["status"] = dialect_status(kind.status)
+        document["error"] = dialect_error(ProblemError(kind, "…"))
+    return document

@@ -38,6 +38,17 @@ def test_every_error_is_described_as_a_problem(description: dict[str, Any]) -> N
     assert "HTTPValidationError" not in description["components"]["schemas"]
 
 
+def test_chats_are_refused_as_openai_does(description: dict[str, Any]) -> None:
+    responses = description["paths"]["/v1/chat/completions"]["post"]["responses"]
+    assert "422" not in responses
+    examples = responses["400"]["content"]["application/problem+json"]["examples"]
+    assert {"invalid-json", "invalid-request", "invalid-image"} <= examples.keys()
+    for slug, example in examples.items():
+        assert (example["value"]["status"], example["value"]["error"]["code"]) == (400, slug)
+    (unknown,) = responses["404"]["content"]["application/problem+json"]["examples"].values()
+    assert unknown["value"]["error"]["type"] == "invalid_request_error"
+
+
 def test_every_reference_leads_somewhere(description: dict[str, Any]) -> None:
     def references(node: Any) -> list[str]:
         if isinstance(node, dict):
