@@ -27,7 +27,8 @@ ScoreTrajectory = Annotated[
 ]
 Ring = Annotated[
     list[NearbyPoint],
-    Field(min_length=3, max_length=400, description="An outline that does not cross itself."),
+    # Of long lists the first fault alone is told: a body may hold hundreds of thousands.
+    Field(min_length=3, max_length=400, fail_fast=True, description="An outline that does not cross itself."),
 ]
 Name = Annotated[str, Field(min_length=1, max_length=100)]
 
@@ -73,6 +74,7 @@ class ScoredAgent(Asked):
     length_m: Length
     width_m: Length
     poses: list[Annotated[list[Nearby], Field(min_length=3, max_length=3)] | None] = Field(
+        fail_fast=True,
         min_length=41,
         max_length=51,
         description="Centre and heading at 10 Hz, the first row is now; null where it is not there. "
@@ -113,18 +115,19 @@ class Labels(Asked):
         max_length=50,
         description="Before now at 10 Hz, oldest first, the last one 0.1 s ago; NAVSIM has 15 of them.",
     )
-    agents: list[ScoredAgent] | None = Field(default=None, max_length=300)
-    lanes: list[ScoredLane] | None = Field(default=None, max_length=300)
-    intersections: list[Ring] | None = Field(default=None, max_length=100)
+    agents: list[ScoredAgent] | None = Field(default=None, max_length=300, fail_fast=True)
+    lanes: list[ScoredLane] | None = Field(default=None, max_length=300, fail_fast=True)
+    intersections: list[Ring] | None = Field(default=None, max_length=100, fail_fast=True)
     drivable: list[Annotated[list[Ring], Field(min_length=1, max_length=50)]] | None = Field(
         default=None,
         max_length=200,
+        fail_fast=True,
         description="Areas where a car may be, besides intersections; the first ring of each is its outline, "
         "others are holes.",
     )
-    red_lights: list[ClosedLane] | None = Field(default=None, max_length=100)
+    red_lights: list[ClosedLane] | None = Field(default=None, max_length=100, fail_fast=True)
     centreline: Annotated[list[NearbyPoint], Field(min_length=2, max_length=2000)] | None = Field(
-        default=None, description="The middle of the lanes that the reference follows."
+        default=None, fail_fast=True, description="The middle of the lanes that the reference follows."
     )
 
 

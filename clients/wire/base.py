@@ -66,7 +66,10 @@ Poses = Annotated[
 ]
 TimesS = Annotated[
     list[Annotated[float, Field(gt=0, le=60)]] | None,
-    Field(description="When the poses of the trajectory are, in s from now; null for 64 at 10 Hz."),
+    Field(
+        description="When the poses of the trajectory are, in s from now; null for 64 at 10 Hz.",
+        fail_fast=True,
+    ),
 ]
 
 

@@ -12,12 +12,16 @@ from clients.wire.scene import Scene
 from clients.wire.scenes import Agent
 
 
+LaneLine = Annotated[list[NearbyPoint], Field(min_length=2, max_length=2000, fail_fast=True)]
+
+
 class Annotations(Asked):
     """What is known about a scene besides what its cameras show; as GET /v1/scenes/ID gives it."""
 
-    agents: list[Agent] = Field(max_length=500, description="Who and what is around.")
-    lane_lines: list[Annotated[list[NearbyPoint], Field(min_length=2, max_length=2000)]] = Field(
-        max_length=500, description="Centre lines of the lanes around."
+    # Of long lists the first fault alone is told: a body may hold hundreds of thousands.
+    agents: list[Agent] = Field(max_length=500, fail_fast=True, description="Who and what is around.")
+    lane_lines: list[LaneLine] = Field(
+        max_length=500, fail_fast=True, description="Centre lines of the lanes around."
     )
 
 

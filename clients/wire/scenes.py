@@ -18,6 +18,7 @@ class Agent(Answered):
     length_m: Length
     width_m: Length
     poses: list[Annotated[list[Nearby], Field(min_length=3, max_length=3)] | None] = Field(
+        fail_fast=True,
         min_length=80,
         max_length=80,
         description="80 poses (x, y in m, heading in rad) at 10 Hz, row 15 is now; null where absent.",

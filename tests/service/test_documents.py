@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -99,6 +100,35 @@ def test_bad_points_are_counted_once_there_are_too_many(served: Served) -> None:
     found = problem(answer, "invalid-history")
     assert len(found.errors) <= 20
     assert len(answer.content) < 20_000
+
+
+POINTS: list[list[Any]] = [[["a", "b"]] * 400] * 90
+"""Of which each is wrong twice."""
+ROWS: list[list[str]] = [["a", "b", "c"]] * 50
+
+
+@pytest.mark.parametrize(
+    ("path", "field", "wrong"),
+    [
+        ("/v1/label", "annotations", {"agents": [], "lane_lines": POINTS}),
+        ("/v1/label", "annotations", {"agents": [{"poses": ROWS}] * 400, "lane_lines": []}),
+        ("/v1/score", "labels", {"lanes": [{"ring": ring} for ring in POINTS]}),
+        ("/v1/score", "labels", {"intersections": POINTS}),
+        ("/v1/score", "labels", {"drivable": [POINTS[:10]] * 9}),
+        ("/v1/score", "labels", {"red_lights": [{"ring": ring} for ring in POINTS]}),
+        ("/v1/score", "labels", {"centreline": [point for ring in POINTS[:5] for point in ring]}),
+        ("/v1/feedback", "labels", {"agents": [{"poses": ROWS}] * 300}),
+        ("/v1/feedback", "trajectories", [[["a", "b", "c"]] * 64] * 60),
+    ],
+)
+def test_of_a_hundred_thousand_bad_points_few_are_made_faults(
+    served: Served, path: str, field: str, wrong: object
+) -> None:
+    answer = served.http.post(path, json={field: wrong})
+    assert answer.status_code == 422
+    more = re.search(r"and ([0-9]+) more", problem(answer, "invalid-request").detail)
+    assert more is not None
+    assert int(more[1]) < 400
 
 
 def test_an_operators_body_is_read_as_carefully(served: Served) -> None:
