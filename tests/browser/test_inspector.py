@@ -464,6 +464,19 @@ def test_needs_nothing_from_elsewhere(page: Page, served: Served) -> None:
     assert [url for url in asked if not url.startswith((served.url, "data:"))] == []
 
 
+@pytest.mark.parametrize("width", [820, 1360, 1800])
+def test_the_plan_button_is_beside_its_fields(inspector: Page, width: int) -> None:
+    inspector.set_viewport_size({"width": width, "height": 800})
+    last = inspector.get_by_label("give the tracks").bounding_box()
+    button = inspector.get_by_role("button", name="Plan", exact=True).bounding_box()
+    assert last is not None
+    assert button is not None
+    rows = max(last["height"], button["height"])
+    assert abs((button["y"] + button["height"] / 2) - (last["y"] + last["height"] / 2)) < rows
+    assert 0 < button["x"] - last["x"] < 300
+    assert button["y"] + button["height"] < 800
+
+
 @pytest.mark.parametrize("width", [360, 820, 1800])
 def test_fits_any_width(inspector: Page, width: int) -> None:
     inspector.set_viewport_size({"width": width, "height": 800})

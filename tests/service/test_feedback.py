@@ -256,6 +256,7 @@ def test_a_teacher_that_does_not_do_is_told_and_not_replaced(
 ) -> None:
     answer, _ = Taught(script, scene_file).ask()
     assert json.loads(answer.content)["type"].endswith(kind)
+    assert "told why" not in answer.text, "what an endpoint says stays in the log"
 
 
 def test_nobody_is_asked_about_correct_plans_or_in_mode_rule(scene_file: Path) -> None:

@@ -2,12 +2,15 @@ from __future__ import annotations
 
 import base64
 import json
+import threading
 from typing import Any
 
 import msgpack
 import pytest
 
 from clients.wire import MSGPACK_MEDIA_TYPE, PlanResponse
+from service import payloads
+from service.body_limit import LARGE_BYTES
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body
@@ -120,3 +123,23 @@ def test_not_multipart(served: Served) -> None:
     for boundary in ("", "; boundary=x"):
         headers = {"Content-Type": f"multipart/form-data{boundary}"}
         problem(served.http.post("/v1/plan", content=b"--y\r\n", headers=headers), "invalid-body")
+
+
+@pytest.mark.parametrize("size", [LARGE_BYTES - 1000, LARGE_BYTES + 1000])
+@pytest.mark.parametrize("name", ["read_json", "read_msgpack"])
+def test_large_bodies_are_read_beside_the_loop(
+    served: Served, monkeypatch: pytest.MonkeyPatch, size: int, name: str
+) -> None:
+    read = getattr(payloads, name)
+    threads: list[str] = []
+
+    def watched(content: bytes) -> Any:
+        threads.append(threading.current_thread().name)
+        return read(content)
+
+    monkeypatch.setattr(payloads, name, watched)
+    document = {"x": "y" * size}
+    headers = PACKED if name == "read_msgpack" else {"Content-Type": "application/json"}
+    content = msgpack.packb(document) if name == "read_msgpack" else json.dumps(document).encode()
+    assert served.http.post("/v1/plan", content=content, headers=headers).status_code == 422
+    assert [each.startswith("looktwice-bodies") for each in threads] == [size > LARGE_BYTES]

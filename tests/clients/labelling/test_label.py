@@ -179,11 +179,13 @@ def test_labels_of_another_teacher_are_others(ledger: Ledger, file: Path) -> Non
 
 def test_scenes_whose_annotations_have_changed_are_asked_about_anew(ledger: Ledger, file: Path) -> None:
     assert labelled(ledger, file, RuleTeacher())[1].done == SCENES
+    tagged, repainted, *same = read_scenes(file)
+    (agent, *others) = repainted.agents
     changed = [
-        replace(each, tags=each.tags ^ {"turn"}) if number < 2 else each
-        for number, each in enumerate(read_scenes(file))
+        replace(tagged, tags=tagged.tags ^ {"turn"}),
+        replace(repainted, agents=(replace(agent, width_m=agent.width_m + 0.1), *others)),
     ]
-    write_scenes(file, iter(changed))
+    write_scenes(file, iter([*changed, *same]))
     again = labelled(ledger, file, RuleTeacher())[1]
     assert (again.done, again.earlier) == (2, SCENES - 2)
 
