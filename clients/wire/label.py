@@ -11,7 +11,6 @@ from clients.wire.controls import PlanGiven
 from clients.wire.scene import Scene
 from clients.wire.scenes import Agent
 
-
 LaneLine = Annotated[list[NearbyPoint], Field(min_length=2, max_length=2000, fail_fast=True)]
 
 
