@@ -60,11 +60,9 @@ def test_the_checkpoint_is_small_and_tells_how_it_was_made(served: Served[TorchE
 
 
 def test_it_thinks_by_itself_now_and_then(planner: PlannerClient) -> None:
-    draws, reasons = [], []
-    for labelled in BUNDLED:
-        drawn = planner.plan(labelled.scene, wire.Controls(n=12, seed=2)).draws
-        draws += drawn
-        reasons.append({draw.thinking for draw in drawn if draw.thinking is not None})
+    drawn = [planner.plan(labelled.scene, wire.Controls(n=12, seed=2)).draws for labelled in BUNDLED]
+    reasons = [{draw.thinking for draw in draws if draw.thinking is not None} for draws in drawn]
+    draws = [draw for each in drawn for draw in each]
     thoughts = [draw for draw in draws if draw.thinking is not None]
     assert 0.02 < len(thoughts) / len(draws) < 0.6
     assert all(draw.revised_plan is not None and draw.plan is not None for draw in thoughts)
