@@ -28,7 +28,7 @@ class Agent(Answered):
 class NextImage(Answered):
     """What one camera saw half a second after a scene."""
 
-    camera: Camera
+    camera: Camera = Field(description="Which camera.")
     image: str = Field(description="JPEG, PNG or WebP in base64.")
 
 
