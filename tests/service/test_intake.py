@@ -65,7 +65,7 @@ def test_any_two_rows_out_of_order_are_found(row: int) -> None:
 
 def test_geometry_that_is_checked_is_not_checked_again() -> None:
     geometry = geometry_of(with_history(driven(np.full(15, 8.0))).scene)
-    unchecked = with_history(driven(np.full(15, 800.0)))
+    unchecked = with_history(driven(np.full(15, 400.0)))
     scene = engine_request(unchecked, CARD, "id", geometry).scene
     np.testing.assert_array_equal(scene.history, geometry.history)
     with pytest.raises(ProblemError, match="is it 10 Hz and metres"):
