@@ -58,7 +58,8 @@ class Recipe:
         tracks_share, mirror_share, blur_share: shares of the examples with tracks, mirrored, and with no
             history but the present speed; see `Item`.
         picture_share: share of the examples with pictures half a second ahead that are taught one of them.
-        own_plans: learn trajectories behind plans of the model's own too, see `OwnPlans`.
+        own_plans: learn trajectories behind plans of the model's own too, where it has small planners to draw
+            them from, see `OwnPlans`.
         error_weight: nats that a metre of a code's expected error counts.
         head_weight: of a regression of the trajectory where its first code is written.
         reflections: what becomes of the reflections of a build: ``learned`` as counterfactual examples, or

@@ -234,6 +234,10 @@ def _prepare(
         reading = IntentLearner(loaded.model, loaded.codec, source)
         read = None if vision is None else read_facts(loaded.model, examples, vision, recipe.seed)
         return reading, IntentDataset(examples, read, recipe.route_share, recipe.seed), None, collate_intents
+    has_planners = loaded.model.resampler is not None and loaded.model.track_reader is not None
+    own_plans = None
+    if recipe.own_plans and has_planners:
+        own_plans = OwnPlans(loaded.model, examples, vision, recipe.seed)
     responses = ResponseDataset(
         examples,
         loaded.codec,
@@ -243,7 +247,7 @@ def _prepare(
         pictures=recipe.pictures,
         vision=vision,
         reflections=() if on_examples is None else on_examples.reflections,
-        own_plans=OwnPlans(loaded.model, examples, vision, recipe.seed) if recipe.own_plans else None,
+        own_plans=own_plans,
         visual_codes=loaded.visual_codes,
         seed=recipe.seed,
     )
