@@ -121,14 +121,14 @@ def trained(source: Path, reflections: Path, target: Path) -> Result:
 def test_a_full_disk_is_a_message_and_loses_nothing(rolled: Path, tmp_path: Path) -> None:
     build = tmp_path / "build"
     shutil.copytree(rolled, build)
-    # No file may grow beyond 40 kB: the ledger can be opened, and is full after a few labels.
-    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))\n"
+    # No file may grow beyond so many bytes: the ledger can be opened, and is full after a few labels.
+    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({0}, {0}))\n"
     begin = "from service.cli.commands import app; app()"
-    for arguments in (
-        ("label", build, SCENES, "--seed", 7),
-        ("export", build, "--form", "messages", "--scenes", SCENES, "--to", tmp_path / "m"),
+    for limit, arguments in (
+        (40_000, ("label", build, SCENES, "--seed", 7)),
+        (500, ("export", build, "--form", "messages", "--scenes", SCENES, "--to", tmp_path / "m")),
     ):
-        command = [sys.executable, "-c", full + begin, "build", *map(str, arguments)]
+        command = [sys.executable, "-c", full.format(limit) + begin, "build", *map(str, arguments)]
         stopped = subprocess.run(command, capture_output=True, text=True, check=False)
         assert stopped.returncode == 2, stopped.stderr
         assert "Traceback" not in stopped.stderr
