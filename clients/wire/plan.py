@@ -79,6 +79,39 @@ class Logprobs(Answered):
     )
 
 
+# What draws of a scene and looks at a given plan tell alike.
+Reasoning = Annotated[str | None, Field(description="The reasoning; null without a second look.")]
+RevisedPlan = Annotated[
+    Plan | None, Field(description="The plan after reasoning; null without a second look.")
+]
+CutOfDraw = Annotated[
+    Cut | None,
+    Field(
+        description="What the deadline did to the second look: skipped, shortened, or replaced by the draft."
+    ),
+]
+Consistent = Annotated[
+    bool | None,
+    Field(description="Whether the parts of the draw agree; null where nothing can be said."),
+]
+Disagreements = Annotated[
+    list[str],
+    Field(
+        description="Which parts do not: plan_trajectory (the trajectory does something else than the plan "
+        "it follows), reason_change (the revised plan does not change as the reasoning asks for)."
+    ),
+]
+ReasonsInView = Annotated[
+    list[str] | None,
+    Field(
+        description="The statements that the reflection could make, by what is in view; null without a "
+        "reflection, and where it could make any."
+    ),
+]
+TokenCounts = Annotated[dict[str, int], Field(description="Tokens per section of the response.")]
+LogprobsOfDraw = Annotated[Logprobs | None, Field(description="Null unless asked for.")]
+
+
 class Draw(Answered):
     """One of the n responses of a scene."""
 
@@ -86,34 +119,20 @@ class Draw(Answered):
     plan: Plan | None = Field(description="The first plan; null where the format has none.")
     branch: Branch | None = Field(description="Action: (direct) or Thinking: (a second look was taken).")
     think_probability: Probability | None = Field(description="Probability of Thinking: at the branch.")
-    thinking: str | None = Field(description="The reasoning; null without a second look.")
-    revised_plan: Plan | None = Field(description="The plan after reasoning; null without a second look.")
+    thinking: Reasoning
+    revised_plan: RevisedPlan
     trajectory: Poses
     times_s: TimesS = None
     draft_trajectory: Poses | None = Field(
         default=None,
         description="Where the first plan would have led; made beside a second look under a deadline.",
     )
-    cut: Cut | None = Field(
-        default=None,
-        description="What the deadline did to the second look: skipped, shortened, or replaced by the draft.",
-    )
-    consistent: bool | None = Field(
-        default=None,
-        description="Whether the parts of the draw agree; null where nothing can be said.",
-    )
-    disagreements: list[str] = Field(
-        default_factory=list,
-        description="Which parts do not: plan_trajectory (the trajectory does something else than the plan "
-        "it follows), reason_change (the revised plan does not change as the reasoning asks for).",
-    )
-    reasons: list[str] | None = Field(
-        default=None,
-        description="The statements that the reflection could make, by what is in view; null without a "
-        "reflection, and where it could make any.",
-    )
-    tokens: dict[str, int] = Field(description="Tokens per section of the response.")
-    logprobs: Logprobs | None = Field(default=None, description="Null unless asked for.")
+    cut: CutOfDraw = None
+    consistent: Consistent = None
+    disagreements: Disagreements = Field(default_factory=list)
+    reasons: ReasonsInView = None
+    tokens: TokenCounts
+    logprobs: LogprobsOfDraw = None
 
     _timed = model_validator(mode="after")(check_times)
 

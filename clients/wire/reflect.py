@@ -8,7 +8,19 @@ from pydantic import Field, model_validator
 
 from clients.wire.base import Answered, Asked, ModelName, Poses, Probability, TimesS, check_times
 from clients.wire.controls import PlanGiven, ReflectControls
-from clients.wire.plan import Cut, Deadline, Logprobs, Plan, Timing
+from clients.wire.plan import (
+    Consistent,
+    CutOfDraw,
+    Deadline,
+    Disagreements,
+    LogprobsOfDraw,
+    Plan,
+    Reasoning,
+    ReasonsInView,
+    RevisedPlan,
+    Timing,
+    TokenCounts,
+)
 from clients.wire.scene import Scene
 
 Group = Literal["longitudinal", "lateral", "lane"]
@@ -45,34 +57,20 @@ class Reflection(Answered):
     decision: Literal["keep", "revise"] = Field(
         description="keep where the model would drive by the given plan, revise where it says otherwise."
     )
-    thinking: str | None = Field(description="The reasoning; null without a second look.")
-    revised_plan: Plan | None = Field(description="The plan after reasoning; null without a second look.")
+    thinking: Reasoning
+    revised_plan: RevisedPlan
     plan_iou: float = Field(
         ge=0, le=1, description="Intersection over union of given and revised plan, in bins of 0.1 s."
     )
     changes: list[PlanChange] = Field(description="Where they do not, track by track; empty when kept.")
     trajectory: Poses
     times_s: TimesS = None
-    cut: Cut | None = Field(
-        default=None,
-        description="What the deadline did to the second look: skipped, shortened, or replaced by the draft.",
-    )
-    consistent: bool | None = Field(
-        default=None,
-        description="Whether the parts of the draw agree; null where nothing can be said.",
-    )
-    disagreements: list[str] = Field(
-        default_factory=list,
-        description="Which parts do not: plan_trajectory (the trajectory does something else than the plan "
-        "it follows), reason_change (the revised plan does not change as the reasoning asks for).",
-    )
-    reasons: list[str] | None = Field(
-        default=None,
-        description="The statements that the reflection could make, by what is in view; null without a "
-        "reflection, and where it could make any.",
-    )
-    tokens: dict[str, int] = Field(description="Tokens per section of the response.")
-    logprobs: Logprobs | None = Field(default=None, description="Null unless asked for.")
+    cut: CutOfDraw = None
+    consistent: Consistent = None
+    disagreements: Disagreements = Field(default_factory=list)
+    reasons: ReasonsInView = None
+    tokens: TokenCounts
+    logprobs: LogprobsOfDraw = None
 
     _timed = model_validator(mode="after")(check_times)
 
