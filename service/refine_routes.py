@@ -63,10 +63,10 @@ def refine_router(parts: Parts) -> APIRouter:
 
         async def begin() -> Refining:
             # On a thread: numbers of a few ms must not hold up the answers of others.
-            return await asyncio.to_thread(refining_of, asked, parts.lifecycle.card)
+            return await asyncio.to_thread(refining_of, asked, parts.lifecycle.card, arrival.request_id)
 
         async def answer(refining: Refining, planned: Planned) -> wire_refine.RefineResponse:
-            told = refining.feedback
+            told = refining.judged.feedback
             if told.correct is not None:
                 parts.metrics.feedback_told(told.written_by, correct=told.correct)
             return await asyncio.to_thread(refine_answer, refining, planned, arrival)
@@ -83,7 +83,7 @@ def refine_router(parts: Parts) -> APIRouter:
         return await streamed(
             request,
             parts.planning.events(refining.planning, arrival, refining.geometry),
-            RefineTeller(refining, arrival),
+            RefineTeller(refining),
             lambda told: server_sent(told, lambda planned: answer(refining, planned), arrival.request_id),
             parts.metrics,
         )

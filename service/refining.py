@@ -62,20 +62,18 @@ class Refining:
         format: that refines it.
         planning: what the engine is asked.
         geometry: of the scene, as the model takes it.
-        feedback: what it is told of the draft.
         world: that plans are scored in; None where nothing around is known.
-        before: the draft's scores in it.
+        judged: what is known of the draft before it is refined.
     """
 
     format: str
     planning: wire.PlanRequest
     geometry: Geometry
-    feedback: wire_refine.DraftFeedback
     world: World | None
-    before: Scores | None
+    judged: wire_refine.DraftJudged
 
 
-def refining_of(asked: wire_refine.RefineRequest, card: ModelCard) -> Refining:
+def refining_of(asked: wire_refine.RefineRequest, card: ModelCard, request_id: str) -> Refining:
     """What a request comes to, before the engine hears of it.
 
     Raises:
@@ -114,7 +112,8 @@ def refining_of(asked: wire_refine.RefineRequest, card: ModelCard) -> Refining:
         ),
         stream=asked.stream,
     )
-    return Refining(format, planning, geometry, feedback, world, before)
+    judged = _judged(feedback, world, before, request_id)
+    return Refining(format, planning, geometry, world, judged)
 
 
 def refining_format(card: ModelCard) -> str:
@@ -133,7 +132,6 @@ def refining_format(card: ModelCard) -> str:
 def refine_answer(refining: Refining, planned: Planned, arrival: Arrival) -> wire_refine.RefineResponse:
     """The answer of POST /v1/refine, once the refinements are there; they are scored here."""
     answer = plan_answer(planned, arrival.request_id)
-    judged = draft_judged(refining, arrival)
     after = list[TrajectoryScore | None]([None] * len(answer.draws))
     if refining.world is not None:
         after = _after(refining.world, planned.draws, arrival.request_id)
@@ -146,7 +144,7 @@ def refine_answer(refining: Refining, planned: Planned, arrival: Arrival) -> wir
         request_id=answer.request_id,
         model=answer.model,
         format=refining.format,
-        **dict(judged),
+        **dict(refining.judged),
         draws=[
             wire_refine.Refinement(**dict(draw), after=after[place])
             for place, draw in enumerate(answer.draws)
@@ -157,25 +155,26 @@ def refine_answer(refining: Refining, planned: Planned, arrival: Arrival) -> wir
     )
 
 
-def draft_judged(refining: Refining, arrival: Arrival) -> wire_refine.DraftJudged:
-    """What is known of the draft before it is refined."""
-    before = None
-    if refining.world is not None and refining.before is not None:
-        before = score_answer(refining.world, refining.before, arrival.request_id)
+def _judged(
+    feedback: wire_refine.DraftFeedback, world: World | None, before: Scores | None, request_id: str
+) -> wire_refine.DraftJudged:
+    scored = None
+    if world is not None and before is not None:
+        scored = score_answer(world, before, request_id)
     return wire_refine.DraftJudged(
-        feedback=refining.feedback,
-        foresight=None if refining.world is None else CONSTANT_VELOCITY,
+        feedback=feedback,
+        foresight=None if world is None else CONSTANT_VELOCITY,
         version=VERSION,
-        missing=[] if before is None else before.missing,
-        before=None if before is None else before.scores[0],
+        missing=[] if scored is None else scored.missing,
+        before=None if scored is None else scored.scores[0],
     )
 
 
 class RefineTeller:
     """Tells of the draft first, then of its refinements as of any draws."""
 
-    def __init__(self, refining: Refining, arrival: Arrival) -> None:
-        self._judged = draft_judged(refining, arrival)
+    def __init__(self, refining: Refining) -> None:
+        self._judged = refining.judged
         self._tell = PlanTeller(refining.format)
 
     async def __call__(self, event: Happened) -> list[tuple[str, Written | wire_refine.DraftJudged]]:
