@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -44,7 +43,6 @@ class OwnPlans:
     def __init__(
         self, vla: LookTwiceVla, examples: Examples, vision: VisionCache | None, seed: int = 0
     ) -> None:
-        self._has_route: npt.NDArray[np.bool_] = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
         read = None if vision is None else read_facts(vla, examples, vision, seed)
         data = IntentDataset(examples, read, route_share=1.0)
         self._readings = {}
@@ -61,7 +59,7 @@ class OwnPlans:
         Raises:
             KeyError: the checkpoint has no planner for what the prompt shows.
         """
-        scores = self._readings[tracks].scores(index, int(mirror), int(route and self._has_route[index]))
+        scores = self._readings[tracks].scores(index, int(mirror), int(route))
         # One draw of noise a word, not one a tick: a plan is in doubt as a whole.
         scores = scores + random.gumbel(size=(1, scores.shape[1])).astype(np.float32)
         tracks_of_groups = {}
