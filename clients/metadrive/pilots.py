@@ -75,6 +75,7 @@ class ServicePilot:
         controls: of every request; the seed goes up by one from plan to plan.
         route: whether the model is told the route.
         tracks: whether it is told the tracks of the objects around.
+        format: a response format that the model writes; its first where None.
     """
 
     needs_pictures = True
@@ -87,9 +88,10 @@ class ServicePilot:
         *,
         route: bool = True,
         tracks: bool = False,
+        format: str | None = None,
     ) -> None:
         self._planner, self.name, self._controls = planner, name, controls
-        self._route, self._tracks = route, tracks
+        self._route, self._tracks, self._format = route, tracks, format
         self._asked = 0
 
     def plan(self, scene: Scene) -> Planned:
@@ -102,7 +104,7 @@ class ServicePilot:
             tracks=scene.tracks if self._tracks else None,
         )
         began_s = time.perf_counter()
-        result = self._planner.plan(asked, controls)
+        result = self._planner.plan(asked, controls, format=self._format)
         milliseconds = 1000 * (time.perf_counter() - began_s)
         trajectories = np.stack([draw.at_10_hz for draw in result.draws])
         chosen = result.agreed

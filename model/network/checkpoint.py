@@ -8,6 +8,7 @@ repository needs (`model.network.repository`).
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -89,6 +90,8 @@ def create_nano(
         model = LookTwiceVla(config)
         write_code_embeddings(model, codec, vocabulary)
         write_number_embeddings(model, vocabulary, set(needed_numbers(model.settings)))
+    if model.draft_books is not None:
+        model.draft_books.fill(codec)
     save(folder, model, vocabulary, codec)
 
 
@@ -280,6 +283,29 @@ def with_formats(loaded: Loaded, formats: Sequence[str], *, seed: int = 0) -> Lo
         inputs=InputBuilder(vocabulary, settings),
         card=replace(loaded.card, formats=settings.formats),
     )
+
+
+def with_drafts(loaded: Loaded, stages: int, *, seed: int = 0) -> Loaded:
+    """A checkpoint whose small planners write drafts of so many codes, to be trained.
+
+    Args:
+        loaded: one that writes none; it stays as it is.
+        stages: at most 6.
+        seed: of the new weights.
+    """
+    queries = loaded.settings.scene_queries
+    wider = replace(loaded.settings, draft_tokens=stages)
+    if queries:
+        wider = replace(wider, scene_tokens=queries + wider.intent_tokens)
+    config = with_settings(copy.deepcopy(loaded.model.config), wider, loaded.vocabulary)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        model = LookTwiceVla(config)
+    model.load_state_dict(loaded.model.state_dict(), strict=False)
+    assert model.draft_books is not None
+    model.draft_books.fill(loaded.codec)
+    model.train(False)
+    return replace(loaded, model=model, inputs=InputBuilder(loaded.vocabulary, wider))
 
 
 @torch.no_grad()

@@ -31,7 +31,8 @@ _KNOTS_S: Final = np.array([0.0, 0.4, 0.8, 1.3, 1.9, 2.6, 3.4, 4.3, 5.3, HORIZON
 HEADING_WEIGHT_M: Final = EGO_LENGTH_M / 3
 """Metres that a radian of heading counts. It moves a corner of the ego's box by half its length; a third
 costs 0.1 degrees of heading on MetaDrive scenes and wins a tenth of the displacement error."""
-_DIMENSIONS: Final = 20
+DIMENSIONS: Final = 20
+"""Of the space that trajectories are quantised in, where there are examples enough to fit them."""
 _MAX_FIT_VECTORS: Final = 80_000
 _REFINEMENTS: Final = 3
 _TIMES_S: Final = STEP_S * np.arange(1, FUTURE_STEPS + 1, dtype=np.float64)
@@ -83,7 +84,7 @@ class TrajectoryCodec:
         in_space = curves @ space
         mean = in_space.mean(axis=0)
         _, _, directions = np.linalg.svd(in_space - mean, full_matrices=False)
-        kept = directions[:_DIMENSIONS]
+        kept = directions[:DIMENSIONS]
         vectors = ((in_space - mean) @ kept.T).astype(np.float32)
         books = quantiser.fit_codebooks(vectors, codes, size, rounds=_REFINEMENTS, seed=seed)
         return cls((space @ mean).astype(np.float32), (kept @ space.T).astype(np.float32), books)

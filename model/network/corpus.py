@@ -15,7 +15,7 @@ from model.driving.scene import CAMERAS
 from model.families.cf_vla.format import ACTION, PLAN_START, THINKING
 from model.families.registry import family_named
 from model.network.prompts import SYSTEM, prompt_text
-from model.network.settings import LEAST_SCENE_TOKENS, VlaSettings
+from model.network.settings import NANO_SETTINGS, VlaSettings
 
 _SLOTS: Final[dict[str, tuple[str, ...]]] = {
     "agent": (
@@ -297,6 +297,6 @@ def nano_corpus() -> Iterator[str]:
     for format in _FORMATS:
         for route in (False, True):
             # Often enough that the prompt's own words become single tokens.
-            for tokens in (0, LEAST_SCENE_TOKENS):
+            for tokens in (0, NANO_SETTINGS.scene_tokens):
                 settings = VlaSettings(cameras=CAMERAS, scene_tokens=tokens)
                 yield from ["".join(prompt_text(format, settings, route=route, tracks=route))] * 20

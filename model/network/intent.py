@@ -3,24 +3,29 @@
 A decoder learns from a few responses a second; a multilayer perceptron over history, route and what is
 around learns from thousands, and plans in metres far better than a decoder that starts from nothing. So
 this trunk learns first (recipes ``read-tracks`` and ``read-scene``), and its state stands in the prompt as
-continuous tokens: the decoder only has to put it into words and codes.
+continuous tokens: the decoder only has to put it into words and codes. A draft, the trajectory that the state
+amounts to, stands beside it in the decoder's own codes.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from model.driving.tracks import MAX_TRACKS
 from model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS, ROUTE_SPACING_M, STEP_S
+from model.network.codec import DIMENSIONS, TrajectoryCodec
 from model.network.track_features import TRACK_FEATURES
+from model.network.trajectory_head import spread_of
 
 INTENT_TOKENS: Final = 2
-"""Tokens of the prompt that one state becomes."""
+"""Tokens of the prompt that one state becomes, without those of its draft."""
 _TRACK_WIDTH: Final = 96
 _WIDTH: Final = 256
+_SOFTNESS: Final = 0.25
+"""Width of a draft's mixtures, in mean squared distances from a code to the nearest other one."""
 _POSE_SCALE: Final = (10.0, 2.0, 0.3)
 _OUTLIER: Final = 6.0
 MOTION_FEATURES: Final = 3 * (2 * HISTORY_STEPS - 1) + 2 * 2 * ROUTE_POINTS + 1
@@ -102,28 +107,112 @@ class IntentTrunk(nn.Module):
         return state
 
 
-class TrackReader(nn.Module):
+class DraftCodes(NamedTuple):
+    """The codes that drafts are written in; a stage is one token of the prompt.
+
+    Attributes:
+        books: [stages, K, d], see `TrajectoryCodec`.
+        widths: [stages], how far off, in squares, a code still has a share in a mixture.
+        embeddings: [stages, K, hidden], the decoder's own of these codes.
+    """
+
+    books: Tensor
+    widths: Tensor
+    embeddings: Tensor
+
+    def tokens(self, drafts: Tensor) -> Tensor:
+        """Tokens [b, stages, hidden] of drafts [b, d], in spreads of the first stage's codes.
+
+        Each mixes the embeddings of the codes nearest to what the stages before it left over: unlike the
+        nearest code alone, a mixture changes no more than the draft does, in every engine alike.
+        """
+        books, widths = self.books.float(), self.widths.float()
+        left = drafts.float() * spread_of(books[0])
+        tokens = []
+        for book, width, embeddings in zip(books, widths, self.embeddings, strict=True):
+            nearness = (2 * left @ book.T - book.square().sum(dim=1)) / width
+            shares = nearness.softmax(dim=1)
+            tokens.append(shares.to(embeddings.dtype) @ embeddings)
+            left = left - shares @ book
+        return torch.stack(tokens, dim=1)
+
+
+class DraftBooks(nn.Module):
+    """The first codebooks of a checkpoint's codec, where its network can reach them.
+
+    Args:
+        stages: how many.
+        size: codes a stage.
+    """
+
+    def __init__(self, stages: int, size: int) -> None:
+        super().__init__()
+        # Weights and no buffers: every engine loads those. Nothing trains them.
+        self.books = nn.Parameter(torch.zeros(stages, size, DIMENSIONS), requires_grad=False)
+        self.widths = nn.Parameter(torch.ones(stages), requires_grad=False)
+
+    @torch.no_grad()
+    def fill(self, codec: TrajectoryCodec) -> None:
+        """Take them from ``codec``; raises ValueError for one in a space of other dimensions."""
+        if codec.books.shape[2] != DIMENSIONS:
+            raise ValueError(f"drafts need a codec of {DIMENSIONS} dimensions, not {codec.books.shape[2]}")
+        self.books.copy_(torch.from_numpy(codec.books[: len(self.books)]))
+        for width, book in zip(self.widths, self.books.float(), strict=True):
+            apart = torch.cdist(book, book).fill_diagonal_(torch.inf).amin(dim=1)
+            width.fill_(_SOFTNESS * apart.square().mean().clamp_min(1e-3))
+
+
+class IntentReader(nn.Module):
+    """A small planner whose state stands in the prompt.
+
+    Args:
+        hidden_size: of a token.
+        around: size of the vector of what is around, see `IntentTrunk`.
+        drafts: whether its draft stands there too.
+    """
+
+    def __init__(self, hidden_size: int, around: int, *, drafts: bool) -> None:
+        super().__init__()
+        self.trunk = IntentTrunk(around)
+        self.tokens = nn.Linear(IntentTrunk.width, INTENT_TOKENS * hidden_size)
+        self.draft = nn.Linear(IntentTrunk.width, DIMENSIONS) if drafts else None
+
+    def written(self, state: Tensor, codes: DraftCodes | None) -> Tensor:
+        """A state [b, 256] as tokens [b, `INTENT_TOKENS` and those of the draft, hidden]."""
+        tokens: Tensor = self.tokens(state)
+        tokens = tokens.view(len(tokens), INTENT_TOKENS, tokens.shape[1] // INTENT_TOKENS)
+        if self.draft is None or codes is None:
+            return tokens
+        return torch.cat([tokens, codes.tokens(self.draft(state)).to(tokens.dtype)], dim=1)
+
+
+class TrackReader(IntentReader):
     """A scene's tracks as tokens of the prompt, read with the ego's history and route in mind."""
 
-    def __init__(self, hidden_size: int) -> None:
-        super().__init__()
+    def __init__(self, hidden_size: int, *, drafts: bool = False) -> None:
+        super().__init__(hidden_size, TrackPool.size, drafts=drafts)
         self.pool = TrackPool()
-        self.trunk = IntentTrunk(TrackPool.size)
-        self.tokens = nn.Linear(IntentTrunk.width, INTENT_TOKENS * hidden_size)
 
     def state(self, tracks: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
         """What to do, [b, 256]; see `forward`."""
         state: Tensor = self.trunk(history, route, has_route, self.pool(tracks, history))
         return state
 
-    def forward(self, tracks: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
-        """Tokens [b, INTENT_TOKENS, hidden].
+    def forward(
+        self,
+        tracks: Tensor,
+        history: Tensor,
+        route: Tensor,
+        has_route: Tensor,
+        codes: DraftCodes | None = None,
+    ) -> Tensor:
+        """Tokens of the prompt; see `IntentReader.written`.
 
         Args:
             tracks: [b, 16, features] of `track_features`.
             history: [b, 16, 4].
             route: [b, 20, 2]; rows without one are ignored.
             has_route: bool [b].
+            codes: that drafts are written in, where they are.
         """
-        tokens: Tensor = self.tokens(self.state(tracks, history, route, has_route))
-        return tokens.view(len(tokens), INTENT_TOKENS, tokens.shape[1] // INTENT_TOKENS)
+        return self.written(self.state(tracks, history, route, has_route), codes)

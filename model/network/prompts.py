@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 from model.families.registry import family_named
-from model.network.intent import INTENT_TOKENS
 from model.network.settings import VlaSettings
 from model.network.vocabulary import (
     HISTORY,
@@ -47,7 +46,7 @@ def prompt_text(format: str, settings: VlaSettings, *, route: bool, tracks: bool
         f"{IM_START}system\n{SYSTEM}{IM_END}\n"
         f"{IM_START}user\n{family_named(format).task}\n"
         f"{_seen(settings)}"
-        f"{motion_text(route=route, tracks=tracks)}",
+        f"{motion_text(settings, route=route, tracks=tracks)}",
         f"{IM_END}\n{IM_START}assistant\n",
     )
 
@@ -58,11 +57,12 @@ def chat_template(settings: VlaSettings) -> str:
     A message's content is text or a list of ``text``, ``video`` (all clips together, in the checkpoint's
     order of cameras), ``history``, ``route`` and ``tracks``; the task comes first.
     """
+    history = motion_text(settings, route=False)
     written = {
         "video": _seen(settings),
-        "history": motion_text(route=False),
-        "route": motion_text(route=True).removeprefix(motion_text(route=False)),
-        "tracks": motion_text(route=False, tracks=True).removeprefix(motion_text(route=False)),
+        "history": history,
+        "route": motion_text(settings, route=True).removeprefix(history),
+        "tracks": motion_text(settings, route=False, tracks=True).removeprefix(history),
     }
     parts = "".join(f"{{% elif part.type == {kind!r} %}}{{{{ {text!r} }}}}" for kind, text in written.items())
     return (
@@ -89,8 +89,8 @@ def _seen(settings: VlaSettings) -> str:
     return "".join(f"{camera}:{clip}\n" for camera in settings.cameras)
 
 
-def motion_text(*, route: bool, tracks: bool = False) -> str:
+def motion_text(settings: VlaSettings, *, route: bool, tracks: bool = False) -> str:
     """The prompt's lines about the ego's motion and that of tracks: all there is without pictures."""
     way = f"route:{ROUTE_START}{ROUTE}{ROUTE_END}\n" if route else ""
-    around = f"tracks:{TRACKS_START}{TRACK * INTENT_TOKENS}{TRACKS_END}\n" if tracks else ""
+    around = f"tracks:{TRACKS_START}{TRACK * settings.intent_tokens}{TRACKS_END}\n" if tracks else ""
     return f"history:{HISTORY_START}{HISTORY}{HISTORY_END}\n{way}{around}"

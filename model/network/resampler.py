@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from model.driving.facts import FACTS
 from model.network.encoders import HistoryEncoder, RouteEncoder
 from model.network.fact_reader import FactReader, likely, weighed
-from model.network.intent import INTENT_TOKENS, IntentTrunk
+from model.network.intent import DraftCodes, IntentReader
 
 _HEADS: Final = 4
 _LAYERS: Final = 2
@@ -29,12 +29,13 @@ class SceneResampler(nn.Module):
     Args:
         hidden_size: of vision tokens and of what comes out.
         vision_tokens: of a scene, all cameras together.
-        scene_tokens: how many come out: one for each query, and `INTENT_TOKENS` that say what to do about it.
+        queries: how many. A token comes out for each, and those that say what to do about it.
+        drafts: whether a draft is among them.
     """
 
-    def __init__(self, hidden_size: int, vision_tokens: int, scene_tokens: int) -> None:
+    def __init__(self, hidden_size: int, vision_tokens: int, queries: int, *, drafts: bool = False) -> None:
         super().__init__()
-        self.queries = nn.Parameter(0.3 * torch.randn(scene_tokens - INTENT_TOKENS, hidden_size))
+        self.queries = nn.Parameter(0.3 * torch.randn(queries, hidden_size))
         self.places = nn.Parameter(0.02 * torch.randn(vision_tokens, hidden_size))
         self.history_encoder = HistoryEncoder(hidden_size)
         self.route_encoder = RouteEncoder(hidden_size)
@@ -43,13 +44,20 @@ class SceneResampler(nn.Module):
         self.layers = nn.ModuleList(_CrossLayer(hidden_size) for _ in range(_LAYERS))
         self.norm = nn.RMSNorm(hidden_size, eps=_EPSILON)
         self.facts = FactReader(hidden_size)
-        self.intent = _SceneIntent(hidden_size)
+        self.intent = _SceneIntent(hidden_size, len(FACTS), drafts=drafts)
 
-    def forward(self, vision_tokens: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
-        """What stands in the prompt, [b, scene_tokens, hidden]; see `gather`."""
+    def forward(
+        self,
+        vision_tokens: Tensor,
+        history: Tensor,
+        route: Tensor,
+        has_route: Tensor,
+        codes: DraftCodes | None = None,
+    ) -> Tensor:
+        """What stands in the prompt, [b, scene_tokens, hidden]; see `gather` and `IntentReader.written`."""
         gathered = self.gather(vision_tokens, history, route, has_route)
-        facts = likely(self.facts(gathered))
-        return torch.cat([gathered, self.intent(facts, history, route, has_route)], dim=1)
+        state = self.intent.state(likely(self.facts(gathered)), history, route, has_route)
+        return torch.cat([gathered, self.intent.written(state, codes)], dim=1)
 
     def gather(self, vision_tokens: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
         """What the queries gather, [b, queries, hidden].
@@ -70,23 +78,13 @@ class SceneResampler(nn.Module):
         return gathered
 
 
-class _SceneIntent(nn.Module):
+class _SceneIntent(IntentReader):
     """What to do about the facts that are read."""
-
-    def __init__(self, hidden_size: int) -> None:
-        super().__init__()
-        self.trunk = IntentTrunk(len(FACTS))
-        self.tokens = nn.Linear(IntentTrunk.width, INTENT_TOKENS * hidden_size)
 
     def state(self, facts: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
         """What to do, [b, 256], about facts [b, len(FACTS)] with their probabilities; see `likely`."""
         state: Tensor = self.trunk(history, route, has_route, weighed(facts))
         return state
-
-    def forward(self, facts: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
-        """Tokens [b, INTENT_TOKENS, hidden]; see `state`."""
-        tokens: Tensor = self.tokens(self.state(facts, history, route, has_route))
-        return tokens.view(len(tokens), INTENT_TOKENS, tokens.shape[1] // INTENT_TOKENS)
 
 
 class _CrossLayer(nn.Module):

@@ -9,11 +9,11 @@ from typing import Any, Final, get_args
 from model.driving.facts import FACT_GROUPS
 from model.driving.phrases import ReflectionLanguage
 from model.driving.scene import CAMERAS, CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE
+from model.families.trajectory_codes import CODES
 from model.network.intent import INTENT_TOKENS
 
 CONFIG_KEY: Final = "looktwice"
 """Where these settings lie in a checkpoint's ``config.json``."""
-LEAST_SCENE_TOKENS: Final = len(FACT_GROUPS) + INTENT_TOKENS
 
 
 class SettingsError(ValueError):
@@ -33,6 +33,8 @@ class VlaSettings:
         codec_size: trajectory codes per stage.
         with_route: whether it has a route encoder.
         with_tracks: whether it has a reader of tracks.
+        draft_tokens: of the prompt that tell the trajectory which a small planner's state amounts to
+            (`model.network.intent`); 0 for none.
         scene_tokens: 0 where every vision token stands in the prompt, as in Qwen2.5-VL; otherwise a
             resampler brings those of all cameras down to so many.
         patch_size, temporal_patch_size, spatial_merge_size, tokens_per_second: as in the backbone's
@@ -48,6 +50,7 @@ class VlaSettings:
     codec_size: int = 512
     with_route: bool = True
     with_tracks: bool = False
+    draft_tokens: int = 0
     scene_tokens: int = 0
     patch_size: int = 14
     temporal_patch_size: int = 2
@@ -64,9 +67,12 @@ class VlaSettings:
             raise SettingsError(f"temporal_patch_size {self.temporal_patch_size} must divide {CLIP_FRAMES}")
         if unknown := [camera for camera in self.cameras if camera not in CAMERAS]:
             raise SettingsError(f"unknown camera {', '.join(unknown)}; known are {', '.join(CAMERAS)}")
-        if 0 < self.scene_tokens < LEAST_SCENE_TOKENS:
+        if not 0 <= self.draft_tokens <= CODES:
+            raise SettingsError(f"draft_tokens must lie in 0..{CODES}, got {self.draft_tokens}")
+        least = len(FACT_GROUPS) + self.intent_tokens
+        if 0 < self.scene_tokens < least:
             raise SettingsError(
-                f"scene_tokens must be 0 or at least {LEAST_SCENE_TOKENS}, got {self.scene_tokens}: "
+                f"scene_tokens must be 0 or at least {least}, got {self.scene_tokens}: "
                 "every group of facts is read from a token of its own"
             )
         if self.reflection not in (languages := get_args(ReflectionLanguage)):
@@ -97,9 +103,14 @@ class VlaSettings:
         return len(self.cameras) * self.clip_tokens
 
     @property
+    def intent_tokens(self) -> int:
+        """Tokens that the state of a small planner becomes, with its draft."""
+        return INTENT_TOKENS + self.draft_tokens
+
+    @property
     def scene_queries(self) -> int:
         """Queries of the resampler: scene tokens but for those of the intent."""
-        return max(0, self.scene_tokens - INTENT_TOKENS)
+        return max(0, self.scene_tokens - self.intent_tokens)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -113,10 +124,12 @@ class VlaSettings:
         return CLIP_PERIOD_S * self.temporal_patch_size
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-like form for ``config.json``; free text, which older checkpoints write, is not mentioned."""
+        """JSON-like form for ``config.json``; what older checkpoints lack is not mentioned."""
         values = asdict(self)
         if self.reflection == "free_text":
             del values["reflection"]
+        if not self.draft_tokens:
+            del values["draft_tokens"]
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     @classmethod
@@ -145,6 +158,7 @@ NANO_SETTINGS: Final = VlaSettings(
     image_height=168,
     temporal_patch_size=4,
     with_tracks=True,
-    scene_tokens=18,
+    draft_tokens=3,
+    scene_tokens=21,
 )
 """Of the model that is trained from scratch: motion is seen within one patch, over all four frames."""

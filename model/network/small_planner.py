@@ -3,11 +3,12 @@
 The blind planner sees history and route alone: who claims to see must beat it. The teacher sees the tracks
 of everybody around as well: it tells what seeing is worth. Both plan in microseconds and train in minutes.
 A third kind is given facts, true ones or those that were read from pictures: it tells what perception is
-worth to a plan, and drives nowhere.
+worth to a plan, and drives nowhere. A checkpoint whose reader of tracks writes drafts holds a teacher, too.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ from torch import Tensor, nn
 from model.driving.facts import FACTS
 from model.driving.scene import Scene, SceneError
 from model.driving.trajectory import FUTURE_STEPS, FloatArray
+from model.network.card import CARD_FILE, weights_revision
+from model.network.checkpoint import load
 from model.network.codec import CodecError, TrajectoryCodec
 from model.network.intent import IntentTrunk, TrackPool, present_speeds
 from model.network.track_features import track_features
@@ -131,8 +134,15 @@ def small_inputs(scenes: Sequence[Scene], kind: SmallKind) -> SmallInputs:
 
 
 def load_small(folder: Path) -> SmallPlanner:
-    """Read what `SmallPlanner.save` wrote; raises `SmallPlannerError`."""
+    """Read what `SmallPlanner.save` wrote, or a checkpoint's reader of tracks with its drafts.
+
+    Raises:
+        SmallPlannerError: the folder holds neither.
+        CheckpointError: it holds a checkpoint that cannot be read.
+    """
     path = folder / WEIGHTS_FILE
+    if not path.is_file() and (folder / CARD_FILE).is_file():
+        return _reader_of_tracks(folder)
     if not path.is_file():
         raise SmallPlannerError(f"{folder} has no {WEIGHTS_FILE}: train one with `looktwice train blind`")
     try:
@@ -146,3 +156,30 @@ def load_small(folder: Path) -> SmallPlanner:
     except (SafetensorError, CodecError, json.JSONDecodeError, RuntimeError) as error:
         raise SmallPlannerError(f"{path} is damaged: {error}") from error
     return planner.eval()
+
+
+def _reader_of_tracks(folder: Path) -> SmallPlanner:
+    loaded = load(folder)
+    reader = loaded.model.track_reader
+    if reader is None or reader.draft is None:
+        raise SmallPlannerError(
+            f"{folder}: this checkpoint reads no tracks or drafts nothing from them; "
+            "`looktwice train read-tracks` makes one that does"
+        )
+    planner = SmallPlanner("teacher", loaded.codec)
+    assert planner.pool is not None
+    for mine, its in (
+        (planner.pool, reader.pool),
+        (planner.trunk, reader.trunk),
+        (planner.head.best, reader.draft),
+    ):
+        mine.load_state_dict(its.state_dict())
+    return planner.eval()
+
+
+def small_revision(folder: Path) -> str:
+    """12 hexadecimal digits that change with a small planner's weights."""
+    path = folder / WEIGHTS_FILE
+    if not path.is_file():
+        return weights_revision(folder)
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]

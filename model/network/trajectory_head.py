@@ -32,30 +32,35 @@ class Guesses(NamedTuple):
     scores: Tensor
 
 
+def spread_of(book: Tensor) -> Tensor:
+    """How far trajectories lie apart along each axis [d]: the first codebook [K, d] spreads as they do."""
+    return book.std(dim=0, correction=0) + 0.01
+
+
 class TrajectoryHead(nn.Module):
     """Linear maps from a state to trajectories.
 
     Args:
         width: of the states.
         codec: whose space is used: the curves are smooth and begin where the ego is.
+        best: makes the best guess in place of a layer of the head's own.
     """
 
     axes: Tensor
     mean: Tensor
     spread: Tensor
 
-    def __init__(self, width: int, codec: TrajectoryCodec) -> None:
+    def __init__(self, width: int, codec: TrajectoryCodec, best: nn.Linear | None = None) -> None:
         super().__init__()
         axes = torch.from_numpy(codec.axes.copy())
         self.register_buffer("axes", axes)
         self.register_buffer("mean", torch.from_numpy(codec.mean.copy()))
-        # The first codebook spreads as trajectories do.
-        self.register_buffer("spread", torch.from_numpy(codec.books[0].std(axis=0) + 0.01))
-        self.best = nn.Linear(width, len(axes))
+        self.register_buffer("spread", spread_of(torch.from_numpy(codec.books[0])))
+        self.best = best or nn.Linear(width, len(axes))
         self.modes = nn.Linear(width, MODES * len(axes))
         self.scores = nn.Linear(width, MODES)
         # Begin at the mean trajectory, modes around it: a head at random would bend the network to its whims.
-        for layer in (self.best, self.modes, self.scores):
+        for layer in (self.modes, self.scores) if best else (self.best, self.modes, self.scores):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         nn.init.normal_(self.modes.bias)

@@ -230,7 +230,9 @@ class ResponseDataset(Dataset[Sample]):
             prompt = self._inputs.prompt(item.task, situation, tracks=item.tracks)
             return cast("list[int]", prompt.ids.tolist())
         # Without pictures nothing but speed counts, and a trajectory's whole example has thirty tokens.
-        motion = self._vocabulary.encode(motion_text(route=item.route, tracks=item.tracks))
+        motion = self._vocabulary.encode(
+            motion_text(self._inputs.settings, route=item.route, tracks=item.tracks)
+        )
         return [*motion, *self._inputs.text(item.task, situation)]
 
     def _patches(self, item: Item) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

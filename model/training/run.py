@@ -19,7 +19,7 @@ from model.driving.reflection_store import read_reflections
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
 from model.network.attention import MATMUL_ATTENTION
-from model.network.checkpoint import Loaded, create_nano, load, save, with_formats
+from model.network.checkpoint import Loaded, create_nano, load, save, with_drafts, with_formats
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus, nano_phrases
 from model.network.settings import NANO_SETTINGS
@@ -119,6 +119,8 @@ def run(
     loaded = load(source)
     if new := [task for task in recipe.tasks if task not in loaded.settings.formats]:
         loaded = with_formats(loaded, new, seed=recipe.seed)
+    if recipe.goal == "read" and not loaded.settings.draft_tokens:
+        loaded = with_drafts(loaded, NANO_SETTINGS.draft_tokens, seed=recipe.seed)
     if visual_codes is not None:
         loaded = replace(loaded, visual_codes=load_visual_codes(visual_codes))
     stages = list(loaded.card.details.get("stages", []))

@@ -32,9 +32,13 @@ def drive(
     deadline_ms: Annotated[int | None, typer.Option(help="That each plan has.", min=1)] = None,
     route: Annotated[bool, typer.Option(help="Tell the model the route.")] = True,
     tracks: Annotated[bool, typer.Option(help="Tell the model the tracks of the objects around.")] = False,
+    format: Annotated[str | None, typer.Option(help="Response format; the model's first by default.")] = None,
     small: Annotated[
         list[Path] | None,
-        typer.Option(help="Folder of a small planner (`train blind`, `train teacher`) that drives too."),
+        typer.Option(
+            help="Folder of a small planner (`train blind`, `train teacher`), or of a checkpoint whose "
+            "reader of tracks writes drafts, that drives too."
+        ),
     ] = None,
     keep: Annotated[
         Path | None, typer.Option(help="File that keeps every drive: started again, it goes on behind them.")
@@ -70,7 +74,7 @@ def drive(
             return ConstantVelocity()
         if driver in small_pilots:
             return small_pilots[driver]
-        return ServicePilot(planner, driver, controls_of(driver), route=route, tracks=tracks)
+        return ServicePilot(planner, driver, controls_of(driver), route=route, tracks=tracks, format=format)
 
     def controls_of(driver: str) -> wire.Controls:
         return wire.Controls(
@@ -87,7 +91,8 @@ def drive(
         if driver in ("expert", "constant-velocity"):
             return hash_of(driver, seed, seconds)
         asked = controls_of(driver).model_dump_json()
-        return hash_of(driver, seed, seconds, asked, route, tracks, models, width_px)
+        formats = () if format is None else (format,)
+        return hash_of(driver, seed, seconds, asked, route, tracks, models, width_px, *formats)
 
     with told():
         small_pilots = {pilot.name: pilot for pilot in map(SmallPilot, small or ())}

@@ -79,7 +79,10 @@ def evaluate(
     ] = None,
     small: Annotated[
         list[Path] | None,
-        typer.Option(help="Folder of a small planner (`train blind`, `train teacher`) that gets a row too."),
+        typer.Option(
+            help="Folder of a small planner (`train blind`, `train teacher`), or of a checkpoint whose "
+            "reader of tracks writes drafts, that gets a row too."
+        ),
     ] = None,
     perception: Annotated[
         bool, typer.Option("--perception", help="How well pictures are read, fact by fact, and nothing else.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from pathlib import Path
 
@@ -10,14 +9,14 @@ import numpy as np
 
 from clients.metadrive.pilots import Planned
 from model.driving.scene import Scene
-from model.network.small_planner import WEIGHTS_FILE, load_small
+from model.network.small_planner import load_small, small_revision
 
 
 class SmallPilot:
     """Drives by a small planner's best guess; it looks at no picture.
 
     Args:
-        folder: of the planner.
+        folder: of the planner, or of a checkpoint whose reader of tracks writes drafts.
     """
 
     needs_pictures = False
@@ -25,7 +24,7 @@ class SmallPilot:
     def __init__(self, folder: Path) -> None:
         self._planner = load_small(folder)
         self.name = self._planner.kind
-        self.revision = hashlib.sha256((folder / WEIGHTS_FILE).read_bytes()).hexdigest()[:12]
+        self.revision = small_revision(folder)
 
     @property
     def described(self) -> str:

@@ -11,7 +11,6 @@ import numpy.typing as npt
 from model.driving.tracks import MAX_TRACKS
 from model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS
 from model.network.inputs import ModelInputs
-from model.network.intent import INTENT_TOKENS
 from model.network.settings import VlaSettings
 from model.network.track_features import TRACK_FEATURES
 from model.network.vocabulary import HISTORY, ROUTE, TRACK, VIDEO_PAD
@@ -80,7 +79,7 @@ def kinds_of(settings: VlaSettings) -> dict[str, Kind]:
             "tracks_route": route,
             "tracks_has_route": ((), np.bool_),
         }
-        kinds["tracks"] = Kind(INTENT_TOKENS, 1, tracks)
+        kinds["tracks"] = Kind(settings.intent_tokens, 1, tracks)
     return kinds
 
 

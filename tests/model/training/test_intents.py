@@ -9,9 +9,12 @@ import torch
 
 from model.driving.facts import IS_YES_OR_NO, mirrored
 from model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
-from model.network.checkpoint import Loaded, load
+from model.network.card import weights_revision
+from model.network.checkpoint import Loaded, load, save
 from model.network.intent import INTENT_TOKENS
+from model.network.small_planner import WEIGHTS_FILE, SmallPlannerError, load_small, small_revision
 from model.network.track_features import TRACK_FEATURES
+from model.network.vla import LookTwiceVla, with_settings
 from model.training.examples import Examples
 from model.training.intents import (
     IntentDataset,
@@ -142,3 +145,31 @@ def test_readers_of_tracks_ignore_order_and_rows_of_nobody(loaded: Loaded, data:
     assert none.shape == (0, *tokens.shape[1:])
     torch.testing.assert_close(turned, tokens)
     assert not torch.allclose(nobody, tokens)
+
+
+def test_a_reader_of_tracks_with_drafts_is_a_small_planner(
+    resampling_checkpoint: Path, data: IntentDataset, tmp_path: Path
+) -> None:
+    loaded = load(resampling_checkpoint)
+    learner = IntentLearner(loaded.model, loaded.codec, "tracks").eval()
+    planner = load_small(resampling_checkpoint)
+    assert planner.kind == "teacher"
+    sample = data.look(1, mirror=False, route=True)
+    batch = collate_intents([sample])
+    with torch.inference_mode():
+        trajectory = planner.plan([SCENES[1].given(route=True, tracks=True)])
+        off_m = np.linalg.norm(trajectory[0, :, :2] - sample.futures[:, :2], axis=1).mean()
+        assert off_m == pytest.approx(float(learner(**batch)["plan_ade_m"]), rel=1e-4)
+    assert small_revision(resampling_checkpoint) == weights_revision(resampling_checkpoint)
+    config = with_settings(loaded.model.config, replace(loaded.settings, draft_tokens=0), loaded.vocabulary)
+    save(tmp_path, LookTwiceVla(config), loaded.vocabulary, loaded.codec)
+    with pytest.raises(SmallPlannerError, match="drafts nothing"):
+        load_small(tmp_path)
+
+
+def test_folders_of_no_small_planner_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SmallPlannerError, match="has no planner"):
+        load_small(tmp_path)
+    (tmp_path / WEIGHTS_FILE).write_bytes(b"none")
+    with pytest.raises(SmallPlannerError, match="is damaged"):
+        load_small(tmp_path)
