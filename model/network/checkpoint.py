@@ -90,8 +90,8 @@ def create_nano(
         model = LookTwiceVla(config)
         write_code_embeddings(model, codec, vocabulary)
         write_number_embeddings(model, vocabulary, set(needed_numbers(model.settings)))
-    if model.draft_books is not None:
-        model.draft_books.fill(codec)
+    if model.sketch_books is not None:
+        model.sketch_books.fill(codec)
     save(folder, model, vocabulary, codec)
 
 
@@ -285,8 +285,8 @@ def with_formats(loaded: Loaded, formats: Sequence[str], *, seed: int = 0) -> Lo
     )
 
 
-def with_drafts(loaded: Loaded, stages: int, *, seed: int = 0) -> Loaded:
-    """A checkpoint whose small planners write drafts of so many codes, to be trained.
+def with_sketches(loaded: Loaded, stages: int, *, seed: int = 0) -> Loaded:
+    """A checkpoint whose small planners write sketches of so many codes, to be trained.
 
     Args:
         loaded: one that writes none; it stays as it is.
@@ -294,7 +294,7 @@ def with_drafts(loaded: Loaded, stages: int, *, seed: int = 0) -> Loaded:
         seed: of the new weights.
     """
     queries = loaded.settings.scene_queries
-    wider = replace(loaded.settings, draft_tokens=stages)
+    wider = replace(loaded.settings, sketch_tokens=stages)
     if queries:
         wider = replace(wider, scene_tokens=queries + wider.intent_tokens)
     config = with_settings(copy.deepcopy(loaded.model.config), wider, loaded.vocabulary)
@@ -302,8 +302,8 @@ def with_drafts(loaded: Loaded, stages: int, *, seed: int = 0) -> Loaded:
         torch.manual_seed(seed)
         model = LookTwiceVla(config)
     model.load_state_dict(loaded.model.state_dict(), strict=False)
-    assert model.draft_books is not None
-    model.draft_books.fill(loaded.codec)
+    assert model.sketch_books is not None
+    model.sketch_books.fill(loaded.codec)
     model.train(False)
     return replace(loaded, model=model, inputs=InputBuilder(loaded.vocabulary, wider))
 

@@ -3,8 +3,8 @@
 A decoder learns from a few responses a second; a multilayer perceptron over history, route and what is
 around learns from thousands, and plans in metres far better than a decoder that starts from nothing. So
 this trunk learns first (recipes ``read-tracks`` and ``read-scene``), and its state stands in the prompt as
-continuous tokens: the decoder only has to put it into words and codes. A draft, the trajectory that the state
-amounts to, stands beside it in the decoder's own codes.
+continuous tokens: the decoder only has to put it into words and codes. Beside it stands a sketch: the
+trajectory that the state amounts to, in the decoder's own codes.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from model.network.track_features import TRACK_FEATURES
 from model.network.trajectory_head import spread_of
 
 INTENT_TOKENS: Final = 2
-"""Tokens of the prompt that one state becomes, without those of its draft."""
+"""Tokens of the prompt that one state becomes, without those of its sketch."""
 _TRACK_WIDTH: Final = 96
 _WIDTH: Final = 256
 _SOFTNESS: Final = 0.25
-"""Width of a draft's mixtures, in mean squared distances from a code to the nearest other one."""
+"""Width of a sketch's mixtures, in mean squared distances from a code to the nearest other one."""
 _POSE_SCALE: Final = (10.0, 2.0, 0.3)
 _OUTLIER: Final = 6.0
 MOTION_FEATURES: Final = 3 * (2 * HISTORY_STEPS - 1) + 2 * 2 * ROUTE_POINTS + 1
@@ -107,8 +107,8 @@ class IntentTrunk(nn.Module):
         return state
 
 
-class DraftCodes(NamedTuple):
-    """The codes that drafts are written in; a stage is one token of the prompt.
+class SketchCodes(NamedTuple):
+    """The codes that sketches are written in; a stage is one token of the prompt.
 
     Attributes:
         books: [stages, K, d], see `TrajectoryCodec`.
@@ -120,14 +120,14 @@ class DraftCodes(NamedTuple):
     widths: Tensor
     embeddings: Tensor
 
-    def tokens(self, drafts: Tensor) -> Tensor:
-        """Tokens [b, stages, hidden] of drafts [b, d], in spreads of the first stage's codes.
+    def tokens(self, sketches: Tensor) -> Tensor:
+        """Tokens [b, stages, hidden] of sketches [b, d], in spreads of the first stage's codes.
 
         Each mixes the embeddings of the codes nearest to what the stages before it left over: unlike the
-        nearest code alone, a mixture changes no more than the draft does, in every engine alike.
+        nearest code alone, a mixture changes no more than the sketch does, in every engine alike.
         """
         books, widths = self.books.float(), self.widths.float()
-        left = drafts.float() * spread_of(books[0])
+        left = sketches.float() * spread_of(books[0])
         tokens = []
         for book, width, embeddings in zip(books, widths, self.embeddings, strict=True):
             nearness = (2 * left @ book.T - book.square().sum(dim=1)) / width
@@ -137,7 +137,7 @@ class DraftCodes(NamedTuple):
         return torch.stack(tokens, dim=1)
 
 
-class DraftBooks(nn.Module):
+class SketchBooks(nn.Module):
     """The first codebooks of a checkpoint's codec, where its network can reach them.
 
     Args:
@@ -155,7 +155,7 @@ class DraftBooks(nn.Module):
     def fill(self, codec: TrajectoryCodec) -> None:
         """Take them from ``codec``; raises ValueError for one in a space of other dimensions."""
         if codec.books.shape[2] != DIMENSIONS:
-            raise ValueError(f"drafts need a codec of {DIMENSIONS} dimensions, not {codec.books.shape[2]}")
+            raise ValueError(f"sketches need a codec of {DIMENSIONS} dimensions, not {codec.books.shape[2]}")
         self.books.copy_(torch.from_numpy(codec.books[: len(self.books)]))
         for width, book in zip(self.widths, self.books.float(), strict=True):
             apart = torch.cdist(book, book).fill_diagonal_(torch.inf).amin(dim=1)
@@ -168,29 +168,29 @@ class IntentReader(nn.Module):
     Args:
         hidden_size: of a token.
         around: size of the vector of what is around, see `IntentTrunk`.
-        drafts: whether its draft stands there too.
+        sketches: whether its sketch stands there too.
     """
 
-    def __init__(self, hidden_size: int, around: int, *, drafts: bool) -> None:
+    def __init__(self, hidden_size: int, around: int, *, sketches: bool) -> None:
         super().__init__()
         self.trunk = IntentTrunk(around)
         self.tokens = nn.Linear(IntentTrunk.width, INTENT_TOKENS * hidden_size)
-        self.draft = nn.Linear(IntentTrunk.width, DIMENSIONS) if drafts else None
+        self.sketch = nn.Linear(IntentTrunk.width, DIMENSIONS) if sketches else None
 
-    def written(self, state: Tensor, codes: DraftCodes | None) -> Tensor:
-        """A state [b, 256] as tokens [b, `INTENT_TOKENS` and those of the draft, hidden]."""
+    def written(self, state: Tensor, codes: SketchCodes | None) -> Tensor:
+        """A state [b, 256] as tokens [b, `INTENT_TOKENS` and those of the sketch, hidden]."""
         tokens: Tensor = self.tokens(state)
         tokens = tokens.view(len(tokens), INTENT_TOKENS, tokens.shape[1] // INTENT_TOKENS)
-        if self.draft is None or codes is None:
+        if self.sketch is None or codes is None:
             return tokens
-        return torch.cat([tokens, codes.tokens(self.draft(state)).to(tokens.dtype)], dim=1)
+        return torch.cat([tokens, codes.tokens(self.sketch(state)).to(tokens.dtype)], dim=1)
 
 
 class TrackReader(IntentReader):
     """A scene's tracks as tokens of the prompt, read with the ego's history and route in mind."""
 
-    def __init__(self, hidden_size: int, *, drafts: bool = False) -> None:
-        super().__init__(hidden_size, TrackPool.size, drafts=drafts)
+    def __init__(self, hidden_size: int, *, sketches: bool = False) -> None:
+        super().__init__(hidden_size, TrackPool.size, sketches=sketches)
         self.pool = TrackPool()
 
     def state(self, tracks: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
@@ -204,7 +204,7 @@ class TrackReader(IntentReader):
         history: Tensor,
         route: Tensor,
         has_route: Tensor,
-        codes: DraftCodes | None = None,
+        codes: SketchCodes | None = None,
     ) -> Tensor:
         """Tokens of the prompt; see `IntentReader.written`.
 
@@ -213,6 +213,6 @@ class TrackReader(IntentReader):
             history: [b, 16, 4].
             route: [b, 20, 2]; rows without one are ignored.
             has_route: bool [b].
-            codes: that drafts are written in, where they are.
+            codes: that sketches are written in, where they are.
         """
         return self.written(self.state(tracks, history, route, has_route), codes)

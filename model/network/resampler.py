@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from model.driving.facts import FACTS
 from model.network.encoders import HistoryEncoder, RouteEncoder
 from model.network.fact_reader import FactReader, likely, weighed
-from model.network.intent import DraftCodes, IntentReader
+from model.network.intent import IntentReader, SketchCodes
 
 _HEADS: Final = 4
 _LAYERS: Final = 2
@@ -30,10 +30,10 @@ class SceneResampler(nn.Module):
         hidden_size: of vision tokens and of what comes out.
         vision_tokens: of a scene, all cameras together.
         queries: how many. A token comes out for each, and those that say what to do about it.
-        drafts: whether a draft is among them.
+        sketches: whether a sketch is among them.
     """
 
-    def __init__(self, hidden_size: int, vision_tokens: int, queries: int, *, drafts: bool = False) -> None:
+    def __init__(self, hidden_size: int, vision_tokens: int, queries: int, *, sketches: bool = False) -> None:
         super().__init__()
         self.queries = nn.Parameter(0.3 * torch.randn(queries, hidden_size))
         self.places = nn.Parameter(0.02 * torch.randn(vision_tokens, hidden_size))
@@ -44,7 +44,7 @@ class SceneResampler(nn.Module):
         self.layers = nn.ModuleList(_CrossLayer(hidden_size) for _ in range(_LAYERS))
         self.norm = nn.RMSNorm(hidden_size, eps=_EPSILON)
         self.facts = FactReader(hidden_size)
-        self.intent = _SceneIntent(hidden_size, len(FACTS), drafts=drafts)
+        self.intent = _SceneIntent(hidden_size, len(FACTS), sketches=sketches)
 
     def forward(
         self,
@@ -52,7 +52,7 @@ class SceneResampler(nn.Module):
         history: Tensor,
         route: Tensor,
         has_route: Tensor,
-        codes: DraftCodes | None = None,
+        codes: SketchCodes | None = None,
     ) -> Tensor:
         """What stands in the prompt, [b, scene_tokens, hidden]; see `gather` and `IntentReader.written`."""
         gathered = self.gather(vision_tokens, history, route, has_route)

@@ -33,7 +33,7 @@ class VlaSettings:
         codec_size: trajectory codes per stage.
         with_route: whether it has a route encoder.
         with_tracks: whether it has a reader of tracks.
-        draft_tokens: of the prompt that tell the trajectory which a small planner's state amounts to
+        sketch_tokens: of the prompt that tell the trajectory which a small planner's state amounts to
             (`model.network.intent`); 0 for none.
         scene_tokens: 0 where every vision token stands in the prompt, as in Qwen2.5-VL; otherwise a
             resampler brings those of all cameras down to so many.
@@ -50,7 +50,7 @@ class VlaSettings:
     codec_size: int = 512
     with_route: bool = True
     with_tracks: bool = False
-    draft_tokens: int = 0
+    sketch_tokens: int = 0
     scene_tokens: int = 0
     patch_size: int = 14
     temporal_patch_size: int = 2
@@ -67,8 +67,8 @@ class VlaSettings:
             raise SettingsError(f"temporal_patch_size {self.temporal_patch_size} must divide {CLIP_FRAMES}")
         if unknown := [camera for camera in self.cameras if camera not in CAMERAS]:
             raise SettingsError(f"unknown camera {', '.join(unknown)}; known are {', '.join(CAMERAS)}")
-        if not 0 <= self.draft_tokens <= CODES:
-            raise SettingsError(f"draft_tokens must lie in 0..{CODES}, got {self.draft_tokens}")
+        if not 0 <= self.sketch_tokens <= CODES:
+            raise SettingsError(f"sketch_tokens must lie in 0..{CODES}, got {self.sketch_tokens}")
         least = len(FACT_GROUPS) + self.intent_tokens
         if 0 < self.scene_tokens < least:
             raise SettingsError(
@@ -104,8 +104,8 @@ class VlaSettings:
 
     @property
     def intent_tokens(self) -> int:
-        """Tokens that the state of a small planner becomes, with its draft."""
-        return INTENT_TOKENS + self.draft_tokens
+        """Tokens that the state of a small planner becomes, with its sketch."""
+        return INTENT_TOKENS + self.sketch_tokens
 
     @property
     def scene_queries(self) -> int:
@@ -128,8 +128,8 @@ class VlaSettings:
         values = asdict(self)
         if self.reflection == "free_text":
             del values["reflection"]
-        if not self.draft_tokens:
-            del values["draft_tokens"]
+        if not self.sketch_tokens:
+            del values["sketch_tokens"]
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     @classmethod
@@ -158,7 +158,7 @@ NANO_SETTINGS: Final = VlaSettings(
     image_height=168,
     temporal_patch_size=4,
     with_tracks=True,
-    draft_tokens=3,
+    sketch_tokens=3,
     scene_tokens=21,
 )
 """Of the model that is trained from scratch: motion is seen within one patch, over all four frames."""

@@ -3,7 +3,7 @@
 The blind planner sees history and route alone: who claims to see must beat it. The teacher sees the tracks
 of everybody around as well: it tells what seeing is worth. Both plan in microseconds and train in minutes.
 A third kind is given facts, true ones or those that were read from pictures: it tells what perception is
-worth to a plan, and drives nowhere. A checkpoint whose reader of tracks writes drafts holds a teacher, too.
+worth to a plan, and drives nowhere. A checkpoint whose reader of tracks writes sketches holds a teacher, too.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def small_inputs(scenes: Sequence[Scene], kind: SmallKind) -> SmallInputs:
 
 
 def load_small(folder: Path) -> SmallPlanner:
-    """Read what `SmallPlanner.save` wrote, or a checkpoint's reader of tracks with its drafts.
+    """Read what `SmallPlanner.save` wrote, or a checkpoint's reader of tracks with its sketches.
 
     Raises:
         SmallPlannerError: the folder holds neither.
@@ -161,9 +161,9 @@ def load_small(folder: Path) -> SmallPlanner:
 def _reader_of_tracks(folder: Path) -> SmallPlanner:
     loaded = load(folder)
     reader = loaded.model.track_reader
-    if reader is None or reader.draft is None:
+    if reader is None or reader.sketch is None:
         raise SmallPlannerError(
-            f"{folder}: this checkpoint reads no tracks or drafts nothing from them; "
+            f"{folder}: this checkpoint reads no tracks or sketches nothing from them; "
             "`looktwice train read-tracks` makes one that does"
         )
     planner = SmallPlanner("teacher", loaded.codec)
@@ -171,7 +171,7 @@ def _reader_of_tracks(folder: Path) -> SmallPlanner:
     for mine, its in (
         (planner.pool, reader.pool),
         (planner.trunk, reader.trunk),
-        (planner.head.best, reader.draft),
+        (planner.head.best, reader.sketch),
     ):
         mine.load_state_dict(its.state_dict())
     return planner.eval()

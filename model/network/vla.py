@@ -18,7 +18,7 @@ from model.driving.trajectory import ROUTE_POINTS, FloatArray
 from model.network.encoders import HistoryEncoder, RouteEncoder
 from model.network.fact_reader import likely
 from model.network.inputs import ModelInputs, Prompt, rotary_positions
-from model.network.intent import DraftBooks, DraftCodes, TrackReader
+from model.network.intent import SketchBooks, SketchCodes, TrackReader
 from model.network.resampler import SceneResampler
 from model.network.settings import CONFIG_KEY, VlaSettings
 from model.network.vision import attends_to_whole_pictures, encode_pictures, normalised
@@ -69,14 +69,16 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         hidden_size = config.text_config.hidden_size
         self.history_encoder = HistoryEncoder(hidden_size)
         self.route_encoder = RouteEncoder(hidden_size) if self.settings.with_route else None
-        stages = self.settings.draft_tokens
-        self.draft_books = DraftBooks(stages, self.settings.codec_size) if stages else None
+        stages = self.settings.sketch_tokens
+        self.sketch_books = SketchBooks(stages, self.settings.codec_size) if stages else None
         self.code_token_id: int | None = extra.get("code_token_id")
-        self.track_reader = TrackReader(hidden_size, drafts=stages > 0) if self.settings.with_tracks else None
+        self.track_reader = (
+            TrackReader(hidden_size, sketches=stages > 0) if self.settings.with_tracks else None
+        )
         self.track_token_id: int | None = extra.get("track_token_id")
         self.resampler = (
             SceneResampler(
-                hidden_size, self.settings.vision_tokens, self.settings.scene_queries, drafts=stages > 0
+                hidden_size, self.settings.vision_tokens, self.settings.scene_queries, sketches=stages > 0
             )
             if self.settings.scene_tokens
             else None
@@ -141,7 +143,7 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
             places = torch.eq(input_ids, self.track_token_id or 0)
             rows = places.any(dim=1)
             way = (part[rows] for part in self._way(history, route, input_ids))
-            tokens = self.track_reader(tracks[rows], *way, self._draft_codes()).to(embeddings.dtype)
+            tokens = self.track_reader(tracks[rows], *way, self._sketch_codes()).to(embeddings.dtype)
             embeddings = embeddings.masked_scatter(places[..., None], tokens)
         return embeddings
 
@@ -149,7 +151,7 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         """What the resampler makes of the clips of whole scenes, [b x scene_tokens, hidden]."""
         assert self.resampler is not None
         tokens = vision_tokens.view(len(history), self.settings.vision_tokens, -1)
-        resampled: Tensor = self.resampler(tokens, history, route, has_route, self._draft_codes())
+        resampled: Tensor = self.resampler(tokens, history, route, has_route, self._sketch_codes())
         return resampled.flatten(0, 1)
 
     @torch.inference_mode()
@@ -164,14 +166,14 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         read = likely(self.resampler.facts(scene_tokens[None].to(self.dtype)))
         return cast("FloatArray", read[0].cpu().numpy())
 
-    def _draft_codes(self) -> DraftCodes | None:
-        """The codes that drafts are written in; None where there are no drafts."""
-        if self.draft_books is None:
+    def _sketch_codes(self) -> SketchCodes | None:
+        """The codes that sketches are written in; None where there are no sketches."""
+        if self.sketch_books is None:
             return None
-        books, first = self.draft_books.books, self.code_token_id or 0
+        books, first = self.sketch_books.books, self.code_token_id or 0
         weight: Any = self.get_input_embeddings().weight
         embeddings = weight[first : first + books.shape[0] * books.shape[1]].view(*books.shape[:2], -1)
-        return DraftCodes(books, self.draft_books.widths, embeddings)
+        return SketchCodes(books, self.sketch_books.widths, embeddings)
 
     def _way(self, history: Tensor, route: Tensor | None, input_ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """History, route and which rows have one: those whose prompt [b, t] has the route's token."""
@@ -266,7 +268,7 @@ def with_settings(config: VlaConfig, settings: VlaSettings, vocabulary: Vocabula
         settings.to_dict()
         | {"history_token_id": vocabulary.id_of(HISTORY), "route_token_id": vocabulary.id_of(ROUTE)}
         | ({"track_token_id": vocabulary.id_of(TRACK)} if settings.with_tracks else {})
-        | ({"code_token_id": vocabulary.code_ids(0).start} if settings.draft_tokens else {}),
+        | ({"code_token_id": vocabulary.code_ids(0).start} if settings.sketch_tokens else {}),
     )
     config.architectures = [LookTwiceVla.__name__]
     config.image_token_id = vocabulary.id_of(IMAGE_PAD)

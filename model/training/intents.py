@@ -2,7 +2,7 @@
 
 The reader of tracks and the intent of the gathered tokens (`model.network.intent`) learn the expert's
 trajectory in metres, its plan's words bin by bin, and the facts that decide them. The best guess of the
-trajectory is kept as the draft; all other heads are thrown away. Tower and queries stay as they are.
+trajectory is kept as the sketch; all other heads are thrown away. Tower and queries stay as they are.
 """
 
 from __future__ import annotations
@@ -186,8 +186,8 @@ class IntentLearner(nn.Module):
         self._source = source
         self.part = part
         width = IntentTrunk.width
-        # A draft is the best guess, which the checkpoint keeps.
-        self.trajectory = TrajectoryHead(width, codec, best=part.draft)
+        # A sketch is the best guess, which the checkpoint keeps.
+        self.trajectory = TrajectoryHead(width, codec, best=part.sketch)
         self.words = nn.Linear(width, TICKS * sum(len(WORDS[group]) for group in GROUPS))
         self.facts = nn.Linear(width, len(FACTS))
         self.register_buffer("fact_weights", fact_weights())

@@ -19,7 +19,7 @@ from model.driving.reflection_store import read_reflections
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
 from model.network.attention import MATMUL_ATTENTION
-from model.network.checkpoint import Loaded, create_nano, load, save, with_drafts, with_formats
+from model.network.checkpoint import Loaded, create_nano, load, save, with_formats, with_sketches
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus, nano_phrases
 from model.network.settings import NANO_SETTINGS
@@ -111,7 +111,8 @@ def run(
 
     Raises:
         ValueError: the recipe wants reflections and there are none, or the other way round, or they are on
-            other scenes; it teaches pictures, and there are no codes for those that scenes bring.
+            other scenes; it teaches pictures, and there are no codes for those that scenes bring; only one of
+            ``source`` and ``vision_source`` writes sketches.
     """
     if (reflections is None) != (recipe.reflections is None):
         wants = "needs reflections" if reflections is None else "takes no reflections"
@@ -119,13 +120,18 @@ def run(
     loaded = load(source)
     if new := [task for task in recipe.tasks if task not in loaded.settings.formats]:
         loaded = with_formats(loaded, new, seed=recipe.seed)
-    if recipe.goal == "read" and not loaded.settings.draft_tokens:
-        loaded = with_drafts(loaded, NANO_SETTINGS.draft_tokens, seed=recipe.seed)
+    if recipe.goal == "read" and not loaded.settings.sketch_tokens:
+        loaded = with_sketches(loaded, NANO_SETTINGS.sketch_tokens, seed=recipe.seed)
     if visual_codes is not None:
         loaded = replace(loaded, visual_codes=load_visual_codes(visual_codes))
     stages = list(loaded.card.details.get("stages", []))
     if vision_source is not None:
         vision = load(vision_source)
+        if vision.settings.sketch_tokens != loaded.settings.sketch_tokens:
+            raise ValueError(
+                f"{source} has {loaded.settings.sketch_tokens} tokens of a sketch and {vision_source} "
+                f"{vision.settings.sketch_tokens}: `looktwice train read-scene` gives them to the one without"
+            )
         for mine, theirs in zip(vision_parts(loaded.model), vision_parts(vision.model), strict=True):
             mine.load_state_dict(theirs.state_dict())
         stages += [stage for stage in vision.card.details.get("stages", []) if stage not in stages]

@@ -37,7 +37,7 @@ def drive(
         list[Path] | None,
         typer.Option(
             help="Folder of a small planner (`train blind`, `train teacher`), or of a checkpoint whose "
-            "reader of tracks writes drafts, that drives too."
+            "reader of tracks writes sketches, that drives too."
         ),
     ] = None,
     keep: Annotated[

@@ -81,7 +81,7 @@ def evaluate(
         list[Path] | None,
         typer.Option(
             help="Folder of a small planner (`train blind`, `train teacher`), or of a checkpoint whose "
-            "reader of tracks writes drafts, that gets a row too."
+            "reader of tracks writes sketches, that gets a row too."
         ),
     ] = None,
     perception: Annotated[

@@ -16,7 +16,7 @@ class SmallPilot:
     """Drives by a small planner's best guess; it looks at no picture.
 
     Args:
-        folder: of the planner, or of a checkpoint whose reader of tracks writes drafts.
+        folder: of the planner, or of a checkpoint whose reader of tracks writes sketches.
     """
 
     needs_pictures = False

@@ -26,7 +26,7 @@ from vllm.multimodal.processing import (
 
 from model.engines.vllm.items import CLIPS, PLACEHOLDERS, kinds_of
 from model.network.encoders import HistoryEncoder, RouteEncoder
-from model.network.intent import DraftBooks, DraftCodes, TrackReader
+from model.network.intent import SketchBooks, SketchCodes, TrackReader
 from model.network.resampler import SceneResampler
 from model.network.settings import CONFIG_KEY, VlaSettings
 from model.network.vision import normalised
@@ -135,18 +135,18 @@ class LookTwiceForVllm(Qwen2_5_VLForConditionalGeneration):
         super().__init__(vllm_config=vllm_config, prefix=prefix)
         hidden_size = self.config.text_config.hidden_size
         self.settings = settings = VlaSettings.of_config(self.config)
-        stages = settings.draft_tokens
+        stages = settings.sketch_tokens
         with self._mark_tower_model(vllm_config, {*kinds_of(settings)} - {CLIPS}):
             if stages:
-                self.draft_books = DraftBooks(stages, settings.codec_size)
+                self.sketch_books = SketchBooks(stages, settings.codec_size)
             self.history_encoder = HistoryEncoder(hidden_size)
             if settings.with_route:
                 self.route_encoder = RouteEncoder(hidden_size)
             if settings.with_tracks:
-                self.track_reader = TrackReader(hidden_size, drafts=stages > 0)
+                self.track_reader = TrackReader(hidden_size, sketches=stages > 0)
             if settings.scene_tokens:
                 self.resampler = SceneResampler(
-                    hidden_size, settings.vision_tokens, settings.scene_queries, drafts=stages > 0
+                    hidden_size, settings.vision_tokens, settings.scene_queries, sketches=stages > 0
                 )
 
     @classmethod
@@ -169,25 +169,25 @@ class LookTwiceForVllm(Qwen2_5_VLForConditionalGeneration):
             tokens = self._vision(patches.flatten(0, 1), len(patches) * cameras)
             looks_along = (kwargs[f"scene_{name}"].to(device) for name in ("history", "route", "has_route"))
             tokens = tokens.view(len(patches), -1, tokens.shape[-1])
-            embeddings += tuple(self.resampler(tokens, *looks_along, self._draft_codes()))
+            embeddings += tuple(self.resampler(tokens, *looks_along, self._sketch_codes()))
         for kind in ("history", "route"):
             if (values := kwargs.get(kind)) is not None:
                 encoder = getattr(self, f"{kind}_encoder")
                 embeddings += tuple(encoder(values.to(device))[:, None])
         if (values := kwargs.get("tracks")) is not None:
             way = (kwargs[f"tracks_{name}"].to(device) for name in ("history", "route", "has_route"))
-            embeddings += tuple(self.track_reader(values.to(device), *way, self._draft_codes()))
+            embeddings += tuple(self.track_reader(values.to(device), *way, self._sketch_codes()))
         return embeddings
 
-    def _draft_codes(self) -> DraftCodes | None:
-        """The codes that drafts are written in; None where there are no drafts."""
-        if not self.settings.draft_tokens:
+    def _sketch_codes(self) -> SketchCodes | None:
+        """The codes that sketches are written in; None where there are no sketches."""
+        if not self.settings.sketch_tokens:
             return None
-        books = self.draft_books.books
+        books = self.sketch_books.books
         ids = torch.arange(books.shape[0] * books.shape[1], device=books.device)
         first: int = getattr(self.config, CONFIG_KEY)["code_token_id"]
         embeddings = self.language_model.embed_input_ids(first + ids).view(*books.shape[:2], -1)
-        return DraftCodes(books, self.draft_books.widths, embeddings)
+        return SketchCodes(books, self.sketch_books.widths, embeddings)
 
     def _vision(self, patches: Tensor, clips: int) -> Tensor:
         """Vision tokens [clips, tokens, hidden] from uint8 patches [clips x p, width]."""

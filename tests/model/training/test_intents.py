@@ -147,7 +147,7 @@ def test_readers_of_tracks_ignore_order_and_rows_of_nobody(loaded: Loaded, data:
     assert not torch.allclose(nobody, tokens)
 
 
-def test_a_reader_of_tracks_with_drafts_is_a_small_planner(
+def test_a_reader_of_tracks_with_sketches_is_a_small_planner(
     resampling_checkpoint: Path, data: IntentDataset, tmp_path: Path
 ) -> None:
     loaded = load(resampling_checkpoint)
@@ -161,9 +161,9 @@ def test_a_reader_of_tracks_with_drafts_is_a_small_planner(
         off_m = np.linalg.norm(trajectory[0, :, :2] - sample.futures[:, :2], axis=1).mean()
         assert off_m == pytest.approx(float(learner(**batch)["plan_ade_m"]), rel=1e-4)
     assert small_revision(resampling_checkpoint) == weights_revision(resampling_checkpoint)
-    config = with_settings(loaded.model.config, replace(loaded.settings, draft_tokens=0), loaded.vocabulary)
+    config = with_settings(loaded.model.config, replace(loaded.settings, sketch_tokens=0), loaded.vocabulary)
     save(tmp_path, LookTwiceVla(config), loaded.vocabulary, loaded.codec)
-    with pytest.raises(SmallPlannerError, match="drafts nothing"):
+    with pytest.raises(SmallPlannerError, match="sketches nothing"):
         load_small(tmp_path)
 
 

@@ -19,10 +19,12 @@ from model.driving.plan import parse_plan
 from model.driving.reflection_store import LabelledReflection, write_reflections
 from model.driving.scene import LabelledScene, NextFrame
 from model.driving.scene_store import write_scenes
-from model.network.checkpoint import load
+from model.network.checkpoint import load, with_sketches
+from model.network.settings import NANO_SETTINGS
 from model.network.visual_codes import VisualCodes
 from model.training.recipes import NANO, Recipe
 from model.training.run import RunSettings, last_whole_state, run
+from tests.checkpoints import write_untrained
 from tests.model.training.scenes import training_scene
 
 SCENES = [training_scene(index) for index in range(16)]
@@ -124,6 +126,22 @@ def test_a_vision_tower_can_be_taken_from_elsewhere(
     both, grounded = load(tmp_path / "both"), load(tmp_path / "ground")
     for name in ("model.visual.merger.mlp.0.weight", "resampler.queries", "resampler.facts.groups.0.weight"):
         assert torch.equal(both.model.state_dict()[name], grounded.model.state_dict()[name])
+
+
+def test_readers_learn_to_sketch_where_they_did_not(scenes: Path, tmp_path: Path) -> None:
+    plain = replace(NANO_SETTINGS, sketch_tokens=0, scene_tokens=18)
+    before = write_untrained(tmp_path / "before", settings=plain)
+    settings = RunSettings(tmp_path / "cache", bf16=False)
+    run(short("read-tracks"), scenes, before, tmp_path / "tracks", settings)
+    made = load(tmp_path / "tracks")
+    assert made.settings.sketch_tokens == NANO_SETTINGS.sketch_tokens
+    reader = made.model.track_reader
+    assert reader is not None
+    assert reader.sketch is not None
+    made_again = with_sketches(load(before), NANO_SETTINGS.sketch_tokens).model.track_reader
+    assert not torch.equal(reader.sketch.weight, made_again.sketch.weight)  # type: ignore[union-attr]
+    with pytest.raises(ValueError, match="0 tokens of a sketch"):
+        run(short("language"), scenes, before, tmp_path / "no", settings, vision_source=tmp_path / "tracks")
 
 
 def test_a_state_cut_off_by_a_kill_is_passed_over(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from model.network.checkpoint import Loaded, create_nano, load, save, with_drafts
+from model.network.checkpoint import Loaded, create_nano, load, save, with_sketches
 from model.network.codec import DIMENSIONS, TrajectoryCodec
-from model.network.intent import INTENT_TOKENS, DraftBooks, DraftCodes
+from model.network.intent import INTENT_TOKENS, SketchBooks, SketchCodes
 from model.network.settings import NANO_SETTINGS, SettingsError, VlaSettings
 from model.network.track_features import TRACK_FEATURES
 from model.network.trajectory_head import spread_of
@@ -24,61 +24,61 @@ STAGES = 3
 
 
 @pytest.fixture(scope="module")
-def codes(small_codec: TrajectoryCodec) -> DraftCodes:
+def codes(small_codec: TrajectoryCodec) -> SketchCodes:
     """Of which each embedding is its code's vector: a mixture then says where it is."""
-    books = DraftBooks(STAGES, CODEC_SIZE)
+    books = SketchBooks(STAGES, CODEC_SIZE)
     books.fill(small_codec)
-    return DraftCodes(books.books, books.widths, books.books.detach())
+    return SketchCodes(books.books, books.widths, books.books.detach())
 
 
-def drafts_of(codec: TrajectoryCodec, count: int, seed: int = 0) -> Tensor:
+def sketches_of(codec: TrajectoryCodec, count: int, seed: int = 0) -> Tensor:
     vectors = torch.from_numpy(codec.vectors(*made_up_motions(count, seed)))
     return vectors / spread_of(torch.from_numpy(codec.books[0]))
 
 
-def test_a_draft_comes_nearer_with_every_token(codes: DraftCodes, small_codec: TrajectoryCodec) -> None:
-    drafts = drafts_of(small_codec, 200, seed=1)
-    tokens = codes.tokens(drafts).detach()
+def test_a_sketch_comes_nearer_with_every_token(codes: SketchCodes, small_codec: TrajectoryCodec) -> None:
+    sketches = sketches_of(small_codec, 200, seed=1)
+    tokens = codes.tokens(sketches).detach()
     assert tokens.shape == (200, STAGES, DIMENSIONS)
-    vectors = drafts * spread_of(codes.books[0])
+    vectors = sketches * spread_of(codes.books[0])
     left = [float((vectors - tokens[:, :count].sum(dim=1)).norm(dim=1).mean()) for count in range(STAGES + 1)]
     assert left == sorted(left, reverse=True)
     assert left[-1] < 0.5 * left[0]
 
 
-def test_the_first_token_is_mostly_the_nearest_code(codes: DraftCodes, small_codec: TrajectoryCodec) -> None:
+def test_the_first_token_is_mostly_the_nearest_code(codes: SketchCodes, small_codec: TrajectoryCodec) -> None:
     vectors = small_codec.vectors(*made_up_motions(200, seed=1))
     one_each = codes._replace(embeddings=torch.eye(CODEC_SIZE).expand(STAGES, -1, -1))
-    shares = one_each.tokens(drafts_of(small_codec, 200, seed=1))[:, 0]
+    shares = one_each.tokens(sketches_of(small_codec, 200, seed=1))[:, 0]
     torch.testing.assert_close(shares.sum(dim=1), torch.ones(200))
     apart = np.linalg.norm(vectors[:, None] - small_codec.books[0], axis=2)
     np.testing.assert_array_equal(shares.argmax(dim=1).numpy(), apart.argmin(axis=1))
 
 
 @given(st.integers(0, 10_000), st.floats(0, 1))
-def test_a_small_change_of_a_draft_changes_its_tokens_little(
-    codes: DraftCodes, small_codec: TrajectoryCodec, seed: int, between: float
+def test_a_small_change_of_a_sketch_changes_its_tokens_little(
+    codes: SketchCodes, small_codec: TrajectoryCodec, seed: int, between: float
 ) -> None:
     # Somewhere between two trajectories, where the nearest code changes from one to the other.
-    one, other = drafts_of(small_codec, 2, seed)
-    draft = torch.lerp(one, other, between)[None]
-    moved = codes.tokens(draft + 1e-4) - codes.tokens(draft)
+    one, other = sketches_of(small_codec, 2, seed)
+    sketch = torch.lerp(one, other, between)[None]
+    moved = codes.tokens(sketch + 1e-4) - codes.tokens(sketch)
     assert float(moved.abs().max()) < 0.05 * float(codes.books[0].std())
 
 
-def test_small_planners_get_drafts_and_all_else_stays(
+def test_small_planners_get_sketches_and_all_else_stays(
     small_codec: TrajectoryCodec, vocabulary: Vocabulary, tmp_path: Path
 ) -> None:
     settings = replace(
         NANO_SETTINGS,
         codec_size=CODEC_SIZE,
-        draft_tokens=0,
-        scene_tokens=NANO_SETTINGS.scene_tokens - NANO_SETTINGS.draft_tokens,
+        sketch_tokens=0,
+        scene_tokens=NANO_SETTINGS.scene_tokens - NANO_SETTINGS.sketch_tokens,
     )
     create_nano(tmp_path / "before", small_codec, vocabulary, settings=settings)
     before = load(tmp_path / "before")
-    assert "draft_tokens" not in before.settings.to_dict()
-    wider = with_drafts(before, STAGES)
+    assert "sketch_tokens" not in before.settings.to_dict()
+    wider = with_sketches(before, STAGES)
     assert wider.settings == replace(NANO_SETTINGS, codec_size=CODEC_SIZE)
     assert wider.settings.intent_tokens == INTENT_TOKENS + STAGES
     assert wider.inputs.longest_prompt("cf_vla") == before.inputs.longest_prompt("cf_vla") + 2 * STAGES
@@ -88,20 +88,20 @@ def test_small_planners_get_drafts_and_all_else_stays(
     state = again.model.state_dict()
     new = set(state) - set(before.model.state_dict())
     assert new == {
-        "draft_books.books",
-        "draft_books.widths",
+        "sketch_books.books",
+        "sketch_books.widths",
         *(
-            f"{part}.draft.{each}"
+            f"{part}.sketch.{each}"
             for part in ("track_reader", "resampler.intent")
             for each in ("weight", "bias")
         ),
     }
     for name, value in before.model.state_dict().items():
         torch.testing.assert_close(state[name], value, rtol=0, atol=0)
-    np.testing.assert_array_equal(state["draft_books.books"].numpy(), small_codec.books[:STAGES])
+    np.testing.assert_array_equal(state["sketch_books.books"].numpy(), small_codec.books[:STAGES])
 
 
-def test_a_draft_is_told_in_the_decoders_own_codes(
+def test_a_sketch_is_told_in_the_decoders_own_codes(
     small_codec: TrajectoryCodec, vocabulary: Vocabulary, tmp_path: Path
 ) -> None:
     settings = replace(NANO_SETTINGS, codec_size=CODEC_SIZE)
@@ -109,12 +109,12 @@ def test_a_draft_is_told_in_the_decoders_own_codes(
     loaded = load(tmp_path)
     reader = loaded.model.track_reader
     assert reader is not None
-    assert reader.draft is not None
+    assert reader.sketch is not None
     code = 5
     with torch.no_grad():
-        reader.draft.weight.zero_()
-        reader.draft.bias.copy_(torch.from_numpy(small_codec.books[0, code]) / loaded_spread(loaded))
-        loaded.model.draft_books.widths.fill_(1e-3)  # type: ignore[union-attr]  # it has them
+        reader.sketch.weight.zero_()
+        reader.sketch.bias.copy_(torch.from_numpy(small_codec.books[0, code]) / loaded_spread(loaded))
+        loaded.model.sketch_books.widths.fill_(1e-3)  # type: ignore[union-attr]  # it has them
         embeddings = loaded.model.embed(
             torch.tensor([[loaded.model.track_token_id] * settings.intent_tokens]),
             history=torch.zeros(1, 16, 4),
@@ -128,12 +128,12 @@ def loaded_spread(loaded: Loaded) -> Tensor:
     return spread_of(torch.from_numpy(loaded.codec.books[0]))
 
 
-def test_more_draft_tokens_than_codes_are_refused() -> None:
-    with pytest.raises(SettingsError, match="draft_tokens"):
-        VlaSettings(draft_tokens=7)
+def test_more_sketch_tokens_than_codes_are_refused() -> None:
+    with pytest.raises(SettingsError, match="sketch_tokens"):
+        VlaSettings(sketch_tokens=7)
 
 
-def test_a_codec_of_another_space_makes_no_drafts(small_codec: TrajectoryCodec) -> None:
+def test_a_codec_of_another_space_makes_no_sketches(small_codec: TrajectoryCodec) -> None:
     narrow = TrajectoryCodec(small_codec.mean, small_codec.axes[:7], small_codec.books[..., :7])
     with pytest.raises(ValueError, match="7"):
-        DraftBooks(STAGES, CODEC_SIZE).fill(narrow)
+        SketchBooks(STAGES, CODEC_SIZE).fill(narrow)
