@@ -24,7 +24,7 @@ from model.driving.scene import Scene
 from model.driving.trajectory import to_ego_frame
 from service.settings import Settings
 from tests.clients.metadrive.conftest import SEED
-from tests.service.scripted_engine import ScriptedEngine
+from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import serve
 
 CONFIG = DriveConfig(duration_s=12.0)
@@ -131,6 +131,7 @@ def test_a_car_stops_where_its_trajectory_ends() -> None:
 
 def test_it_drives_through_the_api(rig: Rig, tmp_path: Path) -> None:
     engine, film, shots = ScriptedEngine(), Film(), list[Shot]()
+    engine.card_shown = replace(CARD, formats=("traj_only", "cf_vla"))
 
     def on_shot(shot: Shot) -> None:
         shots.append(shot)
@@ -141,12 +142,13 @@ def test_it_drives_through_the_api(rig: Rig, tmp_path: Path) -> None:
         PlannerClient(served.url) as planner,
     ):
         controls = wire.Controls(n=3, thinking="always", deadline_ms=60_000)
-        pilot = ServicePilot(planner, "always", controls, route=False)
+        pilot = ServicePilot(planner, "always", controls, route=False, format="cf_vla")
         drove = drive(SEED, pilot, rig, replace(CONFIG, duration_s=4.0), on_shot)
     assert drove.plans == len(engine.submitted) > 3
     assert (drove.thought, drove.late) == (1.0, 0)
     assert {request.controls.seed for request in engine.submitted} == set(range(drove.plans))
     assert all(request.scene.route is None for request in engine.submitted)
+    assert {request.format for request in engine.submitted} == {"cf_vla"}
     assert drove.milliseconds is not None
     planned = shots[-1].planned
     assert planned is not None
