@@ -157,6 +157,14 @@ def test_it_drives_through_the_api(rig: Rig, tmp_path: Path) -> None:
     film.save(tmp_path / "drive.gif")
     with Image.open(tmp_path / "drive.gif") as gif:
         assert gif.n_frames == len(shots)  # type: ignore[attr-defined]  # a GIF has it
+        gif.seek(len(shots) - 1)
+        frame = np.asarray(gif.convert("RGB")).astype(int)
+    # Both cameras and the road from above fill their columns to the bottom; the words have the rest.
+    drawn = np.abs(frame - frame[-1, -1]).max(axis=2) > 8
+    assert drawn[:, :560].any(axis=1).mean() > 0.98
+    assert drawn[:, 560:860].any(axis=1).mean() > 0.98
+    words = np.flatnonzero(drawn[:, 860:].any(axis=1))
+    assert words[-1] > 0.3 * len(frame)
     with pytest.raises(ValueError, match="frame"):
         Film().save(tmp_path / "none.gif")
 

@@ -51,3 +51,24 @@ def test_the_operator_bounds_what_is_kept_of_pictures(untrained_checkpoint: Path
     engine = make_engine(untrained_checkpoint, 4, cache_mb=1)
     assert isinstance(engine, TorchEngine)
     assert engine._settings.clip_bytes == 1 << 20
+
+
+@pytest.mark.parametrize(
+    ("told", "reproducible"), [([], True), (["--fast"], False), (["--reproducible"], True)]
+)
+def test_who_serves_chooses_between_equal_bytes_and_speed(
+    told: list[str], reproducible: bool, untrained_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+
+    def note(engine: TorchEngine, *args: object, **named: object) -> None:
+        made.append(engine._settings.reproducible)
+        raise ValueError("that is enough")
+
+    monkeypatch.setattr("service.app.create_app", note)
+    # They are of the whole process, which is the tests' own here.
+    monkeypatch.setattr("model.network.allocator.return_large_buffers", lambda: None)
+    monkeypatch.setattr("sys.setswitchinterval", lambda _: None)
+    result = RUNNER.invoke(app, ["serve", "--checkpoint", str(untrained_checkpoint), "--port", "0", *told])
+    assert "that is enough" in result.stderr
+    assert made == [reproducible]
