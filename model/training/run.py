@@ -22,6 +22,7 @@ from model.network.attention import MATMUL_ATTENTION
 from model.network.checkpoint import Loaded, create_nano, load, save, with_formats, with_sketches
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus, nano_phrases
+from model.network.intent import IntentReader
 from model.network.settings import NANO_SETTINGS
 from model.network.visual_codes import load_visual_codes
 from model.network.vla import LookTwiceVla
@@ -207,6 +208,12 @@ def vision_parts(vla: LookTwiceVla) -> list[nn.Module]:
     return [vla.model.visual, *([vla.resampler] if vla.resampler is not None else [])]
 
 
+def small_planners(vla: LookTwiceVla) -> list[IntentReader]:
+    """Those whose states stand in the prompt."""
+    scene = None if vla.resampler is None else vla.resampler.intent
+    return [planner for planner in (vla.track_reader, scene) if planner is not None]
+
+
 def last_whole_state(folder: Path) -> str | None:
     """The newest training state that was written to its end, or None.
 
@@ -261,8 +268,11 @@ def _prepare(
     )
     for part in vision_parts(loaded.model):
         part.requires_grad_(recipe.vision_rate > 0)
-    if loaded.model.resampler is not None:
-        loaded.model.resampler.intent.requires_grad_(True)
+    for planner in small_planners(loaded.model):
+        # A sketch is its planner's trajectory only while nothing else moves them: the few responses that a
+        # decoder learns from would. What the state becomes in the prompt is learned with the decoder.
+        planner.requires_grad_(planner.sketch is None)
+        planner.tokens.requires_grad_(True)
     learner = ResponseLearner(
         loaded.model,
         loaded.vocabulary,

@@ -60,9 +60,11 @@ _BUILDS: Final = {
 }
 _UNTRAINED: Final = "untrained"
 _GROUNDWORK: Final = (
-    Rung("language", "language", _UNTRAINED),
+    Rung("tracks", "read-tracks", _UNTRAINED),
+    Rung("language", "language", "tracks"),
     Rung("ground", "ground", _UNTRAINED),
-    Rung(META_ACT, "meta-act", "language", vision="ground"),
+    Rung("scene", "read-scene", "language", vision="ground"),
+    Rung(META_ACT, "meta-act", "scene"),
 )
 _OF_RECIPES: Final = frozenset(("--learning-rate", "--vision-rate"))
 """Options that are meant for the rungs above `META_ACT`: below it every recipe has its own."""

@@ -53,6 +53,14 @@ def test_the_stages_lead_to_a_checkpoint_that_tells_its_history(
 
     run(short("meta-act"), scenes, tmp_path / "ground", tmp_path / "plan", settings, SCENES[:1])
     done = load(tmp_path / "plan")
+    # The decoder learned, and the small planners stayed what they are, but for their tokens.
+    planned = load(tmp_path / "plan", dtype=torch.bfloat16).model.state_dict()
+    learned = {name for name in planned if not torch.equal(planned[name], grounded[name])}
+    planners = ("track_reader", "resampler.intent")
+    assert any(name.startswith("model.language_model.") for name in learned)
+    assert {name for name in learned if name.startswith((*planners, "sketch_books"))} <= {
+        f"{planner}.tokens.{each}" for planner in planners for each in ("weight", "bias")
+    }
     assert [stage["name"] for stage in done.card.details["stages"]] == ["ground", "meta-act"]
     assert done.card.revision != load(resampling_checkpoint).card.revision
     rows = [json.loads(line) for line in (tmp_path / "plan" / "log.jsonl").read_text().splitlines()]

@@ -75,13 +75,15 @@ RUNGS = [
 def test_it_begins_with_nothing_but_scenes(commands: list[list[str]], tmp_path: Path) -> None:
     climbed(tmp_path / "ladder")
     assert trained(commands) == [
-        ("language", "untrained", "language"),
+        ("read-tracks", "untrained", "tracks"),
+        ("language", "tracks", "language"),
         ("ground", "untrained", "ground"),
-        ("meta-act", "language", "meta-act"),
+        ("read-scene", "language", "scene"),
+        ("meta-act", "scene", "meta-act"),
         *RUNGS,
     ]
     of_rung = {command[command.index("train") + 1]: command for command in commands if "train" in command}
-    assert of_rung["meta-act"][of_rung["meta-act"].index("--vision-from") + 1].endswith("ladder/ground")
+    assert of_rung["read-scene"][of_rung["read-scene"].index("--vision-from") + 1].endswith("ladder/ground")
     assert "--learning-rate" not in of_rung["meta-act"]
     assert of_rung["counterfactual"][of_rung["counterfactual"].index("--learning-rate") + 1] == "0.001"
     assert all(command[command.index("--steps") + 1] == "2" for command in of_rung.values())
