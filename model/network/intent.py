@@ -147,9 +147,9 @@ class SketchBooks(nn.Module):
 
     def __init__(self, stages: int, size: int) -> None:
         super().__init__()
-        # Weights and no buffers: every engine loads those. Nothing trains them.
-        self.books = nn.Parameter(torch.zeros(stages, size, DIMENSIONS), requires_grad=False)
-        self.widths = nn.Parameter(torch.ones(stages), requires_grad=False)
+        # Weights and no buffers, since every engine loads weights; training has to leave them out.
+        self.books = nn.Parameter(torch.zeros(stages, size, DIMENSIONS))
+        self.widths = nn.Parameter(torch.ones(stages))
 
     @torch.no_grad()
     def fill(self, codec: TrajectoryCodec) -> None:

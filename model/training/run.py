@@ -273,6 +273,8 @@ def _prepare(
         # decoder learns from would. What the state becomes in the prompt is learned with the decoder.
         planner.requires_grad_(planner.sketch is None)
         planner.tokens.requires_grad_(True)
+    if loaded.model.sketch_books is not None:
+        loaded.model.sketch_books.requires_grad_(False)
     learner = ResponseLearner(
         loaded.model,
         loaded.vocabulary,

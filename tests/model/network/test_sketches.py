@@ -28,7 +28,8 @@ def codes(small_codec: TrajectoryCodec) -> SketchCodes:
     """Of which each embedding is its code's vector: a mixture then says where it is."""
     books = SketchBooks(STAGES, CODEC_SIZE)
     books.fill(small_codec)
-    return SketchCodes(books.books, books.widths, books.books.detach())
+    vectors = books.books.detach()
+    return SketchCodes(vectors, books.widths.detach(), vectors)
 
 
 def sketches_of(codec: TrajectoryCodec, count: int, seed: int = 0) -> Tensor:
