@@ -293,10 +293,10 @@ def with_sketches(loaded: Loaded, stages: int, *, seed: int = 0) -> Loaded:
         stages: at most 6.
         seed: of the new weights.
     """
-    queries = loaded.settings.scene_queries
-    wider = replace(loaded.settings, sketch_tokens=stages)
-    if queries:
-        wider = replace(wider, scene_tokens=queries + wider.intent_tokens)
+    resampled = loaded.settings.scene_tokens
+    wider = replace(
+        loaded.settings, sketch_tokens=stages, scene_tokens=resampled + stages if resampled else 0
+    )
     config = with_settings(copy.deepcopy(loaded.model.config), wider, loaded.vocabulary)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
