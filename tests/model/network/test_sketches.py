@@ -111,11 +111,12 @@ def test_a_sketch_is_told_in_the_decoders_own_codes(
     reader = loaded.model.track_reader
     assert reader is not None
     assert reader.sketch is not None
+    assert loaded.model.sketch_books is not None
     code = 5
     with torch.no_grad():
         reader.sketch.weight.zero_()
         reader.sketch.bias.copy_(torch.from_numpy(small_codec.books[0, code]) / loaded_spread(loaded))
-        loaded.model.sketch_books.widths.fill_(1e-3)  # type: ignore[union-attr]  # it has them
+        loaded.model.sketch_books.widths.fill_(1e-3)
         embeddings = loaded.model.embed(
             torch.tensor([[loaded.model.track_token_id] * settings.intent_tokens]),
             history=torch.zeros(1, 16, 4),

@@ -146,8 +146,10 @@ def test_readers_learn_to_sketch_where_they_did_not(scenes: Path, tmp_path: Path
     reader = made.model.track_reader
     assert reader is not None
     assert reader.sketch is not None
-    made_again = with_sketches(load(before), NANO_SETTINGS.sketch_tokens).model.track_reader
-    assert not torch.equal(reader.sketch.weight, made_again.sketch.weight)  # type: ignore[union-attr]
+    unread = with_sketches(load(before), NANO_SETTINGS.sketch_tokens).model.track_reader
+    assert unread is not None
+    assert unread.sketch is not None
+    assert not torch.equal(reader.sketch.weight, unread.sketch.weight)
     with pytest.raises(ValueError, match="0 tokens of a sketch"):
         run(short("language"), scenes, before, tmp_path / "no", settings, vision_source=tmp_path / "tracks")
 
