@@ -151,6 +151,10 @@ class SketchBooks(nn.Module):
         self.books = nn.Parameter(torch.zeros(stages, size, DIMENSIONS))
         self.widths = nn.Parameter(torch.ones(stages))
 
+    def codes(self, embeddings: Tensor) -> SketchCodes:
+        """What sketches are written in; ``embeddings`` [stages * K, hidden] are a decoder's of the codes."""
+        return SketchCodes(self.books, self.widths, embeddings.view(*self.books.shape[:2], -1))
+
     @torch.no_grad()
     def fill(self, codec: TrajectoryCodec) -> None:
         """Take them from ``codec``; raises ValueError for one in a space of other dimensions."""

@@ -108,6 +108,11 @@ class VlaSettings:
         return INTENT_TOKENS + self.sketch_tokens
 
     @property
+    def sketch_codes(self) -> int:
+        """Trajectory codes that sketches are written in, of all their stages."""
+        return self.sketch_tokens * self.codec_size
+
+    @property
     def scene_queries(self) -> int:
         """Queries of the resampler: scene tokens but for those of the intent."""
         return max(0, self.scene_tokens - self.intent_tokens)

@@ -170,10 +170,9 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         """The codes that sketches are written in; None where there are no sketches."""
         if self.sketch_books is None:
             return None
-        books, first = self.sketch_books.books, self.code_token_id or 0
+        first = self.code_token_id or 0
         weight: Any = self.get_input_embeddings().weight
-        embeddings = weight[first : first + books.shape[0] * books.shape[1]].view(*books.shape[:2], -1)
-        return SketchCodes(books, self.sketch_books.widths, embeddings)
+        return self.sketch_books.codes(weight[first : first + self.settings.sketch_codes])
 
     def _way(self, history: Tensor, route: Tensor | None, input_ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """History, route and which rows have one: those whose prompt [b, t] has the route's token."""

@@ -183,11 +183,9 @@ class LookTwiceForVllm(Qwen2_5_VLForConditionalGeneration):
         """The codes that sketches are written in; None where there are no sketches."""
         if not self.settings.sketch_tokens:
             return None
-        books = self.sketch_books.books
-        ids = torch.arange(books.shape[0] * books.shape[1], device=books.device)
         first: int = getattr(self.config, CONFIG_KEY)["code_token_id"]
-        embeddings = self.language_model.embed_input_ids(first + ids).view(*books.shape[:2], -1)
-        return SketchCodes(books, self.sketch_books.widths, embeddings)
+        ids = first + torch.arange(self.settings.sketch_codes, device=self.sketch_books.books.device)
+        return self.sketch_books.codes(self.language_model.embed_input_ids(ids))
 
     def _vision(self, patches: Tensor, clips: int) -> Tensor:
         """Vision tokens [clips, tokens, hidden] from uint8 patches [clips x p, width]."""
