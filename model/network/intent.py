@@ -127,13 +127,15 @@ class SketchCodes(NamedTuple):
         nearest code alone, a mixture changes no more than the sketch does, in every engine alike.
         """
         books, widths = self.books.float(), self.widths.float()
-        left = sketches.float() * spread_of(books[0])
         tokens = []
-        for book, width, embeddings in zip(books, widths, self.embeddings, strict=True):
-            nearness = (2 * left @ book.T - book.square().sum(dim=1)) / width
-            shares = nearness.softmax(dim=1)
-            tokens.append(shares.to(embeddings.dtype) @ embeddings)
-            left = left - shares @ book
+        # Differences of large squares decide: mixed precision would round them away.
+        with torch.autocast(sketches.device.type, enabled=False):
+            left = sketches.float() * spread_of(books[0])
+            for book, width, embeddings in zip(books, widths, self.embeddings, strict=True):
+                nearness = (2 * left @ book.T - book.square().sum(dim=1)) / width
+                shares = nearness.softmax(dim=1)
+                tokens.append(shares.to(embeddings.dtype) @ embeddings)
+                left = left - shares @ book
         return torch.stack(tokens, dim=1)
 
 

@@ -109,6 +109,7 @@ class ResponseDataset(Dataset[Sample]):
     Attributes:
         formats: that the checkpoint writes, compiled.
         reflecting: the format of reflections, where the checkpoint writes any.
+        random: draws codes and plans.
 
     Args:
         examples, codec, inputs, vocabulary: of the checkpoint.
@@ -145,7 +146,7 @@ class ResponseDataset(Dataset[Sample]):
         self._examples, self._inputs, self._reflections = examples, inputs, reflections
         self._codec, self._vision = codec, vision
         self._soft = SoftCodes(codec, codec.vectors(examples.history, examples.future))
-        self._random = np.random.default_rng(seed)
+        self.random = np.random.default_rng(seed)
         self._weights, self._pictures, self._vocabulary = weights, pictures, vocabulary
         self._families = families_of(inputs.settings.formats, inputs.settings.reflection)
         self.formats = {
@@ -187,10 +188,10 @@ class ResponseDataset(Dataset[Sample]):
         if not found and self._own_plans is not None and item.task == self.reflecting:
             # Nobody knows whether it deserves a second look: nothing but the trajectory is taught behind it.
             own = self._own_plans.draw(
-                index, self._random, mirror=item.mirror, route=item.route, tracks=item.tracks
+                index, self.random, mirror=item.mirror, route=item.route, tracks=item.tracks
             )
             reflections.append(Reflection(own, "", judged=False))
-        soft = [self._soft.draw(vector, self._random) for _ in reflections]
+        soft = [self._soft.draw(vector, self.random) for _ in reflections]
         lessons = [
             Lesson(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived, picture)
             for drawn, reflection in zip(soft, reflections, strict=True)

@@ -86,13 +86,13 @@ class GroundingDataset(Dataset[GroundingSample]):
 
     def __init__(self, examples: Examples, inputs: InputBuilder, seed: int = 0) -> None:
         self._examples, self._inputs = examples, inputs
-        self._random = np.random.default_rng(seed)
+        self.random = np.random.default_rng(seed)
 
     def __len__(self) -> int:
         return len(self._examples)
 
     def __getitem__(self, index: int) -> GroundingSample:
-        chance = self._random.random(2)
+        chance = self.random.random(2)
         return self.look(Look(index, bool(chance[0] < _MIRROR_SHARE), bool(chance[1] < _ROUTE_SHARE)))
 
     def look(self, look: Look) -> GroundingSample:
@@ -198,13 +198,14 @@ class GroundingLearner(nn.Module):
         tokens, gathered = self.gather(patches, history, route, has_route)
         dense = self._dense(tokens, classes.shape)
         labels = classes.long()
-        class_loss = F.cross_entropy(
-            dense[..., :_CLASSES].flatten(0, -2),
-            labels.flatten(),
-            weight=dense.new_tensor(_CLASS_WEIGHTS),
-            ignore_index=UNLABELLED,
+        labelled = labels != UNLABELLED
+        counts = dense.new_tensor(_CLASS_WEIGHTS)[torch.where(labelled, labels, 0)] * labelled
+        class_losses = F.cross_entropy(
+            dense[..., :_CLASSES].flatten(0, -2), labels.flatten(), ignore_index=UNLABELLED, reduction="none"
         )
-        agents = (labels >= FIRST_AGENT_CLASS) & (labels != UNLABELLED)
+        # Scenes may come without dense targets: a batch of nothing else teaches the facts alone.
+        class_loss = (class_losses * counts.flatten()).sum() / counts.sum().clamp_min(1e-6)
+        agents = (labels >= FIRST_AGENT_CLASS) & labelled
         weights = torch.where(agents, _AGENT_RANGE_WEIGHT, 1.0) * (range_log > 0)
         range_error = (dense[..., _CLASSES] - range_log).abs()
         range_loss = (range_error * weights).sum() / weights.sum().clamp_min(1)

@@ -67,7 +67,7 @@ class IntentDataset(Dataset[IntentSample]):
         self, examples: Examples, read: FloatArray | None, route_share: float, seed: int = 0
     ) -> None:
         self._examples, self._read, self._route_share = examples, read, route_share
-        self._random = np.random.default_rng(seed)
+        self.random = np.random.default_rng(seed)
         self._mirrored_bins = np.stack([examples.plan(i).mirrored().bins() for i in range(len(examples))])
         self._nothing = np.zeros(0, np.float32)
 
@@ -75,7 +75,7 @@ class IntentDataset(Dataset[IntentSample]):
         return len(self._examples)
 
     def __getitem__(self, index: int) -> IntentSample:
-        chance = self._random.random(2)
+        chance = self.random.random(2)
         return self.look(index, mirror=bool(chance[0] < 0.5), route=bool(chance[1] < self._route_share))
 
     def look(self, index: int, *, mirror: bool, route: bool) -> IntentSample:
@@ -112,7 +112,7 @@ def read_facts(vla: LookTwiceVla, examples: Examples, vision: VisionCache, seed:
     sides = 1 + vision.mirrored
     read = np.empty((len(examples), sides, 2, len(FACTS)), np.float32)
     pictured, random = examples.pictured, np.random.default_rng(seed)
-    with_pictures = np.flatnonzero(pictured)
+    with_pictures, device = np.flatnonzero(pictured), vla.device
     for side in range(sides):
         truth = mirrored(examples.facts) if side else examples.facts
         flip = _MIRROR if side else np.ones(4, np.float32)
@@ -122,13 +122,9 @@ def read_facts(vla: LookTwiceVla, examples: Examples, vision: VisionCache, seed:
                 places = with_pictures[start : start + _BATCH]
                 seen = np.stack([vision.tokens(int(place), bool(side)) for place in places])
                 known = np.isfinite(examples.route[places]).all(axis=(1, 2)) & bool(has_route)
-                gathered = vla.resampler.gather(
-                    torch.from_numpy(seen).float(),
-                    torch.from_numpy(history[places]),
-                    torch.from_numpy(route[places]),
-                    torch.from_numpy(known),
-                )
-                read[places, side, has_route] = likely(vla.resampler.facts(gathered)).numpy()
+                inputs = (seen.astype(np.float32), history[places], route[places], known)
+                gathered = vla.resampler.gather(*(torch.from_numpy(each).to(device) for each in inputs))
+                read[places, side, has_route] = likely(vla.resampler.facts(gathered)).cpu().numpy()
             if not pictured.all():
                 there = read[with_pictures, side, has_route]
                 read[~pictured, side, has_route] = misread(

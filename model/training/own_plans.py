@@ -80,8 +80,9 @@ class _Reading:
                     states.append(rows)
                     bins.append(plans)
         # [mirror, route, n, width]
-        self._states = torch.stack(states).view(2, 2, len(data), IntentTrunk.width).clone()
-        self._weight, self._bias = _fit(self._states.flatten(0, 2), torch.cat(bins).clone(), seed)
+        stacked = torch.stack(states).view(2, 2, len(data), IntentTrunk.width).clone()
+        self._weight, self._bias = _fit(stacked.flatten(0, 2), torch.cat(bins).clone(), seed)
+        self._states = stacked.cpu()
 
     def scores(self, index: int, mirror: int, route: int) -> FloatArray:
         """How likely each word is in each tick, log [64, words of all groups]."""
@@ -93,25 +94,26 @@ class _Reading:
 def _states(
     part: Any, data: IntentDataset, around: str, *, mirror: bool, route: bool
 ) -> tuple[Tensor, Tensor]:
-    states, bins = [], []
+    states, bins, device = [], [], next(part.parameters()).device
     for start in range(0, len(data), _BATCH):
         places = range(start, min(start + _BATCH, len(data)))
         batch = collate_intents([data.look(place, mirror=mirror, route=route) for place in places])
-        states.append(part.state(batch[around], batch["history"], batch["route"], batch["has_route"]).float())
-        bins.append(batch["plan_bins"])
+        given = (batch[name].to(device) for name in (around, "history", "route", "has_route"))
+        states.append(part.state(*given).float())
+        bins.append(batch["plan_bins"].to(device))
     return torch.cat(states), torch.cat(bins)
 
 
 def _fit(states: Tensor, bins: Tensor, seed: int) -> tuple[FloatArray, FloatArray]:
     """A linear reading of expert plans: weight and bias."""
-    words = nn.Linear(states.shape[1], TICKS * sum(_SIZES))
+    words = nn.Linear(states.shape[1], TICKS * sum(_SIZES)).to(states.device)
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(words.parameters(), _RATE)
     batch = min(_BATCH, len(states))
     steps = max(_LEAST_STEPS, _EPOCHS * len(states) // batch)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATE, steps)
     for _ in range(steps):
-        places = torch.randint(len(states), (batch,), generator=generator)
+        places = torch.randint(len(states), (batch,), generator=generator).to(states.device)
         scores = words(states[places]).view(len(places), TICKS, -1).split(_SIZES, dim=-1)
         taught = bins[places].long()
         losses = [
@@ -122,4 +124,4 @@ def _fit(states: Tensor, bins: Tensor, seed: int) -> tuple[FloatArray, FloatArra
         torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         schedule.step()
-    return words.weight.detach().numpy(), words.bias.detach().numpy()
+    return words.weight.detach().cpu().numpy(), words.bias.detach().cpu().numpy()

@@ -7,9 +7,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import torch
 from torch import nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, Subset, get_worker_info
 from transformers import Trainer, TrainerCallback, TrainingArguments
 
 from model.network.allocator import FreedMemory
@@ -40,6 +41,7 @@ class LearnerTrainer(Trainer):
         save_every: int,
         bf16: bool,
         use_cpu: bool,
+        workers: int,
     ) -> None:
         arguments = TrainingArguments(
             output_dir=str(folder / "state"),
@@ -61,8 +63,7 @@ class LearnerTrainer(Trainer):
             use_cpu=use_cpu,
             report_to=[],
             remove_unused_columns=False,
-            # Decoding pictures for the tower takes a third of a step: beside the step, not before it.
-            dataloader_num_workers=1 if recipe.goal == "ground" else 0,
+            dataloader_num_workers=workers,
             disable_tqdm=True,
         )
         folder.mkdir(parents=True, exist_ok=True)
@@ -77,10 +78,20 @@ class LearnerTrainer(Trainer):
         self._parts: dict[str, list[torch.Tensor]] = {}
 
     def get_train_dataloader(self) -> Any:
-        """Batches of equal tasks where there is a sampler for them."""
+        """Batches of equal tasks where there is a sampler for them, of any examples elsewhere."""
+        arguments = self.args
+        chosen: dict[str, Any] = {"batch_sampler": self._sampler}
         if self._sampler is None:
-            return super().get_train_dataloader()
-        loader = DataLoader(self._dataset, batch_sampler=self._sampler, collate_fn=self.data_collator)
+            chosen = {"batch_size": arguments.train_batch_size, "sampler": self._get_train_sampler()}
+        loader = DataLoader(
+            self._dataset,
+            collate_fn=self.data_collator,
+            num_workers=arguments.dataloader_num_workers,
+            persistent_workers=arguments.dataloader_num_workers > 0,
+            pin_memory=not arguments.use_cpu,
+            worker_init_fn=draw_apart,
+            **chosen,
+        )
         return self.accelerator.prepare(loader)
 
     def compute_loss(self, model: nn.Module, inputs: Any, *args: Any, **kwargs: Any) -> Any:
@@ -129,6 +140,15 @@ class LearnerTrainer(Trainer):
     def _load_from_checkpoint(self, resume_from_checkpoint: str, model: nn.Module | None = None) -> None:
         state = torch.load(Path(resume_from_checkpoint) / _STATE_FILE, map_location="cpu", weights_only=True)
         (model or self._learner).load_state_dict(state)
+
+
+def draw_apart(worker: int) -> None:
+    """Give a worker's dataset random numbers of its own: all workers begin as copies of one."""
+    info: Any = get_worker_info()
+    dataset = info.dataset
+    while isinstance(dataset, Subset):
+        dataset = dataset.dataset
+    dataset.random = np.random.default_rng(info.seed)
 
 
 def is_vision(name: str) -> bool:

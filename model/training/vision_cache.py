@@ -8,13 +8,14 @@ killed run goes on behind the last whole episode.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch.utils.data import DataLoader, Dataset
 
 from model.driving.hashing import hash_of
 from model.driving.whole_files import written_whole
@@ -58,6 +59,7 @@ def open_vision(
     folder: Path,
     *,
     mirrored: bool,
+    workers: int = 0,
     on_done: Callable[[int, int], None] | None = None,
 ) -> VisionCache:
     """The tokens that ``loaded``'s tower gives for examples; worked out where they are not there yet.
@@ -69,43 +71,75 @@ def open_vision(
         examples: to look at.
         folder: where the files lie or go.
         mirrored: look at mirror images too.
+        workers: processes that decode pictures; 0 decodes them in this one.
         on_done: told how many of how many episodes are done, whenever one is.
     """
     tower, pictured = _tower(loaded), examples.pictured
     changes = np.diff(examples.episode) | np.diff(pictured)
     ends = [*np.flatnonzero(changes) + 1, len(examples)]
     episodes = [range(start, end) for start, end in zip([0, *ends], ends, strict=False)]
-    parts: list[Tokens] = []
-    for number, places in enumerate(episodes, start=1):
-        if not pictured[places.start]:
-            parts.append(np.zeros((1 + mirrored, len(places), 0, 0), np.float16))
-            continue
-        path = folder / f"vision-{_key(tower, examples, places, mirrored=mirrored)}.npy"
-        if not path.exists():
-            seen = [_look(loaded, examples, places, mirror) for mirror in (False, True)[: 1 + mirrored]]
-            with written_whole(path) as temporary, temporary.open("wb") as file:
-                np.save(file, np.stack(seen))
-            if on_done is not None:
-                on_done(number, len(episodes))
-        parts.append(np.load(path, mmap_mode="r"))
-    return VisionCache(parts)
+    paths = {
+        places: folder / f"vision-{_key(tower, examples, places, mirrored=mirrored)}.npy"
+        for places in episodes
+        if pictured[places.start]
+    }
+    missing = [places for places, path in paths.items() if not path.exists()]
+    for places, seen in _look(loaded, examples, missing, mirrored, workers):
+        with written_whole(paths[places]) as temporary, temporary.open("wb") as file:
+            np.save(file, seen)
+        if on_done is not None:
+            on_done(episodes.index(places) + 1, len(episodes))
+    return VisionCache(
+        [
+            np.load(paths[places], mmap_mode="r")
+            if places in paths
+            else np.zeros((1 + mirrored, len(places), 0, 0), np.float16)
+            for places in episodes
+        ]
+    )
+
+
+class _Pictures(Dataset[npt.NDArray[np.uint8]]):
+    """The patches of examples, uint8 [sides, p, n]: as they are and, where asked for, mirrored."""
+
+    def __init__(self, loaded: Loaded, examples: Examples, mirrored: bool) -> None:
+        self._inputs, self._examples, self._mirrored = loaded.inputs, examples, mirrored
+
+    def __getitem__(self, place: int) -> npt.NDArray[np.uint8]:
+        frames = example_frames(self._examples, place, False, self._inputs)
+        sides = [frames, frames[:, :, ::-1]][: 1 + self._mirrored]
+        return np.stack([patchify(side, self._inputs.settings) for side in sides])
 
 
 @torch.inference_mode()
-def _look(loaded: Loaded, examples: Examples, places: range, mirror: bool) -> Tokens:
-    """Tokens [n, v, hidden] of examples, or of their mirror images."""
+def _look(
+    loaded: Loaded, examples: Examples, episodes: Sequence[range], mirrored: bool, workers: int
+) -> Iterator[tuple[range, Tokens]]:
+    """Tokens [sides, n, v, hidden] of one episode after the other."""
     settings, device = loaded.settings, loaded.model.device
-    found = []
-    for start in range(places.start, places.stop, _BATCH):
-        batch = range(start, min(start + _BATCH, places.stop))
-        patches = np.concatenate(
-            [patchify(example_frames(examples, place, mirror, loaded.inputs), settings) for place in batch]
-        )
-        grid = torch.tensor([settings.grid] * (len(batch) * len(settings.cameras)))
+    batches = [
+        (places, range(start, min(start + _BATCH, places.stop)))
+        for places in episodes
+        for start in range(places.start, places.stop, _BATCH)
+    ]
+    loader = DataLoader(
+        _Pictures(loaded, examples, mirrored),
+        batch_sampler=[list(batch) for _, batch in batches],
+        collate_fn=np.stack,
+        num_workers=workers,
+    )
+    found: list[Tokens] = []
+    for (places, batch), patches in zip(batches, loader, strict=True):
+        count, sides = patches.shape[:2]
+        grid = torch.tensor([settings.grid] * (count * sides * len(settings.cameras)))
         with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16_is_fast(device.type)):
-            tokens = loaded.model.vision(torch.from_numpy(patches).to(device), grid)
-        found.append(tokens.view(len(batch), settings.vision_tokens, -1).half().cpu().numpy())
-    return np.concatenate(found)
+            flat = torch.from_numpy(patches.reshape(-1, patches.shape[-1])).to(device)
+            tokens = loaded.model.vision(flat, grid)
+        tokens = tokens.view(count, sides, settings.vision_tokens, -1).transpose(0, 1)
+        found.append(tokens.half().cpu().numpy())
+        if batch.stop == places.stop:
+            yield places, np.concatenate(found, axis=1)
+            found.clear()
 
 
 def _tower(loaded: Loaded) -> str:

@@ -72,15 +72,15 @@ class FrameDataset(Dataset[Frame]):
 
     def __init__(self, clips: Sequence[FilmedClip], seed: int = 0) -> None:
         self._clips = clips
-        self._random = np.random.default_rng(seed)
+        self.random = np.random.default_rng(seed)
 
     def __len__(self) -> int:
         return len(self._clips)
 
     def __getitem__(self, index: int) -> Frame:
         images = self._clips[index].images
-        frame = frame_of(images[self._random.integers(len(images))])
-        return np.ascontiguousarray(frame[:, ::-1]) if self._random.random() < 0.5 else frame
+        frame = frame_of(images[self.random.integers(len(images))])
+        return np.ascontiguousarray(frame[:, ::-1]) if self.random.random() < 0.5 else frame
 
 
 class VisualCodesLearner(nn.Module):
@@ -155,6 +155,7 @@ def train_visual_codes(
         save_every=save_every,
         bf16=bf16,
         use_cpu=use_cpu,
+        workers=0,
     )
     trainer.train(resume_from_checkpoint=last_whole_state(target / "state"))
     codes.eval().cpu()

@@ -61,6 +61,13 @@ def train(
     ] = None,
     compiled: Annotated[bool, typer.Option(help="Compile the decoder; pays on long runs.")] = False,
     gpu: Annotated[bool, typer.Option(help="Use the accelerators that are there.")] = False,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            help="Processes that prepare batches beside the training; worth as many as there are idle cores.",
+            min=0,
+        ),
+    ] = None,
     rounds: Annotated[
         int, typer.Option(help="teacher: rounds of driving by itself and learning from it.", min=0)
     ] = 0,
@@ -157,7 +164,7 @@ def train(
             scenes,
             source,
             target,
-            RunSettings(cache, bf16=mixed, compiled=compiled, use_cpu=not gpu),
+            RunSettings(cache, bf16=mixed, compiled=compiled, use_cpu=not gpu, workers=workers),
             held_out,
             vision_from,
             reflections,

@@ -9,7 +9,7 @@ import torch
 from model.driving.facts import FACTS, mirrored
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from model.network.checkpoint import Loaded, load
-from model.training.dense import DENSE_SHAPE
+from model.training.dense import DENSE_SHAPE, UNLABELLED
 from model.training.examples import Examples
 from model.training.grounding import (
     GroundingDataset,
@@ -72,6 +72,16 @@ def test_tower_and_resampler_learn_what_is_seen(loaded: Loaded, data: GroundingD
         losses.append({name: float(value.detach()) for name, value in parts.items()})
     for name in ("class_loss", "range_error_log", "motion_error", "fact_loss", "plan_ade_m"):
         assert losses[-1][name] < losses[0][name], name
+
+
+def test_scenes_without_dense_targets_teach_their_facts(loaded: Loaded, data: GroundingDataset) -> None:
+    learner = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE)
+    batch = collate_grounding([data.look(Look(index)) for index in range(2)])
+    batch["classes"] = torch.full_like(batch["classes"], UNLABELLED)
+    parts = learner(**batch)
+    assert float(parts["class_loss"]) == 0.0
+    assert float(parts["fact_loss"].detach()) > 0.0
+    assert torch.isfinite(parts["loss"])
 
 
 def test_what_is_gathered_depends_on_pictures_history_and_route(

@@ -46,6 +46,15 @@ def test_the_cache_holds_what_the_tower_sees(loaded: Loaded, tmp_path: Path) -> 
         torch.testing.assert_close(kept, seen_now(loaded, index, mirror), rtol=0.1, atol=0.05)
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # where there are fewer cores
+def test_other_processes_decode_the_same(loaded: Loaded, tmp_path: Path) -> None:
+    here = open_vision(loaded, EXAMPLES, tmp_path / "here", mirrored=True)
+    there = open_vision(loaded, EXAMPLES, tmp_path / "there", mirrored=True, workers=2)
+    for index in range(len(EXAMPLES)):
+        for mirror in (False, True):
+            np.testing.assert_array_equal(there.tokens(index, mirror), here.tokens(index, mirror))
+
+
 def test_examples_without_pictures_have_no_tokens(loaded: Loaded, tmp_path: Path) -> None:
     blind = []
     for index in range(2):

@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from torch.utils.data import DataLoader, Dataset, Subset
+
+from model.driving.scene_store import write_scenes
+from model.training.recipes import NANO
+from model.training.run import RunSettings, run
+from model.training.trainer import draw_apart
+from tests.model.training.scenes import training_scene
+
+# torch warns where there are fewer cores than workers.
+pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
+
+
+class _Chances(Dataset[float]):
+    def __init__(self) -> None:
+        self.random = np.random.default_rng(0)
+
+    def __len__(self) -> int:
+        return 8
+
+    def __getitem__(self, index: int) -> float:
+        return float(self.random.random())
+
+
+def test_workers_draw_numbers_of_their_own() -> None:
+    loader = DataLoader(Subset(_Chances(), range(8)), batch_size=1, num_workers=2, worker_init_fn=draw_apart)
+    drawn = [float(value) for value in loader]
+    assert len(set(drawn)) == len(drawn)
+
+
+@pytest.mark.parametrize("recipe", ["ground", "read-tracks", "meta-act"])
+def test_batches_are_prepared_in_other_processes(
+    recipe: str, resampling_checkpoint: Path, tmp_path: Path
+) -> None:
+    write_scenes(tmp_path / "scenes" / "a.parquet", [training_scene(index) for index in range(8)])
+    short = replace(NANO[recipe], steps=3, batch_size=4, warmup_steps=1)
+    settings = RunSettings(tmp_path / "cache", bf16=False, workers=2)
+    run(short, tmp_path / "scenes", resampling_checkpoint, tmp_path / "trained", settings)
+    last = json.loads((tmp_path / "trained" / "log.jsonl").read_text().splitlines()[-1])
+    assert last["step"] == 3
+    assert np.isfinite(last["train_loss"])
