@@ -128,7 +128,7 @@ def read_facts(vla: LookTwiceVla, examples: Examples, vision: VisionCache, seed:
             if not pictured.all():
                 there = read[with_pictures, side, has_route]
                 read[~pictured, side, has_route] = misread(
-                    truth[~pictured], truth[with_pictures], there, random
+                    truth[~pictured], truth[with_pictures], there, random, device
                 )
     return read
 

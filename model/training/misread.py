@@ -24,7 +24,11 @@ _TIE: Final = 1e-3
 
 
 def misread(
-    facts: FloatArray, known: FloatArray, read: FloatArray, random: np.random.Generator
+    facts: FloatArray,
+    known: FloatArray,
+    read: FloatArray,
+    random: np.random.Generator,
+    device: torch.device = torch.device("cpu"),
 ) -> FloatArray:
     """Readings float32 [m, facts] of scenes without pictures, with probabilities for what is or is not so.
 
@@ -45,21 +49,23 @@ def misread(
         columns = slice(first, first + len(fields))
         first += len(fields)
         mine, theirs = np.nan_to_num(facts[:, columns]), np.nan_to_num(known[:, columns])
-        place = _alike(mine, theirs, random)
+        place = _alike(mine, theirs, random, device)
         errors = read[place, columns] - theirs[place]
         found[:, columns] = mine + np.where(np.isfinite(known[place, columns]), errors, read[place, columns])
     return np.where(IS_YES_OR_NO, found.clip(0, 1), found).astype(np.float32)
 
 
-def _alike(mine: FloatArray, theirs: FloatArray, random: np.random.Generator) -> npt.NDArray[np.int64]:
+def _alike(
+    mine: FloatArray, theirs: FloatArray, random: np.random.Generator, device: torch.device
+) -> npt.NDArray[np.int64]:
     """For each row [m, fields], the place of one of the most alike rows [n, fields]."""
-    there, here = torch.from_numpy(theirs), torch.from_numpy(mine)
-    count, chance = min(_ALIKE, len(theirs)), torch.Generator().manual_seed(int(random.integers(2**31)))
+    there, here = torch.from_numpy(theirs).to(device), torch.from_numpy(mine).to(device)
+    count, chance = min(_ALIKE, len(theirs)), torch.Generator(device).manual_seed(int(random.integers(2**31)))
     nearest = []
     for start in range(0, len(here), _ROWS):
         apart = torch.cdist(here[start : start + _ROWS], there)
         # Many are the same, above all where nobody is: chance decides between those.
-        apart += _TIE * torch.rand(apart.shape, generator=chance)
+        apart += _TIE * torch.rand(apart.shape, generator=chance, device=device)
         nearest.append(apart.topk(count, largest=False).indices)
     drawn = random.integers(count, size=len(mine))
-    return np.asarray(torch.cat(nearest).numpy()[np.arange(len(mine)), drawn], np.int64)
+    return np.asarray(torch.cat(nearest).cpu().numpy()[np.arange(len(mine)), drawn], np.int64)
