@@ -37,6 +37,7 @@ def misread(
         known: [n, facts], what is true in scenes with pictures.
         read: [n, facts], what is read there (`model.network.fact_reader.likely`).
         random: draws one of the most alike.
+        device: where they are looked for.
 
     Raises:
         ValueError: there are no scenes with pictures to learn the errors from.

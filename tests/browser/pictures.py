@@ -1,8 +1,8 @@
 """`make pictures`: the README's pictures, of the bundled checkpoint, each with its name and revision inside.
 
-They show the bundled scene and the seed, of a few, whose second look helps most: it brings the trajectory
-nearer to the expert's than the first plan alone would, and the parts of its draw agree. Without one, the
-first scene.
+They show the bundled scene and the seed, of a few, whose second look helps most: it is that of the draw to
+drive by, brings the trajectory nearer to the expert's than the first plan alone would, and the parts of the
+draw agree. Without one, the first scene.
 """
 
 from __future__ import annotations
@@ -61,13 +61,13 @@ def chosen(planner: PlannerClient, scenes: list[LabelledScene]) -> tuple[int, in
     for place, labelled in enumerate(scenes):
         for seed in SEEDS:
             looked, direct = (
-                planner.plan(labelled.scene, Controls(n=DRAWS, seed=seed, thinking=thinking)).draws
+                planner.plan(labelled.scene, Controls(n=DRAWS, seed=seed, thinking=thinking))
                 for thinking in ("adaptive", "never")
             )
-            for number, (draw, before) in enumerate(zip(looked, direct, strict=True)):
-                if draw.thinking is not None and draw.consistent and lanes_agree(draw, labelled.scene):
-                    farther_m = ade_m(draw, labelled) - ade_m(before, labelled)
-                    found.append((farther_m, place, seed, number))
+            draw, before = looked.draws[looked.agreed], direct.draws[looked.agreed]
+            if draw.thinking is not None and draw.consistent and lanes_agree(draw, labelled.scene):
+                farther_m = ade_m(draw, labelled) - ade_m(before, labelled)
+                found.append((farther_m, place, seed, looked.agreed))
     _, place, seed, number = min(found)
     return place, seed, number
 
