@@ -125,11 +125,9 @@ def read_facts(vla: LookTwiceVla, examples: Examples, vision: VisionCache, seed:
                 inputs = (seen.astype(np.float32), history[places], route[places], known)
                 gathered = vla.resampler.gather(*(torch.from_numpy(each).to(device) for each in inputs))
                 read[places, side, has_route] = likely(vla.resampler.facts(gathered)).cpu().numpy()
-            if not pictured.all():
-                there = read[with_pictures, side, has_route]
-                read[~pictured, side, has_route] = misread(
-                    truth[~pictured], truth[with_pictures], there, random, device
-                )
+        if not pictured.all():
+            there = read[with_pictures, side]
+            read[~pictured, side] = misread(truth[~pictured], truth[with_pictures], there, random, device)
     return read
 
 

@@ -30,12 +30,12 @@ def misread(
     random: np.random.Generator,
     device: torch.device = torch.device("cpu"),
 ) -> FloatArray:
-    """Readings float32 [m, facts] of scenes without pictures, with probabilities for what is or is not so.
+    """Readings float32 [m, times, facts] of scenes without pictures; probabilities of what is or is not so.
 
     Args:
         facts: [m, facts], what is true in them; NaN where a fact does not apply.
         known: [n, facts], what is true in scenes with pictures.
-        read: [n, facts], what is read there (`model.network.fact_reader.likely`).
+        read: [n, times, facts], what is read there each time (`model.network.fact_reader.likely`).
         random: draws one of the most alike.
         device: where they are looked for.
 
@@ -44,15 +44,15 @@ def misread(
     """
     if not len(known):
         raise ValueError("without any scenes with pictures nobody knows how they are read")
-    found = np.empty_like(facts)
+    found = np.empty((len(facts), *read.shape[1:]), np.float32)
     first = 0
     for fields in FACT_GROUPS:
         columns = slice(first, first + len(fields))
         first += len(fields)
         mine, theirs = np.nan_to_num(facts[:, columns]), np.nan_to_num(known[:, columns])
         place = _alike(mine, theirs, random, device)
-        errors = read[place, columns] - theirs[place]
-        found[:, columns] = mine + np.where(np.isfinite(known[place, columns]), errors, read[place, columns])
+        seen, was_known = read[place][..., columns], np.isfinite(known[place, columns])[:, None]
+        found[..., columns] = mine[:, None] + np.where(was_known, seen - theirs[place][:, None], seen)
     return np.where(IS_YES_OR_NO, found.clip(0, 1), found).astype(np.float32)
 
 

@@ -31,7 +31,9 @@ def test_numbers_are_wrong_as_they_are_where_pictures_are_read() -> None:
     absent = known[:, PRESENT] == 0
     read[:, PRESENT] = np.where(absent, np.where(np.arange(2000) % 10 == 0, 0.8, 0.1), 0.9)
     truth = scenes(1000, 1)
-    found = misread(truth, known, read, np.random.default_rng(2))
+    twice = misread(truth, known, np.stack([read, read], axis=1), np.random.default_rng(2))
+    np.testing.assert_array_equal(twice[:, 0], twice[:, 1])
+    found = twice[:, 0]
     far, near = np.nan_to_num(truth[:, GAP]) > 3.1, (truth[:, GAP] < 2.9) & (truth[:, PRESENT] == 1)
     assert np.median(found[far, SPEED] - truth[far, SPEED]) == pytest.approx(-0.5, abs=1e-5)
     assert np.median(found[near, SPEED] - truth[near, SPEED]) == pytest.approx(0, abs=1e-5)
@@ -43,7 +45,7 @@ def test_numbers_are_wrong_as_they_are_where_pictures_are_read() -> None:
 def test_what_is_or_is_not_so_stays_a_probability() -> None:
     known = scenes(50, 3)
     read = np.nan_to_num(known) + np.random.default_rng(0).normal(size=known.shape).astype(np.float32)
-    found = misread(scenes(20, 4), known, read, np.random.default_rng(0))
+    found = misread(scenes(20, 4), known, read[:, None], np.random.default_rng(0))[:, 0]
     assert np.isfinite(found).all()
     assert found[:, IS_YES_OR_NO].min() >= 0
     assert found[:, IS_YES_OR_NO].max() <= 1
@@ -52,4 +54,4 @@ def test_what_is_or_is_not_so_stays_a_probability() -> None:
 def test_without_pictures_anywhere_nobody_knows() -> None:
     facts = scenes(3, 0)
     with pytest.raises(ValueError, match="how they are read"):
-        misread(facts, facts[:0], facts[:0], np.random.default_rng(0))
+        misread(facts, facts[:0], facts[:0, None], np.random.default_rng(0))
