@@ -51,7 +51,7 @@ def misread(
         first += len(fields)
         mine, theirs = np.nan_to_num(facts[:, columns]), np.nan_to_num(known[:, columns])
         place = _alike(mine, theirs, random, device)
-        seen, was_known = read[place][..., columns], np.isfinite(known[place, columns])[:, None]
+        seen, was_known = read[place, :, columns], np.isfinite(known[place, columns])[:, None]
         found[..., columns] = mine[:, None] + np.where(was_known, seen - theirs[place][:, None], seen)
     return np.where(IS_YES_OR_NO, found.clip(0, 1), found).astype(np.float32)
 

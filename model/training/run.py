@@ -60,8 +60,8 @@ class RunSettings:
         bf16: mixed precision.
         compiled: compile the decoder; pays after a few hundred steps.
         use_cpu: stay off accelerators.
-        workers: processes that make examples into batches beside the training. None: one where pictures are
-            decoded for the tower, which takes a third of a step on a CPU; elsewhere none.
+        workers: processes that make examples into batches beside the training. Grounding has at least one:
+            decoding pictures for the tower takes a third of a step on a CPU.
     """
 
     cache: Path
@@ -71,7 +71,7 @@ class RunSettings:
     bf16: bool = True
     compiled: bool = False
     use_cpu: bool = True
-    workers: int | None = None
+    workers: int = 0
 
     @property
     def device(self) -> torch.device:
@@ -161,9 +161,7 @@ def run(
         held_out = Examples.from_scenes(validation, loaded.settings.cameras)
         held_out_read = None
         if recipe.pictures:
-            seen = open_vision(
-                loaded, held_out, settings.cache, mirrored=False, workers=settings.workers or 0
-            )
+            seen = open_vision(loaded, held_out, settings.cache, mirrored=False, workers=settings.workers)
             held_out_read = read_facts(loaded.model, held_out, seen)
         validate = partial(read_errors, learner, held_out, held_out_read)
     trainer = LearnerTrainer(
@@ -179,7 +177,7 @@ def run(
         save_every=settings.save_every,
         bf16=settings.bf16,
         use_cpu=settings.use_cpu,
-        workers=int(recipe.goal == "ground") if settings.workers is None else settings.workers,
+        workers=max(settings.workers, int(recipe.goal == "ground")),
     )
     if trainer.is_world_process_zero():
         _inherit_log(target / LOG_FILE, [source, *([vision_source] if vision_source else [])])
@@ -262,7 +260,7 @@ def _prepare(
             examples,
             settings.cache,
             mirrored=recipe.mirror_share > 0,
-            workers=settings.workers or 0,
+            workers=settings.workers,
         )
     if recipe.goal == "read":
         source: Source = "scene" if recipe.pictures else "tracks"

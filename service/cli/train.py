@@ -62,12 +62,12 @@ def train(
     compiled: Annotated[bool, typer.Option(help="Compile the decoder; pays on long runs.")] = False,
     gpu: Annotated[bool, typer.Option(help="Use the accelerators that are there.")] = False,
     workers: Annotated[
-        int | None,
+        int,
         typer.Option(
             help="Processes that prepare batches beside the training; worth as many as there are idle cores.",
             min=0,
         ),
-    ] = None,
+    ] = 0,
     rounds: Annotated[
         int, typer.Option(help="teacher: rounds of driving by itself and learning from it.", min=0)
     ] = 0,

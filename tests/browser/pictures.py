@@ -60,14 +60,12 @@ def chosen(planner: PlannerClient, scenes: list[LabelledScene]) -> tuple[int, in
     found = [(0.0, 0, 0, 0)]
     for place, labelled in enumerate(scenes):
         for seed in SEEDS:
-            looked, direct = (
-                planner.plan(labelled.scene, Controls(n=DRAWS, seed=seed, thinking=thinking))
-                for thinking in ("adaptive", "never")
-            )
-            draw, before = looked.draws[looked.agreed], direct.draws[looked.agreed]
+            looked = planner.plan(labelled.scene, Controls(n=DRAWS, seed=seed))
+            number, draw = looked.agreed, looked.draws[looked.agreed]
             if draw.thinking is not None and draw.consistent and lanes_agree(draw, labelled.scene):
-                farther_m = ade_m(draw, labelled) - ade_m(before, labelled)
-                found.append((farther_m, place, seed, looked.agreed))
+                never = planner.plan(labelled.scene, Controls(n=DRAWS, seed=seed, thinking="never"))
+                farther_m = ade_m(draw, labelled) - ade_m(never.draws[number], labelled)
+                found.append((farther_m, place, seed, number))
     _, place, seed, number = min(found)
     return place, seed, number
 
