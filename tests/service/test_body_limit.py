@@ -3,8 +3,9 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 
+import httpx
 import pytest
 
 from service.settings import Settings
@@ -62,17 +63,33 @@ def test_scene_files_have_a_limit_of_their_own(served: Served) -> None:
     problem(served.http.post("/v1/scenes:read", content=b"x" * 1000), "invalid-scene-file")
 
 
+@contextmanager
+def held(served: Served, sent: int, padded: str) -> Iterator[httpx.Response]:
+    """While ``sent`` bytes of a body are held that never ends: how another, which is too much, is refused.
+
+    Of two bodies that arrive at once either may be the one that is too much, so both are sent until it is
+    the second.
+    """
+    host, port = served.url.removeprefix("http://").split(":")
+    head = f"POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Length: {sent + 1}\r\n\r\n"
+    answers: list[httpx.Response] = []
+    with ExitStack() as stack:
+
+        def second_is_refused() -> bool:
+            stack.close()
+            connection = stack.enter_context(socket.create_connection((host, int(port)), timeout=30))
+            connection.sendall(head.encode() + b" " * sent)
+            answers.append(served.http.post("/v1/plan", content=padded, headers=JSON))
+            return answers[-1].status_code == 429
+
+        served.until(second_is_refused)
+        yield answers[-1]
+
+
 def test_all_bodies_together_have_a_limit(engine: ScriptedEngine) -> None:
-    with serve(engine, Settings(max_held_bytes=1_500_000, body_timeout_s=20)) as served:
-        host, port = served.url.removeprefix("http://").split(":")
-        head = "POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000001\r\n\r\n"
-        with socket.create_connection((host, int(port)), timeout=30) as connection:
-            connection.sendall(head.encode() + b" " * 1_000_000)
-            padded = json.dumps(body()) + " " * 1_000_000
-            served.until(
-                lambda: served.http.post("/v1/plan", content=padded, headers=JSON).status_code == 429
-            )
-            refused = served.http.post("/v1/plan", content=padded, headers=JSON)
+    padded = json.dumps(body()) + " " * 1_000_000
+    with serve(engine, Settings(max_held_bytes=1_500_000, body_timeout_s=300)) as served:
+        with held(served, 1_000_000, padded) as refused:
             assert "together" in problem(refused, "queue-full").detail
             assert refused.headers["Retry-After"] == "1"
             assert served.http.post("/v1/plan", json=body()).status_code == 200
@@ -81,19 +98,14 @@ def test_all_bodies_together_have_a_limit(engine: ScriptedEngine) -> None:
 
 def test_large_bodies_leave_room_for_small_ones(engine: ScriptedEngine) -> None:
     """The large ones that are under way hold a quarter, and those that are refused nothing."""
-    settings = Settings(max_held_bytes=16_000_000, max_body_bytes=3_000_000, body_timeout_s=20)
-    with serve(engine, settings) as served, ExitStack() as stack:
-        host, port = served.url.removeprefix("http://").split(":")
-        head = b"POST /v1/plan HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2900000\r\n\r\n"
-        held = stack.enter_context(socket.create_connection((host, int(port)), timeout=30))
-        held.sendall(head + b" " * 2_500_000)
-        padded = json.dumps(body()) + " " * 2_000_000
-        served.until(lambda: served.http.post("/v1/plan", content=padded, headers=JSON).status_code == 429)
-        for _ in range(9):
-            refused = served.http.post("/v1/plan", content=padded, headers=JSON)
-            assert "4000000 bytes" in problem(refused, "queue-full").detail
-        assert served.http.post("/v1/plan", json=body()).status_code == 200
-        held.close()
+    settings = Settings(max_held_bytes=16_000_000, max_body_bytes=3_000_000, body_timeout_s=300)
+    padded = json.dumps(body()) + " " * 2_000_000
+    with serve(engine, settings) as served:
+        with held(served, 2_500_000, padded) as refused:
+            for _ in range(9):
+                assert "4000000 bytes" in problem(refused, "queue-full").detail
+                refused = served.http.post("/v1/plan", content=padded, headers=JSON)
+            assert served.http.post("/v1/plan", json=body()).status_code == 200
         served.until(lambda: served.http.post("/v1/plan", content=padded, headers=JSON).status_code == 200)
 
 
