@@ -141,7 +141,9 @@ class OutcomeLearner(nn.Module):
             )
             for number, item in enumerate(items)
         ]
-        with torch.inference_mode():
+        device = next(network.parameters()).device
+        # The engine's memory has the weights' type, which autocast would not write into it.
+        with torch.inference_mode(), torch.autocast(device.type, enabled=False):
             found = draws_of(Runner(self._loaded, len(items) * settings.draws), requests)
         network.train(was_training)
         return list(found.values())

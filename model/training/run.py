@@ -161,7 +161,14 @@ def run(
         held_out = Examples.from_scenes(validation, loaded.settings.cameras)
         held_out_read = None
         if recipe.pictures:
-            seen = open_vision(loaded, held_out, settings.cache, mirrored=False, workers=settings.workers)
+            seen = open_vision(
+                loaded,
+                held_out,
+                settings.cache,
+                mirrored=False,
+                bf16=settings.bf16,
+                workers=settings.workers,
+            )
             held_out_read = read_facts(loaded.model, held_out, seen)
         validate = partial(read_errors, learner, held_out, held_out_read)
     trainer = LearnerTrainer(
@@ -260,6 +267,7 @@ def _prepare(
             examples,
             settings.cache,
             mirrored=recipe.mirror_share > 0,
+            bf16=settings.bf16,
             workers=settings.workers,
         )
     if recipe.goal == "read":

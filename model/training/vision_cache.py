@@ -21,7 +21,6 @@ from model.driving.hashing import hash_of
 from model.driving.whole_files import written_whole
 from model.network.checkpoint import Loaded
 from model.network.patches import patchify
-from model.network.precision import bfloat16_is_fast
 from model.training.examples import Examples, example_frames
 
 _BATCH: Final = 16
@@ -59,6 +58,7 @@ def open_vision(
     folder: Path,
     *,
     mirrored: bool,
+    bf16: bool = False,
     workers: int = 0,
     on_done: Callable[[int, int], None] | None = None,
 ) -> VisionCache:
@@ -71,6 +71,7 @@ def open_vision(
         examples: to look at.
         folder: where the files lie or go.
         mirrored: look at mirror images too.
+        bf16: mixed precision, as the training has it.
         workers: processes that decode pictures; 0 decodes them in this one.
         on_done: told how many of how many episodes are done, whenever one is.
     """
@@ -84,7 +85,7 @@ def open_vision(
         if pictured[places.start]
     }
     missing = [places for places, path in paths.items() if not path.exists()]
-    for places, seen in _look(loaded, examples, missing, mirrored, workers):
+    for places, seen in _look(loaded, examples, missing, mirrored, bf16, workers):
         with written_whole(paths[places]) as temporary, temporary.open("wb") as file:
             np.save(file, seen)
         if on_done is not None:
@@ -113,7 +114,7 @@ class _Pictures(Dataset[npt.NDArray[np.uint8]]):
 
 @torch.inference_mode()
 def _look(
-    loaded: Loaded, examples: Examples, episodes: Sequence[range], mirrored: bool, workers: int
+    loaded: Loaded, examples: Examples, episodes: Sequence[range], mirrored: bool, bf16: bool, workers: int
 ) -> Iterator[tuple[range, Tokens]]:
     """Tokens [sides, n, v, hidden] of one episode after the other."""
     settings, device = loaded.settings, loaded.model.device
@@ -132,7 +133,7 @@ def _look(
     for (places, batch), patches in zip(batches, loader, strict=True):
         count, sides = patches.shape[:2]
         grid = torch.tensor([settings.grid] * (count * sides * len(settings.cameras)))
-        with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16_is_fast(device.type)):
+        with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
             flat = torch.from_numpy(patches.reshape(-1, patches.shape[-1])).to(device)
             tokens = loaded.model.vision(flat, grid)
         tokens = tokens.view(count, sides, settings.vision_tokens, -1).transpose(0, 1)

@@ -51,7 +51,9 @@ def test_thinking_and_contradictions_cost_what_they_are_said_to() -> None:
     assert found[1] == pytest.approx(-0.25 - 0.125)
 
 
-def noted(part: str, recipe: Recipe, scenes: Path, source: Path, folder: Path) -> list[float]:
+def noted(
+    part: str, recipe: Recipe, scenes: Path, source: Path, folder: Path, *, bf16: bool = False
+) -> list[float]:
     """A part of each step's loss, while the recipe is run."""
     found: list[float] = []
     plain = OutcomeLearner.forward
@@ -63,7 +65,7 @@ def noted(part: str, recipe: Recipe, scenes: Path, source: Path, folder: Path) -
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OutcomeLearner, "forward", noting)
-        run(recipe, scenes, source, folder / "rl", RunSettings(folder / "cache", bf16=False))
+        run(recipe, scenes, source, folder / "rl", RunSettings(folder / "cache", bf16=bf16))
     return found
 
 
@@ -87,6 +89,14 @@ def test_a_run_draws_as_the_learner_reckons_and_is_logged(
     assert any("language_model" in name for name in moved)
     last = json.loads((tmp_path / "rl" / "log.jsonl").read_text().splitlines()[-1])
     assert last["step"] == 2
+
+
+def test_a_run_in_bfloat16_draws_in_single_precision(resampling_checkpoint: Path, tmp_path: Path) -> None:
+    scenes = tmp_path / "scenes"
+    write_scenes(scenes / "a.parquet", [training_scene(index) for index in range(3)])
+    recipe = replace(NANO["cf-rl"], steps=1, batch_size=2, warmup_steps=1, outcome=OutcomeSettings(draws=3))
+    ratios = noted("policy_ratio", recipe, scenes, resampling_checkpoint, tmp_path, bf16=True)
+    assert ratios == pytest.approx([1.0], abs=0.05)
 
 
 def test_what_is_worth_more_is_drawn_more_often(resampling_checkpoint: Path, tmp_path: Path) -> None:
