@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from typing import Final, TypeVar
 
 import httpx
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, JsonValue, ValidationError
 
 from clients import wire
 from model.driving.plan import Plan, PlanError, parse_plan
@@ -95,6 +95,7 @@ class PlannedDraw:
         disagreements: which do not: ``plan_trajectory``, ``reason_change``.
         reasons: the statements that the reflection could make; None without one, and where it could make any.
         logprobs: its tokens and how likely each decision was; None unless asked for.
+        sections: values of the sections that only its format has, by name.
     """
 
     index: int
@@ -112,6 +113,7 @@ class PlannedDraw:
     reasons: tuple[str, ...] | None = None
     logprobs: wire.Logprobs | None = None
     times_s: tuple[float, ...] = TEN_HZ_S
+    sections: Mapping[str, list[JsonValue]] = field(default_factory=dict)
 
     @property
     def at_10_hz(self) -> FloatArray:
@@ -333,4 +335,5 @@ def _draw(draw: wire.Draw) -> PlannedDraw:
         disagreements=tuple(draw.disagreements),
         reasons=None if draw.reasons is None else tuple(draw.reasons),
         logprobs=draw.logprobs,
+        sections={section.name: section.values for section in draw.sections},
     )

@@ -16,6 +16,7 @@ Told = (
     wire.PlanWritten
     | wire.BranchTaken
     | wire.ThinkingWritten
+    | wire.SectionWritten
     | wire.TrajectoryWritten
     | PlanResult
     | ReflectResult
@@ -34,6 +35,7 @@ RefineTold = (
     | wire.PlanWritten
     | wire.BranchTaken
     | wire.ThinkingWritten
+    | wire.SectionWritten
     | wire.TrajectoryWritten
     | wire_refine.RefineResponse
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final, get_args
 
 import numpy as np
@@ -12,6 +13,7 @@ from model.driving.plan import Plan, plan_changes, plan_iou
 from model.driving.trajectory import TEN_HZ_S, agreed
 from model.engines.engine import Draw, ModelCard
 from model.families.registry import family_named
+from model.formats.pieces import Plain
 from service.planning import Planned
 from service.problems import REFUSED, ProblemError
 
@@ -93,6 +95,12 @@ def wire_trajectory(draw: Draw) -> list[list[float]]:
     return rows
 
 
+def wire_sections(sections: Mapping[str, list[Plain]]) -> list[wire.Section]:
+    """What a format's own sections say, for the wire."""
+    told = [{"name": name, "values": values} for name, values in sections.items()]
+    return [wire.Section.model_validate(each) for each in told]
+
+
 def wire_times(draw: Draw) -> list[float] | None:
     """When its poses are, where that is not at 10 Hz."""
     return None if draw.times_s == TEN_HZ_S else list(draw.times_s)
@@ -117,6 +125,7 @@ def _draw(draw: Draw, agreement: Agreement, draft: Draw | None) -> wire.Draw:
         consistent=agreement.consistent,
         disagreements=list(agreement.disagreements),
         reasons=None if draw.reasons is None else list(draw.reasons),
+        sections=wire_sections(draw.sections),
         tokens=dict(draw.tokens),
         logprobs=_logprobs(draw),
     )

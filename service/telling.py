@@ -8,16 +8,20 @@ from model.engines.engine import DraftFinished, SectionFinished, TextWritten
 from model.families.family import Family
 from model.families.registry import family_named
 from model.formats.pieces import Values
-from service.answers import wire_branch, wire_plan, wire_times, wire_trajectory
+from service.answers import wire_branch, wire_plan, wire_sections, wire_times, wire_trajectory
 from service.planning import Judged
 from service.planning import Told as Happened
 
-Written = wire.PlanWritten | wire.BranchTaken | wire.ThinkingWritten | wire.TrajectoryWritten
+Written = (
+    wire.PlanWritten | wire.BranchTaken | wire.ThinkingWritten | wire.SectionWritten | wire.TrajectoryWritten
+)
 """The data of an event."""
 
 
 class PlanTeller:
-    """Tells of the draws of one scene, by the kind of what they say: a plan, an option, words, a trajectory.
+    """Tells of the draws of one scene, by the kind of what they say.
+
+    That is a plan, an option, words, a trajectory, or a section that only their format has.
 
     Args:
         format: that the response is in.
@@ -45,6 +49,9 @@ class PlanTeller:
             case SectionFinished(index, section, _, (Plan() as plan, *_)) if section in family.plans:
                 name = "plan" if section == family.first_plan else "revised_plan"
                 return [(name, wire.PlanWritten(index=index, plan=wire_plan(plan)))]
+            case SectionFinished(index, section, _, (_, *_) as values) if section in family.own_sections:
+                [told] = wire_sections(family.own(Values({section: values})))
+                return [("section", wire.SectionWritten(index=index, section=told))]
             case DraftFinished(draw):
                 trajectory = wire.TrajectoryWritten(
                     index=draw.index, trajectory=wire_trajectory(draw), times_s=wire_times(draw)

@@ -49,7 +49,15 @@ from clients.wire.controls import (
     Thinking,
     Tracks,
 )
-from clients.wire.events import EVENTS, BranchTaken, Event, PlanWritten, ThinkingWritten, TrajectoryWritten
+from clients.wire.events import (
+    EVENTS,
+    BranchTaken,
+    Event,
+    PlanWritten,
+    SectionWritten,
+    ThinkingWritten,
+    TrajectoryWritten,
+)
 from clients.wire.label import Annotations, LabelRequest, LabelResponse, PlanOutcome, Seconds, TeacherName
 from clients.wire.models import LoadRequest, ModelCard, ModelList, NamedModel
 from clients.wire.plan import (
@@ -67,6 +75,7 @@ from clients.wire.plan import (
     Plan,
     PlanRequest,
     PlanResponse,
+    Section,
     Timing,
 )
 from clients.wire.problem import Fault, Problem
@@ -162,4 +171,6 @@ __all__ = [
     "Tracks",
     "Trajectory",
     "TrajectoryWritten",
+    "Section",
+    "SectionWritten",
 ]

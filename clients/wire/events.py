@@ -7,7 +7,7 @@ from typing import Final
 from pydantic import Field, model_validator
 
 from clients.wire.base import Answered, Poses, TimesS, check_times
-from clients.wire.plan import Branch, Plan
+from clients.wire.plan import Branch, Plan, Section
 from clients.wire.problem import Problem
 
 
@@ -32,6 +32,13 @@ class ThinkingWritten(Answered):
     text: str
 
 
+class SectionWritten(Answered):
+    """Data of the event `section`: one that only the format has is finished."""
+
+    index: int
+    section: Section
+
+
 class TrajectoryWritten(Answered):
     """Data of the events `draft_trajectory` and `trajectory`; whether parts agree is not said of a draft."""
 
@@ -44,13 +51,14 @@ class TrajectoryWritten(Answered):
     _timed = model_validator(mode="after")(check_times)
 
 
-Event = PlanWritten | BranchTaken | TrajectoryWritten | ThinkingWritten | Problem
+Event = PlanWritten | BranchTaken | SectionWritten | TrajectoryWritten | ThinkingWritten | Problem
 EVENTS: Final[dict[str, type[Event]]] = {
     "plan": PlanWritten,
     "branch": BranchTaken,
     "draft_trajectory": TrajectoryWritten,
     "thinking": ThinkingWritten,
     "revised_plan": PlanWritten,
+    "section": SectionWritten,
     "trajectory": TrajectoryWritten,
     "error": Problem,
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import Field, SkipValidation, model_validator
+from pydantic import Field, JsonValue, SkipValidation, model_validator
 
 from clients.wire.base import (
     Answered,
@@ -112,6 +112,15 @@ TokenCounts = Annotated[dict[str, int], Field(description="Tokens per section of
 LogprobsOfDraw = Annotated[Logprobs | None, Field(description="Null unless asked for.")]
 
 
+class Section(Answered):
+    """A section of a response that has no field of its own."""
+
+    name: str = Field(description="As the format calls it.")
+    values: list[JsonValue] = Field(
+        description="What it says: numbers, words, lists of repeated values, objects of named ones."
+    )
+
+
 class Draw(Answered):
     """One of the n responses of a scene."""
 
@@ -131,6 +140,9 @@ class Draw(Answered):
     consistent: Consistent = None
     disagreements: Disagreements = Field(default_factory=list)
     reasons: ReasonsInView = None
+    sections: list[Section] = Field(
+        default_factory=list, description="What only this format has, in its order; [] where it has no more."
+    )
     tokens: TokenCounts
     logprobs: LogprobsOfDraw = None
 

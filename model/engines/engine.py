@@ -16,7 +16,7 @@ from model.driving.plan import Plan
 from model.driving.scene import CAMERAS, Scene
 from model.driving.trajectory import TEN_HZ_S, FloatArray, at_10_hz
 from model.families.family import Attempt, Foreseen
-from model.formats.pieces import Value
+from model.formats.pieces import Plain, Value
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
@@ -178,6 +178,7 @@ class Draw:
             where `Controls.logprobs` does not ask for them.
         section_logprobs: of each section's text, the sum over its choices; empty likewise.
         foreseen: what its family reads of it as perceived and foreseen; None where it tells of neither.
+        sections: what the sections say that only its family has, see `Family.own_sections`.
     """
 
     index: int
@@ -199,6 +200,7 @@ class Draw:
     logprobs: tuple[float | None, ...] = ()
     section_logprobs: Mapping[str, float] = field(default_factory=dict)
     foreseen: Foreseen | None = None
+    sections: Mapping[str, list[Plain]] = field(default_factory=dict)
 
     @property
     def at_10_hz(self) -> FloatArray:

@@ -131,6 +131,7 @@ def read(
             logprobs=tuple(response.logprobs) if request.controls.logprobs else (),
             section_logprobs=_by_section(response) if request.controls.logprobs else {},
             foreseen=reading.foreseen,
+            sections=family.own(values),
         )
         for index in draws
     ]

@@ -19,11 +19,13 @@ from model.families.prompts import TextInputs as TextInputs
 from model.formats.pieces import (
     Format,
     FormatError,
+    Plain,
     Section,
     Value,
     Values,
     choices,
     holds,
+    plain,
     walk,
     with_picks,
 )
@@ -284,6 +286,19 @@ class Family:
     def plans(self) -> tuple[str, ...]:
         """The sections of plans, the one that counts first where several are written."""
         return tuple(each for each in (self.revised_plan, self.first_plan) if each is not None)
+
+    @cached_property
+    def own_sections(self) -> frozenset[str]:
+        """The sections that hold neither a plan, the branch, the reflection nor the trajectory."""
+        branch = None if self.branch is None else self.branch.name
+        known = {self.first_plan, branch, self.reflection, self.revised_plan, self.trajectory}
+        return frozenset(self.format.sections()) - known
+
+    def own(self, values: Values) -> dict[str, list[Plain]]:
+        """What a response says in its own sections, in the order of the format."""
+        return {
+            name: [plain(each) for each in values.all(name)] for name in values if name in self.own_sections
+        }
 
     def reflected(self, values: Values) -> str | None:
         """What a response says in its reflection, in words; None where it has none, or says nothing."""

@@ -24,6 +24,22 @@ Value: TypeAlias = "Plan | str | bool | float | tuple[Value, ...] | Mapping[str,
 """A plan, a word or free text, whether a `Maybe` is there, a number, codes or repeated values, a record."""
 
 
+Plain: TypeAlias = "str | bool | float | list[Plain] | dict[str, Plain]"
+"""A value as JSON writes it."""
+
+
+def plain(value: Value) -> Plain:
+    """A value as JSON writes it; a plan is its text."""
+    match value:
+        case Plan():
+            return str(value)
+        case tuple():
+            return [plain(each) for each in value]
+        case Mapping():
+            return {name: plain(each) for name, each in value.items()}
+    return value
+
+
 class FormatError(ValueError):
     """A format that cannot be read without doubt, or text, tokens or values that do not follow a format.
 

@@ -144,6 +144,8 @@ def _told(scene_id: str, draws: list[Draw], chosen: int) -> list[str]:
             "Revised meta actions:",
             str(draw.revised_plan).rstrip(),
         ]
+    for name, values in draw.sections.items():
+        lines += ["", f"{name.replace('_', ' ').capitalize()}: {' '.join(map(str, values))}"]
     return lines
 
 
@@ -160,6 +162,7 @@ def _as_json(scene_id: str, draws: list[Any], chosen: int, picture: Path) -> dic
                 "think_probability": draw.think_probability,
                 "trajectory": draw.trajectory.tolist(),
                 "times_s": list(draw.times_s),
+                "sections": dict(draw.sections),
                 "tokens": dict(draw.tokens),
             }
             for draw in draws

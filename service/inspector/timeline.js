@@ -19,6 +19,13 @@ export function showDraw(draw) {
   if (draw.revised_plan) {
     parts.push(element("h3", { textContent: "Revised plan" }), tracks(draw.revised_plan, draw.plan));
   }
+  for (const section of draw.sections) {
+    const said = section.values.map((value) => typeof value === "string" ? value : JSON.stringify(value)).join(" ");
+    parts.push(
+      element("h3", { textContent: section.name.replaceAll("_", " ") }),
+      element("p", { textContent: said }),
+    );
+  }
   const text = element("pre", { textContent: (draw.revised_plan || draw.plan || { text: "" }).text, tabIndex: 0 });
   const chips = Object.entries(draw.tokens).map(([section, count]) =>
     element("li", { textContent: `${section.replaceAll("_", " ")} ${count}` }));

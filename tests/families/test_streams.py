@@ -53,6 +53,8 @@ def told_of(index: int, events: list[tuple[str, Told]]) -> dict[str, Any]:
                 told[name] = branch
             case wire.ThinkingWritten(index=of, text=text) if of == index:
                 told[name] = told.get(name, "") + text
+            case wire.SectionWritten(index=of, section=section) if of == index:
+                told.setdefault("sections", []).append(section.model_dump())
             case wire.TrajectoryWritten(index=of) if of == index:
                 assert name == "trajectory"
                 told |= data.model_dump(exclude={"index"})
@@ -64,6 +66,8 @@ def answered(draw: wire.Draw, told: dict[str, Any]) -> dict[str, Any]:
     plans = {name: plan.text for name in ("plan", "revised_plan") if (plan := getattr(draw, name))}
     fields = {name: getattr(draw, name) for name in ("branch", "thinking") if getattr(draw, name) is not None}
     names = set(wire.TrajectoryWritten.model_fields) - {"index"}
+    if draw.sections:
+        fields["sections"] = [section.model_dump() for section in draw.sections]
     return plans | fields | draw.model_dump(include=names)
 
 

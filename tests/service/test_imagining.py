@@ -202,6 +202,12 @@ def test_plans_imagine_as_the_caller_decides(served: Served[TorchEngine]) -> Non
             controls = wire.Controls(n=4, imagine=imagine, seed=2)
             draws = planner.plan(scene(), controls, format="vla_world").draws
             assert np.mean(["visual" in draw.tokens for draw in draws]) == share
+            for draw in draws:
+                own = {"perception", "prediction", "action"} | ({"visual"} if share else set())
+                assert own <= set(draw.sections)
+                if share:
+                    codes, camera = draw.sections["visual"]
+                    assert (len(codes), camera[:4]) == (98, "CAM_")
         with pytest.raises(RequestRefused, match="camera has no meaning with imagine: never") as caught:
             planner.plan(scene(), wire.Controls(imagine="never", camera="back"), format="vla_world")
         assert caught.value.errors[0].pointer == "/controls"
