@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -30,3 +31,19 @@ def resampling_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("checkpoint") / "resampling"
     return write_untrained(folder, settings=NANO_SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def toy_family(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The family `toy` is there, as an installed package declares it."""
+    from model.families.registry import GROUP, family_named
+
+    installed = tmp_path_factory.mktemp("installed")
+    about = installed / "toy-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: toy\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[{GROUP}]\ntoy = tests.families.toy:TOY\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(installed)
+        yield
+    family_named.cache_clear()

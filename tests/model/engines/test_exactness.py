@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -25,6 +26,7 @@ from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
 from model.driving.plan import plan_from_bins
+from model.driving.scene import CAMERAS
 from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thinking
 from model.engines.sampling import probabilities
 from model.engines.torch.deadlines import TimeFor
@@ -34,8 +36,8 @@ from model.engines.torch.rows import Row
 from model.engines.torch.runner import Prompt, Runner
 from model.engines.torch.shortcuts import Shortcuts
 from model.families.cf_vla import CF_VLA
-from model.families.family import Family
-from model.families.registry import families_of
+from model.families.family import Attempt, Family
+from model.families.registry import OURS, families_of, family_named
 from model.formats.pieces import Format
 from model.network.checkpoint import Loaded, load
 from model.network.settings import NANO_SETTINGS, VlaSettings
@@ -50,6 +52,8 @@ MIXES = int(os.environ.get("LOOKTWICE_EXACTNESS_MIXES", "8"))
 REQUESTS, ROWS = ((1, 4), (10, 20)) if MIXES <= 100 else ((4, 16), (12, 64))
 """Of a mix; in a longer run many draws share the time of a pass."""
 CHECKPOINT = os.environ.get("LOOKTWICE_EXACTNESS_CHECKPOINT")
+NAMES = ("cf_vla", "traj_only") if CHECKPOINT else (*OURS, "toy")
+"""Formats that are mixed. A trained checkpoint has a few."""
 TOGETHER = 6 if MIXES <= 100 else 3
 """Mixes whose plain decoding is one batch: a token a pass takes as long for a hundred draws as for ten. Fewer
 of large mixes, or the memory that it reserves is more than machines have."""
@@ -94,7 +98,9 @@ class Mix:
 def arrivals(draw: st.DrawFn) -> list[Arrival]:
     found = []
     for index in range(draw(st.integers(*REQUESTS))):
-        format = draw(st.sampled_from(["cf_vla", "cf_vla", "traj_only"]))
+        format = draw(st.sampled_from(["cf_vla"] * len(NAMES) + list(NAMES)))
+        family = family_named(format)
+        scene = draw(st.sampled_from(SCENES))
         thinking: Thinking = draw(st.sampled_from(["adaptive", "adaptive", "always", "never"]))
         prefill = None
         if format == "cf_vla" and draw(st.integers(0, 3)) == 0:
@@ -114,10 +120,15 @@ def arrivals(draw: st.DrawFn) -> list[Arrival]:
             # The clock stands still: deadlines only decide who gives way to whom, and make drafts.
             deadline_ms=draw(st.sampled_from([None, None, 2_000, 3_000])),
         )
-        scene = draw(st.sampled_from(SCENES))
+        if family.imagination is not None and draw(st.booleans()):
+            controls = replace(controls, imagine="always", camera=draw(st.sampled_from(CAMERAS)))
+        attempt = None
+        if family.refines:
+            draft = np.zeros((len(family.times_s), 4), np.float32)
+            attempt = Attempt(draft, draw(st.sampled_from(["Brake.", "It leaves the road on the left."])))
         found.append(
             Arrival(
-                PlanRequest(f"r{index}", scene, format, controls),
+                PlanRequest(f"r{index}", scene, format, controls, attempt),
                 step=draw(st.integers(0, 30)),
                 cancelled=draw(st.one_of(st.none(), st.none(), st.integers(1, 60))),
             )
@@ -138,7 +149,6 @@ mixes = st.builds(
 
 
 Families = Mapping[str, Family]
-NAMES = ("cf_vla", "traj_only")
 
 
 def with_format(format: Format) -> Families:
@@ -149,16 +159,19 @@ def with_format(format: Format) -> Families:
 
 
 made_up: st.SearchStrategy[Families] = st.one_of(
-    st.just(families_of(NAMES, "free_text")),
-    st.just(families_of(NAMES, "phrases")),
+    st.just("free_text").map(partial(families_of, NAMES)),
+    st.just("phrases").map(partial(families_of, NAMES)),
     branching_formats().map(with_format),
 )
 """Those that there are, or one with a format that nobody thought of."""
 
 
 @pytest.fixture(scope="module", params=["every vision token", "resampled"])
-def exact(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Loaded:
+def exact(
+    request: pytest.FixtureRequest, toy_family: None, tmp_path_factory: pytest.TempPathFactory
+) -> Loaded:
     settings = NANO_SETTINGS if request.param == "resampled" else VlaSettings()
+    settings = replace(settings, formats=NAMES, reflection="phrases")
     folder = CHECKPOINT or write_untrained(
         tmp_path_factory.mktemp("narrow") / "untrained", narrow=True, settings=settings
     )
