@@ -11,9 +11,10 @@ import clients.wire as wire
 from model.driving.agreement import Agreement
 from model.driving.plan import Plan, plan_changes, plan_iou
 from model.driving.trajectory import TEN_HZ_S, agreed
-from model.engines.engine import Draw, ModelCard
+from model.engines.engine import Draw
 from model.families.registry import family_named
 from model.formats.pieces import Plain
+from model.network.model_card import ModelCard
 from service.planning import Planned
 from service.problems import REFUSED, ProblemError
 

@@ -12,9 +12,10 @@ import clients.wire as wire
 import clients.wire_imagine as wire_imagine
 from model.driving.images import encode_png
 from model.driving.perceived import Perceived, PerceivedAgent
-from model.engines.engine import CodesWritten, Draw, ModelCard, SectionFinished
+from model.engines.engine import CodesWritten, Draw, SectionFinished
 from model.families.family import Imagination, Predicted
 from model.families.registry import family_named
+from model.network.model_card import ModelCard
 from service.planning import Arrival, Begun, Paint, Planned
 from service.planning import Told as Happened
 from service.problems import CANNOT_IMAGINE, UNKNOWN_FORMAT, ProblemError

@@ -23,9 +23,10 @@ from model.driving.trajectory import (
     check_trajectory,
     wrap_angle,
 )
-from model.engines.engine import Controls, ModelCard, PlanRequest, RequestError
+from model.engines.engine import Controls, PlanRequest, RequestError
 from model.families.family import Attempt
 from model.families.registry import family_named
+from model.network.model_card import ModelCard
 from service.problems import (
     CANNOT_IMAGINE,
     INVALID_ATTEMPT,

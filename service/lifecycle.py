@@ -9,7 +9,8 @@ from typing import Final
 
 import structlog
 
-from model.engines.engine import Engine, Load, ModelCard
+from model.engines.engine import Engine, Load
+from model.network.model_card import ModelCard
 from service.metrics import Metrics
 from service.problems import (
     CHECKPOINT_FAILED,

@@ -16,7 +16,8 @@ from prometheus_client import (
 
 from model.driving.agreement import PARTS, Agreement
 from model.driving.plan import plan_iou
-from model.engines.engine import Draw, Load, ModelCard, Thinking
+from model.engines.engine import Draw, Load, Thinking
+from model.network.model_card import ModelCard
 from service.admission import Admission
 from service.logs import lines_lost
 from service.problems import REJECTIONS, Kind

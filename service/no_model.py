@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.engine import Event, Load, ModelCard, PlanRequest, RequestError
+from model.engines.engine import Event, Load, PlanRequest, RequestError
+from model.network.model_card import ModelCard
 
 CARD: Final = ModelCard(
     name="no-model",

@@ -16,7 +16,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 import clients.wire as wire
 from model.driving.scene import CLIP_FRAMES
-from model.engines.engine import ModelCard
+from model.network.model_card import ModelCard
 from service.answers import plan_answer, wire_branch
 from service.planning import Planned
 from service.problems import INVALID_CLIP, INVALID_IMAGE, INVALID_REQUEST, UNKNOWN_MODEL, ProblemError, at

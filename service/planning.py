@@ -26,11 +26,11 @@ from model.engines.engine import (
     Engine,
     EngineError,
     Event,
-    ModelCard,
     PlanRequest,
     RequestError,
     Started,
 )
+from model.network.model_card import ModelCard
 from service.admission import Admission, Full, Place, whole_seconds
 from service.intake import Geometry, engine_request
 from service.lifecycle import Lifecycle

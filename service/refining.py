@@ -29,8 +29,9 @@ from model.driving.trajectory import (
     at_times,
     check_trajectory,
 )
-from model.engines.engine import Draw, ModelCard
+from model.engines.engine import Draw
 from model.families.registry import family_named
+from model.network.model_card import ModelCard
 from service.answers import plan_answer
 from service.feedback import CALLER, by_rule
 from service.intake import Geometry, geometry_of

@@ -11,7 +11,8 @@ from contextlib import contextmanager
 from typing import Any, Final, Protocol
 
 import clients.wire as wire
-from model.engines.engine import Draw, ModelCard
+from model.engines.engine import Draw
+from model.network.model_card import ModelCard
 from service.problems import ProblemError
 
 _SYSTEM: Final = "looktwice"

@@ -18,6 +18,15 @@ ALLOWED = {
     "model.driving": ("model.driving",),
     "model.formats": ("model.formats", "model.driving"),
     "model.families": ("model.families", "model.formats", "model.driving"),
+    "model.network": ("model.network", "model.families", "model.formats", "model.driving"),
+    "model.engines": ("model.engines", "model.network", "model.families", "model.formats", "model.driving"),
+    "model.evaluation": (
+        *("model.evaluation", "model.engines", "model.network", "model.families", "model.driving"),
+    ),
+    "model.training": (
+        *("model.training", "model.evaluation", "model.engines", "model.network", "model.families"),
+        *("model.formats", "model.driving"),
+    ),
     "clients": ("clients", "model.driving"),
     "clients.importers": ("clients.importers", "clients.navsim", "model.driving"),
     "loadtests": ("loadtests", "clients", "model.driving"),

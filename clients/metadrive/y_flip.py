@@ -20,11 +20,6 @@ def points_from_metadrive(points: npt.ArrayLike) -> Points:
     return flipped
 
 
-def heading_from_metadrive(heading: float) -> float:
-    """A heading of MetaDrive, counter-clockwise positive."""
-    return -heading
-
-
 def centre_line_from_metadrive(lane: Any, spacing_m: float) -> Points:
     """The centre line of a lane of MetaDrive in driving direction, evenly spaced."""
     length = float(lane.length)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncGenerator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from model.driving.scene import CAMERAS, Scene
 from model.driving.trajectory import TEN_HZ_S, FloatArray, at_10_hz
 from model.families.family import Attempt, Foreseen
 from model.formats.pieces import Plain, Value
+from model.network.model_card import ModelCard
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
@@ -271,44 +272,6 @@ class DraftFinished:
 
 
 Event = Started | TextWritten | CodesWritten | SectionFinished | DraftFinished | DrawFinished
-
-
-@dataclass(frozen=True)
-class ModelCard:
-    """What a loaded checkpoint is.
-
-    Attributes:
-        name: e.g. ``looktwice-nano``.
-        revision: changes with the weights.
-        engine: ``torch`` or ``vllm``.
-        formats: response formats it can write; the first is that of requests that name none.
-        cameras: cameras it looks at; a scene must have these.
-        image_size: width, height in pixels that pictures are resized to.
-        parameters: how many weights.
-        inputs: what it takes of a scene beside pictures and history: ``route``, ``tracks``.
-        prompt_tokens: of a scene that brings all of these.
-        input_tokens: of them, how many each of ``inputs`` takes.
-        paints: whether it can paint the pictures that it imagines.
-        details: anything else worth showing, JSON-like.
-    """
-
-    name: str
-    revision: str
-    engine: str
-    formats: tuple[str, ...]
-    cameras: tuple[str, ...]
-    image_size: tuple[int, int]
-    parameters: int
-    inputs: tuple[str, ...] = ("route",)
-    prompt_tokens: int = 0
-    input_tokens: Mapping[str, int] = field(default_factory=dict)
-    paints: bool = False
-    details: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def default_format(self) -> str:
-        """The format of requests that name none: the first; empty where there is none."""
-        return next(iter(self.formats), "")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from model.driving.plan import Plan
 from model.driving.trajectory import GeometryError, check_trajectory
-from model.engines.engine import Draw, ModelCard, PlanRequest, RequestError
+from model.engines.engine import Draw, PlanRequest, RequestError
 from model.engines.reason_mask import ReasonMask
 from model.engines.response import Response
 from model.families.family import Branch, Family
@@ -16,6 +16,7 @@ from model.formats.cursor import CompiledFormat, Cursor
 from model.formats.pieces import FormatError
 from model.formats.text import parse
 from model.network.codec import TrajectoryCodec
+from model.network.model_card import ModelCard
 from model.network.vocabulary import Vocabulary
 
 if TYPE_CHECKING:

@@ -7,9 +7,10 @@ import numpy as np
 from model.driving.images import encode_jpeg
 from model.driving.scene import CLIP_FRAMES, Clip, Scene
 from model.driving.trajectory import HISTORY_STEPS
-from model.engines.engine import Controls, Engine, ModelCard, PlanRequest
+from model.engines.engine import Controls, Engine, PlanRequest
 from model.families.family import Attempt
 from model.families.registry import family_named
+from model.network.model_card import ModelCard
 
 
 def grey_scene(card: ModelCard) -> Scene:

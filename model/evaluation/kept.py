@@ -17,8 +17,9 @@ import numpy.typing as npt
 from model.driving.hashing import hash_of, scene_hash
 from model.driving.perceived import Perceived, PerceivedAgent
 from model.driving.plan import Plan, parse_plan
-from model.engines.engine import Draw, DrawFinished, Engine, Event, Load, ModelCard, PlanRequest, Started
+from model.engines.engine import Draw, DrawFinished, Engine, Event, Load, PlanRequest, Started
 from model.families.family import Foreseen, NextPicture
+from model.network.model_card import ModelCard
 
 _SCHEMA_VERSION: Final = 3
 """Part of every key, so that a draw that is kept otherwise is none that is known."""

@@ -20,10 +20,10 @@ from safetensors import SafetensorError
 from transformers import AutoTokenizer, Qwen2_5_VLConfig
 from transformers.utils import logging as transformers_logging
 
-from model.engines.engine import ModelCard
 from model.network.card import CheckpointError, read_card, weight_files, weights_revision, write_card
 from model.network.codec import CodecError, TrajectoryCodec
 from model.network.inputs import InputBuilder
+from model.network.model_card import ModelCard
 from model.network.numbers import needed_numbers, write_number_embeddings
 from model.network.repository import write_repository
 from model.network.settings import SettingsError, VlaSettings

@@ -131,10 +131,6 @@ class Vocabulary:
         """Token ids of the 6 codes of a trajectory."""
         return tuple(self.code_ids(stage)[int(code)] for stage, code in enumerate(codes))
 
-    def ids_to_codes(self, ids: Sequence[int] | npt.NDArray[np.integer]) -> tuple[int, ...]:
-        """The inverse of `codes_to_ids`; raises ValueError for ids that are not codes of their stage."""
-        return tuple(self.code_ids(stage).index(int(token)) for stage, token in enumerate(ids))
-
     @cached_property
     def alphabets(self) -> Mapping[str, tuple[range, ...]]:
         """Named alphabets of codes: for each codebook the ids of its tokens.

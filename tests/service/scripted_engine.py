@@ -23,7 +23,6 @@ from model.engines.engine import (
     EngineError,
     Event,
     Load,
-    ModelCard,
     PlanRequest,
     RequestError,
     SectionFinished,
@@ -32,6 +31,7 @@ from model.engines.engine import (
 )
 from model.families.family import Foreseen, NextPicture
 from model.formats.pieces import Value
+from model.network.model_card import ModelCard
 
 CARD: Final = ModelCard(
     name="scripted",

@@ -207,7 +207,9 @@ def test_plans_imagine_as_the_caller_decides(served: Served[TorchEngine]) -> Non
                 assert own <= set(draw.sections)
                 if share:
                     codes, camera = draw.sections["visual"]
-                    assert (len(codes), camera[:4]) == (98, "CAM_")
+                    assert isinstance(codes, list)
+                    assert len(codes) == 98
+                    assert str(camera).startswith("CAM_")
         with pytest.raises(RequestRefused, match="camera has no meaning with imagine: never") as caught:
             planner.plan(scene(), wire.Controls(imagine="never", camera="back"), format="vla_world")
         assert caught.value.errors[0].pointer == "/controls"

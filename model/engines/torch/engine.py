@@ -14,15 +14,7 @@ from typing import Final
 import torch
 
 from model.engines.binding import Binding, binding_of
-from model.engines.engine import (
-    DrawFinished,
-    EngineError,
-    Event,
-    Load,
-    ModelCard,
-    PlanRequest,
-    RequestError,
-)
+from model.engines.engine import DrawFinished, EngineError, Event, Load, PlanRequest, RequestError
 from model.engines.pictures import PictureThreads
 from model.engines.requests import painted
 from model.engines.torch.decoder import Counts, Decoder, Failed
@@ -36,6 +28,7 @@ from model.engines.torch.worker import Worker
 from model.engines.warm_up import warm_up
 from model.network.allocator import FreedMemory
 from model.network.checkpoint import load
+from model.network.model_card import ModelCard
 from model.network.precision import bfloat16_is_fast
 from model.network.visual_codes import Frame
 

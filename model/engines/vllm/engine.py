@@ -16,7 +16,7 @@ import numpy as np
 
 from model.driving.images import ImageError
 from model.driving.scene import Scene
-from model.engines.engine import EngineError, Event, Load, ModelCard, PlanRequest, RequestError
+from model.engines.engine import EngineError, Event, Load, PlanRequest, RequestError
 from model.engines.least_error import LeastError
 from model.engines.pictures import PictureThreads
 from model.engines.reason_mask import reason_mask_of
@@ -29,6 +29,7 @@ from model.families.registry import families_of
 from model.formats.cursor import Active, CompiledFormat, Cursor, Rest
 from model.formats.grammar_export import to_lark
 from model.network.checkpoint import read_parts
+from model.network.model_card import ModelCard
 from model.network.visual_codes import Frame
 
 _ENVIRONMENT: Final = {"VLLM_NO_USAGE_STATS": "1", "HF_HUB_OFFLINE": "1", "VLLM_CPU_KVCACHE_SPACE": "2"}

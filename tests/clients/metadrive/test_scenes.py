@@ -15,7 +15,7 @@ from clients.metadrive.episode import run_episode
 from clients.metadrive.maps import make_map
 from clients.metadrive.rig import Rig
 from clients.metadrive.windows import labelled_scenes
-from clients.metadrive.y_flip import heading_from_metadrive, points_from_metadrive
+from clients.metadrive.y_flip import points_from_metadrive
 from model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS, CameraSpec
 from model.driving.metrics import collides, leaves_road
 from model.driving.scene import CAMERAS, EGO_LENGTH_M, SEMANTIC_CLASSES, LabelledScene
@@ -94,7 +94,6 @@ def test_lane_trace_says_where_the_ego_is(filmed: Filmed) -> None:
 
 def test_metadrives_right_is_our_negative_y() -> None:
     assert points_from_metadrive([(3.0, 2.0)]).tolist() == [[3.0, -2.0]]
-    assert heading_from_metadrive(0.25) == -0.25
 
 
 def test_lane_zero_is_the_leftmost_in_our_frame() -> None:

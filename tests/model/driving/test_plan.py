@@ -3,7 +3,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -22,7 +21,6 @@ from model.driving.plan import (
     plan_from_bins,
     plan_iou,
 )
-from model.driving.plan_mending import parse_plan_leniently
 
 PAPERS_EXAMPLE = """\
 - longitudinal
@@ -70,9 +68,6 @@ def test_the_papers_example_is_read_and_written() -> None:
 def test_text_round_trip(plan: Plan) -> None:
     assert parse_plan(str(plan)) == plan
     assert parse_plan(str(plan).removesuffix("\n")) == plan
-    lenient = parse_plan_leniently(str(plan))
-    assert lenient.mends == ()
-    np.testing.assert_array_equal(lenient.plan.bins(), plan.bins())
 
 
 @given(plans(joined=True))
@@ -147,9 +142,8 @@ def test_lines_count_from_where_the_plan_stands_in_a_larger_text() -> None:
 
 @given(st.text("- lateralongitudn\n0123456.s: StrkepLKT", max_size=80))
 def test_any_text_is_a_plan_or_a_plan_error(text: str) -> None:
-    for parse in (parse_plan, parse_plan_leniently):
-        with contextlib.suppress(PlanError):
-            parse(text)
+    with contextlib.suppress(PlanError):
+        parse_plan(text)
 
 
 def test_a_plan_cannot_be_built_against_the_rules() -> None:
@@ -157,69 +151,6 @@ def test_a_plan_cannot_be_built_against_the_rules() -> None:
         Plan(lane=(MetaAction(0, 60, "Keep Lane"),))
     with pytest.raises(PlanError, match="leave the group out"):
         Plan(lane=())
-
-
-# Lenient reading
-
-
-@pytest.mark.parametrize(
-    ("text", "lateral", "mend"),
-    [
-        ("* **Lateral:**\n* 0.0s-6.4s: Straight", "0.0s-6.4s: Straight", "group line rewritten"),
-        ("- lateral\n- 0 - 6.4 s: straight.", "0.0s-6.4s: Straight", "rewritten as '0.0s-6.4s: Straight'"),
-        ("- lateral\n  - 0.0s to 6.4s: LEFT  TURN", "0.0s-6.4s: Left Turn", "rewritten as"),
-        ("- lateral\n  - 0.0s\u20136.4s: Straight", "0.0s-6.4s: Straight", "rewritten as"),
-        ("- lateral\n  - 0.04s-6.38s: Straight", "0.0s-6.4s: Straight", "rewritten as"),
-        ("- lateral\n  - 0.0s-6.0s: Straight", "0.0s-6.4s: Straight", "gaps closed"),
-        ("- lateral\n  - 1.0s-6.4s: Straight", "0.0s-6.4s: Straight", "gaps closed"),
-        ("- lateral\n  - 0.0s-8.0s: Straight", "0.0s-6.4s: Straight", "cut at 6.4s"),
-        ("So:\n- lateral\n  - 0.0s-6.4s: Straight", "0.0s-6.4s: Straight", "line 1: left out"),
-        (
-            "- lateral\n  - 0.0s-2.0s: Straight\n  - 3.0s-6.4s: Left Turn",
-            "0.0s-3.0s: Straight, 3.0s-6.4s: Left Turn",
-            "gaps closed",
-        ),
-        (
-            "- lateral\n  - 0.0s-4.0s: Straight\n  - 3.0s-6.4s: Left Turn",
-            "0.0s-4.0s: Straight, 4.0s-6.4s: Left Turn",
-            "3.0s-6.4s: Left Turn yields where it overlaps",
-        ),
-        (
-            "- lateral\n  - 0.0s-6.4s: Straight\n  - 4.0s-3.0s: Left Turn",
-            "0.0s-6.4s: Straight",
-            "line 3: left out, 4.0s-3.0s: Left Turn does not end after it starts",
-        ),
-        (
-            "- lateral\n  - 0.0s-6.4s: Left Turn\n- lateral\n  - 0.0s-6.4s: Straight",
-            "0.0s-6.4s: Straight",
-            "line 3: group lateral again, the later one counts",
-        ),
-    ],
-)
-def test_what_is_unambiguous_is_mended_and_reported(text: str, lateral: str, mend: str) -> None:
-    mended = parse_plan_leniently(text)
-    assert ", ".join(str(action) for action in mended.plan.lateral or ()) == lateral
-    assert any(mend in reported for reported in mended.mends), mended.mends
-
-
-def test_groups_are_put_in_order() -> None:
-    mended = parse_plan_leniently("- lane\n  - 0.0s-6.4s: Keep Lane\n- lateral\n  - 0.0s-6.4s: Straight\n")
-    assert [group for group, _ in mended.plan.tracks()] == ["lateral", "lane"]
-    assert mended.mends == ("groups put in order",)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "no meta-actions found"),
-        ("I would slow down.", "no meta-actions found"),
-        ("- lateral\n  - 0.0s-6.4s: Swerve", "unknown lateral word 'Swerve'"),
-        ("- lateral\n  - 7.0s-8.0s: Straight", "no meta-action within"),
-    ],
-)
-def test_what_is_ambiguous_is_refused(text: str, message: str) -> None:
-    with pytest.raises(PlanError, match=message):
-        parse_plan_leniently(text)
 
 
 # IOU

@@ -16,11 +16,11 @@ from model.engines.engine import (
     EngineError,
     Event,
     Load,
-    ModelCard,
     PlanRequest,
     RequestError,
     SectionFinished,
 )
+from model.network.model_card import ModelCard
 
 
 def draw_of(
