@@ -10,6 +10,7 @@ from itertools import count
 from typing import Final, TypeVar
 
 from model.driving.images import check_image
+from model.engines.engine import EngineError
 
 _Result = TypeVar("_Result")
 THREADS: Final = 2
@@ -39,6 +40,7 @@ class PictureThreads:
 
         Raises:
             ImageError: one of the pictures is none.
+            EngineError: it was dropped by `close`.
         """
         if await self._run(lambda: _pixels(pictures) > LARGE_PIXELS, large=False):
             return await self._run(work, large=True)
@@ -48,7 +50,7 @@ class PictureThreads:
         if large not in self._pools:
             threads = LARGE_THREADS if large else THREADS
             self._pools[large] = ThreadPoolExecutor(threads, "looktwice-pictures")
-        number = next(self._numbers)
+        pool, number = self._pools[large], next(self._numbers)
 
         def begun() -> _Result:
             self._since_s.setdefault(number, time.monotonic())
@@ -56,9 +58,14 @@ class PictureThreads:
 
         if not large:
             self._since_s[number] = time.monotonic()
-        future = self._pools[large].submit(begun)
+        future = pool.submit(begun)
         future.add_done_callback(lambda _: self._since_s.pop(number, None))
-        return await asyncio.wrap_future(future)
+        try:
+            return await asyncio.wrap_future(future)
+        except asyncio.CancelledError:
+            if future.cancelled() and self._pools.get(large) is not pool:
+                raise EngineError("the engine was stopped") from None
+            raise
 
     def close(self) -> None:
         """Drop what has not begun."""

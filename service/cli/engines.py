@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from model.engines.engine import Engine
 
 EngineName = Annotated[
-    Literal["torch", "vllm"],
-    typer.Option("--engine", help="torch is built in; vllm for large ones."),
+    Literal["torch", "vllm", "transformers"],
+    typer.Option("--engine", help="torch is built in; vllm for large ones; transformers has no shortcuts."),
 ]
 Device = Annotated[Literal["cpu", "cuda"], typer.Option(help="Where the torch engine runs.")]
 VllmArguments = Annotated[
@@ -43,7 +43,7 @@ def make_engine(
     checkpoint: Path,
     rows: int,
     *,
-    name: Literal["torch", "vllm"] = "torch",
+    name: Literal["torch", "vllm", "transformers"] = "torch",
     device: Literal["cpu", "cuda"] = "cpu",
     vllm_arguments: str = "{}",
     cache_mb: int = 256,
@@ -68,6 +68,10 @@ def make_engine(
         if not isinstance(arguments, dict):
             raise ValueError("--vllm-arguments must be a JSON object")
         return VllmEngine(checkpoint, VllmSettings(rows=rows, arguments=arguments))
+    if name == "transformers":
+        from model.engines.transformers.engine import TransformersEngine
+
+        return TransformersEngine(checkpoint, rows)
     import torch
 
     from model.engines.torch.engine import TorchEngine, TorchSettings

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from torch import Tensor, nn
-from transformers import DynamicCache
 
-from model.driving.plan import Plan
-from model.engines.binding import binding_of
 from model.engines.engine import Draw, PlanRequest
-from model.engines.least_error import LeastError, least_error
-from model.engines.reason_mask import reason_mask_of
-from model.engines.sampling import choose, probabilities, uniform
+from model.engines.requests import decided, given_plans, read
+from model.engines.sampling import probabilities
+from model.engines.transformers.decoding import Decoding
 from model.families.family import Family
 from model.families.registry import families_of
-from model.formats.cursor import CompiledFormat, Token
-from model.formats.text import parse
+from model.formats.cursor import CompiledFormat
 from model.network.checkpoint import Loaded
 
 
@@ -76,81 +70,15 @@ def reference(
 
 
 def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> tuple[Draw, Shares]:
-    model: Any = loaded.model
-    controls = request.controls
+    controls, decoding = request.controls, Decoding(loaded)
     inputs = loaded.inputs.build(request.scene, request.format, request.attempt, controls.camera)
-    prompt = model.encode_prompt_embeddings(inputs)
-    cache = DynamicCache(config=model.config)
-    logits = model(
-        inputs_embeds=prompt.embeddings[None],
-        position_ids=prompt.position_ids[:, None],
-        past_key_values=cache,
-        use_cache=True,
-    ).logits[0, -1]
-    given: dict[str, Plan] = {}
-    if controls.prefill is not None and family.first_plan is not None:
-        given[family.first_plan] = controls.prefill
     compiled = CompiledFormat(family.format, loaded.vocabulary)
-    imagination = family.imagination
-    cursor = compiled.start(given, imagination.picks(None, controls.camera) if imagination else None)
-    tokens: list[Token] = []
-    binding = binding_of(request, loaded.codec, loaded.vocabulary)
-    facts = model.read_facts(prompt.embeddings[inputs.prompt.ids == model.config.video_token_id])
-    reason_mask = reason_mask_of(request, family, loaded.vocabulary, facts)
-    least = LeastError(loaded.codec, loaded.vocabulary)
-    think_probability = None
+    start = compiled.start(given_plans(request, family), decided(request, family))
+    asked = decoding.begin(request, family, start, inputs)
     shares: Shares = {}
-    while not cursor.done:
-        allowed = cursor.allowed()
-        scores = logits.double().numpy()[allowed.ids]
-        left = np.ones(len(allowed.ids), np.bool_)
-        if len(allowed.ids) > 1:
-            shares[len(tokens)] = probabilities(scores)
-        if family.branch is not None and allowed.choice == family.branch.name and len(allowed.ids) > 1:
-            reflecting = family.branch.reflecting
-            thinks = np.array([reflecting in cursor.option_texts(int(id)) for id in allowed.ids])
-            think_probability = float(probabilities(scores)[thinks].sum())
-            if controls.thinking != "adaptive":
-                left = thinks == (controls.thinking == "always")
-            elif controls.think_threshold is not None:
-                left = thinks == (think_probability > controls.think_threshold)
-        if imagination is not None and allowed.choice == imagination.name and controls.imagine != "auto":
-            wanted = imagination.imagined if controls.imagine == "always" else imagination.unseen
-            left = np.array([wanted in cursor.option_texts(int(id)) for id in allowed.ids])
-        if binding is not None and (bound := binding.leaves(allowed.ids, tokens, family.plans)) is not None:
-            left = bound
-        if reason_mask is not None and (named := reason_mask.leaves(cursor, tokens)) is not None:
-            left = named
-        expected = least.expected(allowed, controls)
-        number = np.array([uniform(controls.seed, index, len(tokens))])
-        if expected is None:
-            place = choose(scores[left], controls.temperature, controls.top_p, number)[0]
-            token = int(allowed.ids[left][place])
-        else:
-            token = int(allowed.ids[least_error(scores, expected, left)])
-        place = len(inputs.prompt.ids) + len(tokens)
-        tokens.append(Token(token, cursor.section))
-        cursor = cursor.advance(token)
-        logits = model(
-            input_ids=torch.tensor([[token]]),
-            position_ids=torch.full((3, 1, 1), place + prompt.position_offset),
-            past_key_values=cache,
-            use_cache=True,
-        ).logits[0, -1]
-    text = loaded.vocabulary.decode([token.id for token in tokens])
-    history = request.scene.history[None]
-    values = parse(compiled, text, given)
-    reading = family.read(values, lambda codes: loaded.codec.decode(history, [codes])[0])
-    draw = Draw(
-        index=index,
-        text=text,
-        plan=reading.plan,
-        branch=reading.branch,
-        think_probability=think_probability,
-        thinking=family.reflected(values),
-        revised_plan=reading.revised_plan,
-        trajectory=reading.trajectory,
-        codes=reading.codes,
-        tokens=dict(Counter(token.section for token in tokens)),
-    )
+    for position, step in enumerate(decoding.write(asked, index)):
+        if len(step.logits) > 1:
+            shares[position] = probabilities(step.logits)
+    parts = loaded.vocabulary, loaded.codec, asked.reason_mask
+    [draw] = read(request, family, step.response, position + 1, (index,), *parts)
     return draw, shares

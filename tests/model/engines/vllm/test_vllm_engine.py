@@ -47,6 +47,7 @@ from model.training.batches import collate
 from model.training.learner import ResponseLearner
 from model.training.rollouts import rollout
 from tests.checkpoints import write_untrained
+from tests.model.engines.contract import CONTRACT, Check
 
 T = TypeVar("T")
 Run = Callable[[Awaitable[T]], T]
@@ -283,6 +284,11 @@ def test_decisions_are_as_likely_as_training_says(
         assert sum(told is not None for told in draw.logprobs) == len(made)
         told = [draw.logprobs[each.position] for each in made]
         np.testing.assert_allclose(np.array(told, float), logprobs.numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
+def test_the_contract(loop: asyncio.AbstractEventLoop, vllm: VllmEngine, check: Check) -> None:
+    loop.run_until_complete(check(vllm, BUNDLED[2]))
 
 
 def test_sections_come_before_their_draw(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:

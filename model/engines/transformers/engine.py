@@ -1,0 +1,203 @@
+"""The engine interface over `transformers` alone."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from model.driving.images import ImageError
+from model.engines.engine import (
+    CodesWritten,
+    DrawFinished,
+    EngineError,
+    Event,
+    Load,
+    PlanRequest,
+    RequestError,
+    SectionFinished,
+    Started,
+    TextWritten,
+)
+from model.engines.pictures import PictureThreads
+from model.engines.requests import begin, given_plans, painted, read
+from model.engines.transformers.decoding import Asked, Decoding, Step
+from model.engines.warm_up import warm_up
+from model.families.registry import families_of
+from model.formats.cursor import CompiledFormat, Cursor
+from model.formats.pieces import NOTHING
+from model.network.checkpoint import load
+from model.network.inputs import ModelInputs
+from model.network.model_card import ModelCard
+from model.network.visual_codes import Frame
+
+_Tell = Callable[[Event | Exception], bool]
+"""Hands an event on; False where nobody waits for more."""
+
+
+class TransformersEngine:
+    """`model.engines.engine.Engine` over a checkpoint folder; see there for the contract.
+
+    One thread writes one draw after the other, a token a pass. Deadlines are refused: nothing is made ready
+    beside a second look that could take its place.
+
+    Args:
+        checkpoint: its folder.
+        rows: draws that may be asked for at once; more are refused by the service.
+        dtype: of the network.
+
+    Raises:
+        CheckpointError: the folder is no usable checkpoint.
+    """
+
+    def __init__(self, checkpoint: Path, rows: int = 24, dtype: torch.dtype = torch.float32) -> None:
+        self._loaded, self._rows = load(checkpoint, dtype), rows
+        self._card = replace(self._loaded.card, engine="transformers")
+        self._families = families_of(self._card.formats, self._loaded.settings.reflection)
+        self._formats = {
+            name: CompiledFormat(family.format, self._loaded.vocabulary)
+            for name, family in self._families.items()
+        }
+        self._decoding = Decoding(self._loaded)
+        self._pictures = PictureThreads()
+        self._thread: ThreadPoolExecutor | None = None
+        self._ended: asyncio.Event | None = None
+        self._running: dict[str, tuple[PlanRequest, asyncio.Queue[Event | Exception]]] = {}
+
+    @property
+    def card(self) -> ModelCard:
+        """What is loaded."""
+        return self._card
+
+    @property
+    def load(self) -> Load:
+        """How full it is now; what waits for the thread counts as far as there would be room."""
+        asked = sum(request.controls.n for request, _ in self._running.values())
+        return Load(self._rows, min(asked, self._rows), self._pictures.waiting_s)
+
+    async def start(self) -> None:
+        """Start the thread and plan once for a grey scene in every format."""
+        if self._thread is not None:
+            raise EngineError("the engine runs already")
+        self._thread = ThreadPoolExecutor(1, "looktwice-transformers")
+        self._ended = asyncio.Event()
+        await warm_up(self)
+
+    async def wait(self) -> None:
+        """Wait until the engine was stopped. A draw that fails ends its request alone."""
+        if self._ended is not None:
+            await self._ended.wait()
+
+    async def stop(self) -> None:
+        """Cancel everything and end the thread; running requests get an `EngineError`."""
+        if self._thread is None or self._ended is None:
+            return
+        for name in list(self._running):
+            self._end(name, EngineError("the engine was stopped"))
+        self._pictures.close()
+        thread, self._thread = self._thread, None
+        await asyncio.to_thread(thread.shutdown)
+        self._ended.set()
+
+    async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
+        """Queue a request and iterate over its events; see `Engine.submit`."""
+        if self._thread is None:
+            raise EngineError("the engine is not running")
+        if request.request_id in self._running:
+            raise RequestError(f"request id {request.request_id} is in use")
+        start = begin(request, self._card, self._families, self._formats)
+        if request.controls.deadline_ms is not None:
+            raise RequestError("deadline_ms needs the torch engine: this one makes no drafts")
+        events: asyncio.Queue[Event | Exception] = asyncio.Queue()
+        running = self._running[request.request_id] = request, events
+        writing: Future[None] | None = None
+        try:
+            inputs = await self._pictures.run(partial(self._inputs, request), request.scene.pictures)
+            loop = asyncio.get_running_loop()
+
+            def tell(event: Event | Exception) -> bool:
+                loop.call_soon_threadsafe(events.put_nowait, event)
+                return self._running.get(request.request_id) is running
+
+            writing = self._thread.submit(self._write, request, start, inputs, tell)
+            remaining = request.controls.n
+            while remaining:
+                event = await events.get()
+                if isinstance(event, Exception):
+                    raise event
+                remaining -= isinstance(event, DrawFinished)
+                yield event
+        finally:
+            if self._running.get(request.request_id) is running:
+                del self._running[request.request_id]
+            if writing is not None:
+                writing.cancel()
+
+    def paint(self, codes: Sequence[int]) -> Frame:
+        """An imagined picture; see `Engine.paint`."""
+        return painted(self._loaded.visual_codes, codes)
+
+    def cancel(self, request_id: str) -> None:
+        """Drop a request; unknown ids are ignored."""
+        if request_id in self._running:
+            self._end(request_id, EngineError("the request was cancelled"))
+
+    def _end(self, request_id: str, error: EngineError) -> None:
+        _, events = self._running.pop(request_id)
+        events.put_nowait(error)
+
+    def _inputs(self, request: PlanRequest) -> ModelInputs:
+        scene, format, camera = request.scene, request.format, request.controls.camera
+        try:
+            return self._loaded.inputs.build(scene, format, request.attempt, camera)
+        except ImageError:
+            raise
+        except ValueError as error:
+            raise RequestError(str(error)) from error
+
+    def _write(self, request: PlanRequest, start: Cursor, inputs: ModelInputs, tell: _Tell) -> None:
+        """Write all draws, in the thread; ends where nobody waits for them any more."""
+        tell(Started())
+        try:
+            with torch.inference_mode():
+                asked = self._decoding.begin(request, self._families[request.format], start, inputs)
+                for index in range(request.controls.n):
+                    if not all(map(tell, self._draw(asked, index))):
+                        return
+        except Exception as error:  # one request that cannot be decoded must not end the others
+            tell(EngineError.because("decoding failed", error))
+
+    def _draw(self, asked: Asked, index: int) -> Iterator[Event]:
+        passes = 0
+        for step in self._decoding.write(asked, index):
+            passes += 1
+            yield from self._events(asked, step, index)
+        yield DrawFinished(
+            *read(
+                asked.request,
+                asked.family,
+                step.response,
+                passes,
+                (index,),
+                self._loaded.vocabulary,
+                self._loaded.codec,
+                asked.reason_mask,
+            )
+        )
+
+    def _events(self, asked: Asked, step: Step, index: int) -> Iterator[Event]:
+        response, vocabulary, live = step.response, self._loaded.vocabulary, asked.request.live
+        said = NOTHING
+        if live and step.finished:
+            said = response.values(vocabulary, given_plans(asked.request, asked.family))
+        for section in step.finished:
+            yield SectionFinished(index, *section, said.all(section.name))
+        if live and (new := response.new_text(vocabulary)):
+            yield TextWritten(index, *new)
+        if live and (codes := response.cursor.codes_written):
+            yield CodesWritten(index, response.cursor.section, codes)

@@ -1,0 +1,165 @@
+"""What every engine has to do. Each check takes an engine that runs, and a scene that it can see."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import pytest
+
+from model.driving.images import ImageError
+from model.driving.plan import parse_plan
+from model.driving.scene import Clip, Scene
+from model.engines.engine import (
+    Controls,
+    Draw,
+    DrawFinished,
+    Engine,
+    EngineError,
+    Event,
+    PlanRequest,
+    RequestError,
+    SectionFinished,
+    Started,
+    TextWritten,
+)
+from model.families.registry import family_named
+
+Check = Callable[[Engine, Scene], Awaitable[None]]
+GIVEN: Final = parse_plan("- longitudinal\n  - 0.0s-2.5s: Keep Speed\n  - 2.5s-6.4s: Accelerate\n")
+
+
+async def events_of(engine: Engine, request: PlanRequest) -> list[Event]:
+    return [event async for event in engine.submit(request)]
+
+
+async def plan(engine: Engine, request: PlanRequest) -> list[Draw]:
+    """The draws of a request, in order."""
+    draws = [event.draw for event in await events_of(engine, request) if isinstance(event, DrawFinished)]
+    return sorted(draws, key=lambda draw: draw.index)
+
+
+def asked(name: str, scene: Scene, *, live: bool = False, **controls: Any) -> PlanRequest:
+    return PlanRequest(name, scene, "cf_vla", Controls(**controls), live=live)
+
+
+async def what_a_draw_says_is_told_before_it(engine: Engine, scene: Scene) -> None:
+    events = await events_of(engine, asked("told", scene, n=2, thinking="always", live=True))
+    assert isinstance(events[0], Started)
+    assert sorted(event.draw.index for event in events if isinstance(event, DrawFinished)) == [0, 1]
+    for index in range(2):
+        [end] = [
+            k
+            for k, event in enumerate(events)
+            if isinstance(event, DrawFinished) and event.draw.index == index
+        ]
+        finished = events[end]
+        assert isinstance(finished, DrawFinished)
+        told: dict[str, tuple[Any, ...]] = {}
+        for place, event in enumerate(events):
+            if isinstance(event, SectionFinished | TextWritten) and event.index == index:
+                assert place < end
+            if isinstance(event, SectionFinished) and event.index == index:
+                told[event.section] = event.values
+        assert told["plan"] == (finished.draw.plan,)
+        assert told["revised_plan"] == (finished.draw.revised_plan,)
+
+
+async def the_branch_is_the_callers(engine: Engine, scene: Scene) -> None:
+    for thinking, looked in (("always", True), ("never", False)):
+        draws = await plan(engine, asked(f"{thinking} thinks", scene, n=2, thinking=thinking))
+        assert [draw.looked_twice for draw in draws] == [looked, looked]
+        assert all(0.0 <= (draw.think_probability or 0.0) <= 1.0 for draw in draws)
+    for threshold, looked in ((0.0, True), (1.0, False)):
+        [draw] = await plan(engine, asked("threshold", scene, n=1, think_threshold=threshold))
+        assert draw.looked_twice == looked
+
+
+async def a_given_plan_is_kept(engine: Engine, scene: Scene) -> None:
+    [draw] = await plan(engine, asked("given", scene, n=1, prefill=GIVEN, thinking="never"))
+    assert draw.plan == GIVEN
+
+
+async def the_same_seed_draws_the_same(engine: Engine, scene: Scene) -> None:
+    first, again, other = [
+        await plan(engine, asked("seed", scene, n=3, seed=seed, logprobs=True)) for seed in (7, 7, 8)
+    ]
+    for one, two in zip(first, again, strict=True):
+        assert (one.text, one.ids) == (two.text, two.ids)
+        assert one.trajectory.shape == (len(family_named("cf_vla").times_s), 4)
+        assert len(one.logprobs) == len(one.ids)
+        assert all(logprob is None or logprob <= 0 for logprob in one.logprobs)
+    assert any(
+        not np.array_equal(one.trajectory, two.trajectory) for one, two in zip(first, other, strict=True)
+    )
+
+
+async def who_leaves_early_frees_the_engine(engine: Engine, scene: Scene) -> None:
+    async for _ in (events := engine.submit(asked("early", scene, n=2, thinking="always"))):
+        break
+    await events.aclose()
+    assert len(await plan(engine, asked("early", scene, n=1))) == 1
+    assert engine.load.rows_used == 0
+
+
+async def cancelling_tells_who_waits(engine: Engine, scene: Scene) -> None:
+    waiting = asyncio.create_task(plan(engine, asked("slow", scene, n=4, thinking="always")))
+    while not engine.load.rows_used:
+        await asyncio.sleep(0.001)
+    engine.cancel("slow")
+    engine.cancel("unknown")
+    with pytest.raises(EngineError, match="cancelled"):
+        await waiting
+    assert len(await plan(engine, asked("slow", scene, n=1))) == 1
+
+
+async def bad_requests_fail_alone(engine: Engine, scene: Scene) -> None:
+    camera = scene.clips[0].camera
+    damaged = replace(scene, clips=(Clip(camera, (b"\xff\xd8no",) * 4), *scene.clips[1:]))
+    good = asyncio.create_task(plan(engine, asked("good", scene, n=2)))
+    await asyncio.sleep(0)
+    for bad, message in (
+        (asked("good", scene), "in use"),
+        (asked("a", damaged), "picture"),
+        (asked("b", replace(scene, clips=scene.clips[1:])), f"lacks camera {camera}"),
+        (PlanRequest("c", scene, "nobody"), "unknown format"),
+        (asked("d", scene, imagine="always"), "imagine no pictures"),
+    ):
+        with pytest.raises((RequestError, ImageError), match=message):
+            await plan(engine, bad)
+    assert len(await good) == 2
+
+
+async def who_stops_is_told_and_may_start_again(engine: Engine, scene: Scene) -> None:
+    waiting = asyncio.create_task(plan(engine, asked("slow", scene, n=4, thinking="always")))
+    while not engine.load.rows_used:
+        await asyncio.sleep(0.001)
+    watching = asyncio.create_task(engine.wait())
+    await engine.stop()
+    with pytest.raises(EngineError, match="stopped"):
+        await waiting
+    await watching
+    with pytest.raises(EngineError, match="not running"):
+        await plan(engine, asked("late", scene, n=1))
+    await engine.start()
+    assert len(await plan(engine, asked("again", scene, n=1))) == 1
+
+
+TELLING: Final[tuple[Check, ...]] = (
+    what_a_draw_says_is_told_before_it,
+    the_branch_is_the_callers,
+    a_given_plan_is_kept,
+    the_same_seed_draws_the_same,
+)
+"""What an engine tells of draws. The services' scripted engine does that much."""
+CONTRACT: Final[tuple[Check, ...]] = (
+    *TELLING,
+    who_leaves_early_frees_the_engine,
+    cancelling_tells_who_waits,
+    bad_requests_fail_alone,
+    who_stops_is_told_and_may_start_again,
+)
+"""All of it; the last one starts the engine anew."""

@@ -1,0 +1,72 @@
+"""One contract for all engines; vLLM's run of it is in `tests/model/engines/vllm`."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from model.bundled import CHECKPOINT, SCENES
+from model.driving.scene_store import read_scenes
+from model.engines.engine import Engine, RequestError
+from model.engines.torch.engine import TorchEngine, TorchSettings
+from model.engines.transformers.engine import TransformersEngine
+from tests.model.engines.contract import CONTRACT, TELLING, Check, asked, plan
+from tests.service.scripted_engine import ScriptedEngine
+
+SCENE = next(iter(read_scenes(SCENES))).scene
+ENGINES: dict[str, Callable[[], Engine]] = {
+    "torch": lambda: TorchEngine(CHECKPOINT, TorchSettings(rows=8, products=None)),
+    "transformers": lambda: TransformersEngine(CHECKPOINT),
+}
+
+
+@pytest.fixture(scope="module")
+def loop() -> Iterator[asyncio.AbstractEventLoop]:
+    loop = asyncio.new_event_loop()
+    yield loop
+    loop.close()
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def engine(request: pytest.FixtureRequest, loop: asyncio.AbstractEventLoop) -> Iterator[Engine]:
+    engine = ENGINES[request.param]()
+    loop.run_until_complete(engine.start())
+    yield engine
+    loop.run_until_complete(engine.stop())
+
+
+@pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
+def test_the_contract(loop: asyncio.AbstractEventLoop, engine: Engine, check: Check) -> None:
+    loop.run_until_complete(check(engine, SCENE))
+
+
+@pytest.mark.parametrize("check", TELLING, ids=lambda check: check.__name__)
+def test_the_scripted_engine_tells_as_others_do(loop: asyncio.AbstractEventLoop, check: Check) -> None:
+    loop.run_until_complete(check(ScriptedEngine(), SCENE))
+
+
+def test_the_engines_write_the_same(loop: asyncio.AbstractEventLoop) -> None:
+    async def drawn(engine: Engine) -> list[str]:
+        await engine.start()
+        try:
+            return [draw.text for draw in await plan(engine, asked("same", SCENE, n=3, seed=3))]
+        finally:
+            await engine.stop()
+
+    one, other = (loop.run_until_complete(drawn(make())) for make in ENGINES.values())
+    assert one == other
+
+
+def test_an_engine_without_drafts_refuses_deadlines(loop: asyncio.AbstractEventLoop) -> None:
+    async def test() -> None:
+        engine = TransformersEngine(CHECKPOINT)
+        await engine.start()
+        try:
+            with pytest.raises(RequestError, match="deadline_ms needs the torch engine"):
+                await plan(engine, asked("late", SCENE, deadline_ms=300))
+        finally:
+            await engine.stop()
+
+    loop.run_until_complete(test())
