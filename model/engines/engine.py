@@ -180,6 +180,7 @@ class Draw:
         section_logprobs: of each section's text, the sum over its choices; empty likewise.
         foreseen: what its family reads of it as perceived and foreseen; None where it tells of neither.
         sections: what the sections say that only its family has, see `Family.own_sections`.
+        action: what it says that it does, in words of its family's `actions`; empty where that has none.
     """
 
     index: int
@@ -202,6 +203,7 @@ class Draw:
     section_logprobs: Mapping[str, float] = field(default_factory=dict)
     foreseen: Foreseen | None = None
     sections: Mapping[str, list[Plain]] = field(default_factory=dict)
+    action: tuple[str, ...] = ()
 
     @property
     def at_10_hz(self) -> FloatArray:

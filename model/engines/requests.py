@@ -133,6 +133,7 @@ def read(
             section_logprobs=_by_section(response) if request.controls.logprobs else {},
             foreseen=reading.foreseen,
             sections=family.own(values),
+            action=reading.action,
         )
         for index in draws
     ]

@@ -8,14 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from model.driving.intervals import Array, Interval, episode_weights, interval_of
-from model.evaluation.open_loop import SceneResult
 
 
-def mean_interval(results: Sequence[SceneResult], measure: str) -> tuple[float | None, Interval | None]:
+class Measured(Protocol):
+    """What one scene is worth: its measures are further attributes, float or None."""
+
+    @property
+    def scene_id(self) -> str:
+        """The scene's own."""
+
+    @property
+    def episode_id(self) -> str:
+        """Of the episode that it is of."""
+
+
+def mean_interval(results: Sequence[Measured], measure: str) -> tuple[float | None, Interval | None]:
     """Mean of a measure over the scenes that have it, with its 95 % interval; None where none has it."""
     sums, counts = _per_episode([results], measure)
     if not counts.any():
@@ -29,7 +41,7 @@ class Comparison:
 
     Attributes:
         name: what is compared.
-        measure: one of `MEASURES`.
+        measure: an attribute of the results.
         scenes: how many scenes had the measure in both.
         value, against: the two means.
         difference: value - against.
@@ -48,7 +60,7 @@ class Comparison:
 
 
 def compare(
-    name: str, results: Sequence[SceneResult], against: Sequence[SceneResult], measure: str = "min_ade_m"
+    name: str, results: Sequence[Measured], against: Sequence[Measured], measure: str = "min_ade_m"
 ) -> Comparison:
     """Paired comparison: both variants are resampled together, so what scenes share cancels out.
 
@@ -82,7 +94,7 @@ def compare(
     )
 
 
-def _per_episode(sides: Sequence[Sequence[SceneResult]], measure: str) -> tuple[Array, Array]:
+def _per_episode(sides: Sequence[Sequence[Measured]], measure: str) -> tuple[Array, Array]:
     """Sums [sides, episodes] of a measure and how many scenes [episodes] have it (in the first side)."""
     episodes = sorted({result.episode_id for result in sides[0]})
     place = {episode: index for index, episode in enumerate(episodes)}

@@ -21,8 +21,9 @@ from model.engines.engine import Draw, DrawFinished, Engine, Event, Load, PlanRe
 from model.families.family import Foreseen, NextPicture
 from model.network.model_card import ModelCard
 
-_SCHEMA_VERSION: Final = 3
+_SCHEMA_VERSION: Final = 4
 """Part of every key, so that a draw that is kept otherwise is none that is known."""
+_TUPLES: Final = ("codes", "times_s", "ids", "logprobs", "action")
 
 
 class KeptDraws:
@@ -138,7 +139,7 @@ def _unpacked(packed: bytes) -> list[Draw]:
                 "revised_plan": _plan(record["revised_plan"]),
                 "trajectory": np.frombuffer(record["trajectory"], "<f4").reshape(-1, 4),
                 "foreseen": _foreseen(record["foreseen"]),
-                **{name: tuple(record[name]) for name in ("codes", "times_s", "ids", "logprobs")},
+                **{name: tuple(record[name]) for name in _TUPLES},
             }
         )
         for record in records

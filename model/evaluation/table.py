@@ -119,7 +119,7 @@ def format_table(rows: Sequence[Row], comparisons: Sequence[Comparison] = ()) ->
     header = ["", "scenes", "n", *(title for _, title, _ in _COLUMNS)]
     header.insert(4, "95 %")
     lines = aligned([header, *(_cells(row) for row in rows)])
-    lines += aligned([_comparison_cells(comparison) for comparison in comparisons])
+    lines += aligned([comparison_cells(comparison) for comparison in comparisons])
     return "\n".join(lines) + "\n"
 
 
@@ -139,7 +139,8 @@ def _cells(row: Row) -> list[str]:
     return cells
 
 
-def _comparison_cells(comparison: Comparison) -> list[str]:
+def comparison_cells(comparison: Comparison) -> list[str]:
+    """The cells of a comparison: both means, their ratio and difference, with 95 % intervals."""
     ratio = "" if comparison.ratio is None else f"ratio {comparison.ratio:.3f}"
     return [
         comparison.name,

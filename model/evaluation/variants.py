@@ -41,6 +41,8 @@ class Variant:
         expert_plan: the expert's plan is given as the first plan.
         greedy: the likeliest response is asked for too.
         speed: the history is driven at so many times its speed.
+        next_camera: a camera is asked for whose picture half a second later the scene brings, another one
+            from scene to scene.
         shuffled_images: scenes get the clips of scenes from other episodes: a planner that looks gets worse.
     """
 
@@ -53,6 +55,7 @@ class Variant:
     shuffled_images: bool = False
     greedy: bool = False
     speed: float = 1.0
+    next_camera: bool = False
 
 
 def standard_variants(
@@ -167,8 +170,25 @@ def request_for(labelled: LabelledScene, variant: Variant) -> PlanRequest:
             variant.controls,
             seed=seed,
             prefill=expert_plan(labelled) if variant.expert_plan else variant.controls.prefill,
+            camera=next_camera(labelled) if variant.next_camera else variant.controls.camera,
         ),
     )
+
+
+def next_camera(labelled: LabelledScene) -> str:
+    """The camera whose next picture is asked for: one that the scene shows now and half a second later.
+
+    Which one follows from the scene's name. Raises ValueError where there is none.
+    """
+    scene = labelled.scene
+    shown = {clip.camera for clip in scene.clips}
+    cameras = [frame.camera for frame in labelled.next_frames if frame.camera in shown]
+    if not cameras:
+        raise ValueError(
+            f"scene {scene.scene_id} brings no picture half a second ahead: "
+            "`looktwice scenes generate --next-frames` makes such scenes"
+        )
+    return cameras[zlib.crc32(f"camera of {scene.scene_id}".encode()) % len(cameras)]
 
 
 def greedy_request(labelled: LabelledScene, variant: Variant) -> PlanRequest:

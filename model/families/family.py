@@ -88,6 +88,19 @@ class Imagination:
         return picks if camera is None else picks | {self.camera: self.cameras[camera]}
 
 
+@dataclass(frozen=True)
+class Actions:
+    """What responses say that they do, in few words that can be counted.
+
+    Attributes:
+        groups: the words of each group; an action is one of each.
+        of: the action of a trajectory [64, 4] at 10 Hz.
+    """
+
+    groups: tuple[tuple[str, ...], ...]
+    of: Callable[[FloatArray], tuple[str, ...]]
+
+
 Decode = Callable[[Sequence[int]], FloatArray]
 """Makes a trajectory float32 [64, 4] of codes, with the checkpoint's codec and the scene's history."""
 
@@ -149,6 +162,7 @@ class Reading:
         branch: the option that was taken.
         revised_plan: what takes its place.
         foreseen: what is perceived and foreseen before that.
+        action: what it says that it does, a word of each group of its family's `Actions`.
     """
 
     trajectory: FloatArray
@@ -157,6 +171,7 @@ class Reading:
     branch: str | None = None
     revised_plan: Plan | None = None
     foreseen: Foreseen | None = None
+    action: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -219,6 +234,7 @@ class Family:
         dialects: other formats of the same name, for checkpoints whose reflections are written otherwise.
         refines: whether its prompts hold an `Attempt`, which every request then has to bring.
         imagination: where it may imagine a picture.
+        actions: what its responses say that they do, where tables can count it.
 
     Raises:
         FamilyError: the format lacks a section, the branch or the imagination that is declared, times do not
@@ -241,6 +257,7 @@ class Family:
     dialects: Mapping[ReflectionLanguage, Format] = field(default_factory=dict)
     refines: bool = False
     imagination: Imagination | None = None
+    actions: Actions | None = None
 
     def __post_init__(self) -> None:
         imagination = self.imagination

@@ -211,6 +211,12 @@ def batch_of(frames: list[Frame]) -> Tensor:
     return torch.from_numpy(np.stack(frames)).movedim(-1, 1).float() / 255
 
 
+def psnr(picture: Frame, other: Frame) -> float:
+    """Peak signal-to-noise ratio in dB of two pictures; at most that of half a grey level everywhere."""
+    error = float(((picture.astype(np.float64) - other) ** 2).mean())
+    return 10 * math.log10(255**2 / max(error, 0.25))
+
+
 class _Block(nn.Module):
     """Looks around in each channel, then mixes the channels of each place; added to what came in."""
 

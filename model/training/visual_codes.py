@@ -29,6 +29,7 @@ from model.network.visual_codes import (
     VisualCodes,
     batch_of,
     frame_of,
+    psnr,
 )
 from model.training.recipes import Recipe
 from model.training.run import last_whole_state
@@ -208,12 +209,6 @@ def picture_figures(codes: VisualCodes, clips: Sequence[FilmedClip]) -> dict[str
         "codes_kept": float(np.mean(kept)),
         "pictures": float(len(psnr_db)),
     }
-
-
-def psnr(picture: Frame, other: Frame) -> float:
-    """Peak signal-to-noise ratio in dB of two pictures; at most that of half a grey level everywhere."""
-    error = float(((picture.astype(np.float64) - other) ** 2).mean())
-    return 10 * math.log10(255**2 / max(error, 0.25))
 
 
 def patch_means(frame: Frame) -> Frame:

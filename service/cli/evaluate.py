@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from model.driving.scene import LabelledScene
     from model.driving.trajectory import FloatArray
     from model.engines.engine import Controls, Draw, Engine
+    from model.evaluation.imagination import ImaginationReport
     from model.evaluation.ladder import LadderReport
     from model.evaluation.open_loop import SceneResult
     from model.evaluation.report import Report
@@ -60,8 +61,11 @@ def evaluate(
     device: Device = "cpu",
     vllm_arguments: VllmArguments = "{}",
     preset: Annotated[
-        Literal["standard", "ladder"],
-        typer.Option(help="ladder: what thinking brings, checkpoint by checkpoint."),
+        Literal["standard", "ladder", "imagination"],
+        typer.Option(
+            help="ladder: what thinking brings, checkpoint by checkpoint. imagination: waypoints with and "
+            "without a picture of the next half second, and how good the pictures are."
+        ),
     ] = "standard",
     ladder: Annotated[
         Path | None, typer.Option(help="Folder of the ladder's checkpoints; --checkpoint counts among them.")
@@ -140,7 +144,7 @@ def evaluate(
             typer.echo(json.dumps(told_as) if as_json else text)
             return
 
-        report: Report | LadderReport
+        report: Report | LadderReport | ImaginationReport
         if preset == "ladder":
             report = _ladder(
                 labelled,
@@ -154,6 +158,8 @@ def evaluate(
                 per_scene,
                 quiet=as_json,
             )
+        elif preset == "imagination":
+            report = _imagination(labelled, engine_of(checkpoint), checkpoint, controls, rows, quiet=as_json)
         else:
             from model.evaluation.report import evaluate_checkpoint
             from model.evaluation.variants import standard_variants
@@ -293,6 +299,24 @@ def _ladder(
             plots / "risk-and-compute.png",
         )
     return report
+
+
+def _imagination(
+    scenes: Sequence[LabelledScene],
+    engine: Engine,
+    checkpoint: Path,
+    controls: Controls,
+    rows: int,
+    *,
+    quiet: bool,
+) -> ImaginationReport:
+    """What a checkpoint plans with and without imagining, and what its pictures are worth."""
+    from model.evaluation.imagination import evaluate_imagination, imagination_variants
+    from model.network.checkpoint import load
+
+    variants = imagination_variants(engine.card, controls)
+    evaluate = partial(evaluate_imagination, loaded=load(checkpoint))
+    return asyncio.run(run_started(evaluate, scenes, engine, variants, controls.n, rows, quiet=quiet))
 
 
 async def run_started(

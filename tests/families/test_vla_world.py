@@ -216,7 +216,10 @@ def test_what_it_foresees_is_read_in_our_axes(world: Loaded) -> None:
     labelled = labelled_scene(9.0, agents=(agent(15.0, 0.0), agent(30.0, 3.5)))
     lesson = lesson_of(labelled, NextPicture("back_left", tuple(range(PICTURE_CODES))))
     assert VLA_WORLD.teach is not None
-    foreseen = VLA_WORLD.read(VLA_WORLD.teach(lesson), lambda codes: labelled.future).foreseen
+    reading = VLA_WORLD.read(VLA_WORLD.teach(lesson), lambda codes: labelled.future)
+    assert VLA_WORLD.actions is not None
+    assert reading.action == VLA_WORLD.actions.of(labelled.future) == ("forward", "keep")
+    foreseen = reading.foreseen
     assert foreseen is not None
     assert lesson.perceived is not None
     assert foreseen.picture == lesson.next_picture

@@ -4,6 +4,7 @@ from typing import Final
 
 from model.families.family import Family, Imagination
 from model.families.vla_world import format as its
+from model.families.vla_world.actions import ACTIONS
 from model.families.vla_world.inputs import INPUTS
 from model.families.vla_world.read import perceived, pictured, predicted, read, thoughts_text
 from model.families.vla_world.targets import teach
@@ -37,5 +38,6 @@ VLA_WORLD: Final = Family(
         predicted=predicted,
         pictured=pictured,
     ),
+    actions=ACTIONS,
 )
 """perception, prediction, a picture or none, think, action, answer"""

@@ -14,7 +14,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.families.vla_world.format import TIMES_S, Direction, Lateral, Speed
+from model.driving.trajectory import TEN_HZ_S, FloatArray, at_times
+from model.families.family import Actions
+from model.families.vla_world.format import DIRECTIONS, TIMES_S, Direction, Lateral, Speed
 
 SIDE_M: Final = 2.0
 """Metres to a side after 3 s that make a turn."""
@@ -25,6 +27,17 @@ CHANGED_MS: Final = 1.0
 QUICK: Final = 2.0
 """A change by this factor is a quick one."""
 
+COUNTED_SPEED: Final[Mapping[Speed, str]] = MappingProxyType(
+    {
+        "A CONSTANT SPEED": "keep",
+        "AN ACCELERATION": "accelerate",
+        "A QUICK ACCELERATION": "accelerate",
+        "A DECELERATION": "decelerate",
+        "A QUICK DECELERATION": "decelerate",
+        "A DECELERATION TO ZERO": "stop",
+    }
+)
+"""What table 3 counts: how quick a change is does not matter."""
 _STEP_S: Final = TIMES_S[0]
 _DIRECTION_OF: Final[Mapping[Lateral, Direction]] = MappingProxyType(
     {"MOVE FORWARD": "Forward", "TURN LEFT": "Left", "TURN RIGHT": "Right"}
@@ -42,6 +55,21 @@ class Action:
     def direction(self) -> Direction:
         """The same way in the words of predictions."""
         return _DIRECTION_OF[self.lateral]
+
+
+def counted(action: Action) -> tuple[str, ...]:
+    """The words that table 3 counts of an action: direction and speed."""
+    return action.direction.lower(), COUNTED_SPEED[action.speed]
+
+
+def counted_of(trajectory: FloatArray) -> tuple[str, ...]:
+    """The same of a trajectory [64, 4] at 10 Hz."""
+    return counted(action_of(at_times(trajectory, TEN_HZ_S, TIMES_S)[:, :2]))
+
+
+ACTIONS: Final = Actions(
+    (tuple(map(str.lower, DIRECTIONS)), tuple(dict.fromkeys(COUNTED_SPEED.values()))), counted_of
+)
 
 
 def action_of(waypoints_m: npt.ArrayLike) -> Action:

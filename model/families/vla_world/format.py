@@ -66,7 +66,6 @@ Speed = OneOf[
     "A DECELERATION TO ZERO",
 ]
 SPEED: Final[tuple[Speed, ...]] = get_args(Speed)
-"""What table 3 counts as keep, accelerate (two), decelerate (two) and stop."""
 
 _MOVING_M: Final = 0.2
 """Between waypoints: less says nothing of a heading, as waypoints are rounded to 0.1 m."""

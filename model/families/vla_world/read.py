@@ -8,14 +8,18 @@ from typing import Any, cast
 from model.driving.perceived import Perceived, PerceivedAgent
 from model.families.family import Decode, Foreseen, NextPicture, Predicted, Reading
 from model.families.vla_world import format as its
+from model.families.vla_world.actions import Action, counted
 from model.formats.pieces import Value, Values
 
 _CAMERAS = {written: camera for camera, written in its.CAMERA_OPTIONS.items()}
 
 
 def read(values: Values, decode: Decode) -> Reading:
-    """Its waypoints and what it foresees. A trajectory has no codes."""
-    return Reading(its.read_trajectory(values[its.ANSWER]), foreseen=_foreseen(values))
+    """Its waypoints, what it foresees, and what it says that it does. A trajectory has no codes."""
+    said = cast("dict[str, Any]", values[its.ACTION])
+    action = Action(said["lateral"], said["speed"])
+    trajectory = its.read_trajectory(values[its.ANSWER])
+    return Reading(trajectory, foreseen=_foreseen(values), action=counted(action))
 
 
 def thoughts_text(values: tuple[Value, ...]) -> str | None:

@@ -57,7 +57,7 @@ def test_draws_come_back_whole(tmp_path: Path) -> None:
         draw_of(SCENE.history.repeat(4, 0).astype(np.float32), PLAN, PLAN, 2),
         text="…", think_probability=0.1, passes=7, chosen=5, cut="shortened",
         foreseen=Foreseen(PERCEIVED, 5.0, 0.5, "Left", NextPicture("back", (1, 2, 3))),
-        section_logprobs={"visual": -7.5},
+        section_logprobs={"visual": -7.5}, action=("left", "keep"),
     )  # fmt: skip
 
     class One(FakeEngine):

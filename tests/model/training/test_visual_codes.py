@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from model.driving.images import encode_png
 from model.driving.scene import FRONT_TELE, FRONT_WIDE, Clip, LabelledScene
 from model.driving.scene_store import write_scenes
-from model.network.visual_codes import VisualCodes, frame_of, load_visual_codes
+from model.network.visual_codes import VisualCodes, frame_of, load_visual_codes, psnr
 from model.training.recipes import VISUAL_CODES
 from model.training.visual_codes import (
     SHEET_FILE,
@@ -27,7 +27,6 @@ from model.training.visual_codes import (
     clips_of,
     held_out,
     picture_figures,
-    psnr,
     spread,
     train_visual_codes,
 )

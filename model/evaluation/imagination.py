@@ -1,0 +1,353 @@
+"""What imagination brings: a checkpoint with a picture, without one, and with pictures of other scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, Self
+
+import numpy as np
+
+from model.driving.intervals import Interval
+from model.driving.scene import LabelledScene
+from model.driving.trajectory import TEN_HZ_S
+from model.engines.engine import Controls, Draw, Engine, ModelCard
+from model.evaluation.bootstrap import Comparison, Measured, compare, mean_interval
+from model.evaluation.next_frames import (
+    Painter,
+    Pictures,
+    TowerFeatures,
+    copied,
+    measure_pictures,
+    through_codes,
+    warped,
+)
+from model.evaluation.open_loop import BASELINES, SceneResult
+from model.evaluation.protocols import Protocol
+from model.evaluation.report import evaluate_variants
+from model.evaluation.table import aligned, comparison_cells
+from model.evaluation.variants import Variant, next_camera
+from model.evaluation.waypoints import (
+    PROTOCOLS,
+    WAYPOINT_MEASURES,
+    ActionScore,
+    WaypointResult,
+    WaypointScene,
+    action_scores,
+    waypoints_of,
+)
+from model.families.family import Family
+from model.families.registry import family_named
+from model.network.checkpoint import Loaded
+from model.network.visual_codes import Frame
+
+AUTO: Final = "auto"
+NEVER: Final = "never"
+ALWAYS: Final = "always"
+ASKED: Final = "always, camera asked for"
+SHUFFLED: Final = f"{ASKED}, shuffled images"
+COPIED: Final = "the last frame"
+WARPED: Final = "the last frame, moved as the ego"
+CODED: Final = "what came, through its codes"
+
+_PICTURE_MEASURES: Final = ("psnr_db", "feature_distance")
+
+
+def imagination_variants(card: ModelCard, controls: Controls) -> list[Variant]:
+    """The rows of a checkpoint that imagines; the route is given, as it says the mission goal.
+
+    Raises:
+        ValueError: see `imagining`.
+    """
+    family = imagining(card)
+    plain = replace(controls, thinking="adaptive", think_threshold=None, imagine="auto", camera=None)
+    always = replace(plain, imagine="always")
+    asked = Variant(ASKED, family.name, always, route=True, next_camera=True)
+    return [
+        Variant(AUTO, family.name, plain, route=True),
+        Variant(NEVER, family.name, replace(plain, imagine="never"), route=True),
+        Variant(ALWAYS, family.name, always, route=True),
+        asked,
+        replace(asked, name=SHUFFLED, shuffled_images=True),
+    ]
+
+
+def imagining(card: ModelCard) -> Family:
+    """The family of a checkpoint's first format that imagines.
+
+    Raises:
+        ValueError: there is none, or the checkpoint cannot paint.
+    """
+    for family in map(family_named, card.formats):
+        if family.imagination is not None:
+            if not card.paints:
+                raise ValueError(f"{card.name} has no codes of pictures to paint with")
+            return family
+    raise ValueError(f"{card.name} writes no format that imagines pictures: it has {', '.join(card.formats)}")
+
+
+@dataclass(frozen=True)
+class ResponseResult:
+    """What a scene's draws took: means over the draws.
+
+    Attributes:
+        scene_id, episode_id: the scene's own.
+        imagine_rate: share that imagined a picture.
+        passes: through the network, the prompt apart.
+    """
+
+    scene_id: str
+    episode_id: str
+    imagine_rate: float
+    passes: float
+
+
+@dataclass(frozen=True)
+class FigureRow:
+    """Means of some results over scenes, with 95 % intervals over episodes.
+
+    Attributes:
+        name: of the row.
+        scenes, episodes: how many.
+        values, intervals: by measure; None where no scene has it.
+    """
+
+    name: str
+    scenes: int
+    episodes: int
+    values: Mapping[str, float | None]
+    intervals: Mapping[str, Interval | None]
+
+    @classmethod
+    def of(cls, name: str, results: Sequence[Measured], measures: Sequence[str]) -> Self:
+        """The row of some results."""
+        means = {measure: mean_interval(results, measure) for measure in measures}
+        return cls(
+            name,
+            len(results),
+            len({result.episode_id for result in results}),
+            {measure: mean for measure, (mean, _) in means.items()},
+            {measure: interval for measure, (_, interval) in means.items()},
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """The row with its measures as keys of their own, intervals below ``intervals``."""
+        intervals = {name: list(each) for name, each in self.intervals.items() if each is not None}
+        about = {"name": self.name, "scenes": self.scenes, "episodes": self.episodes}
+        return about | dict(self.values) | {"intervals": intervals}
+
+
+@dataclass(frozen=True)
+class ImaginationReport:
+    """All tables of one evaluation.
+
+    Attributes:
+        extractor: whose features tell how far pictures are apart.
+        waypoints: rows by protocol.
+        responses: what responses took.
+        actions: scores by row.
+        pictures: rows, and ``frechet`` among their measures.
+        comparisons: what should differ, pair by pair.
+    """
+
+    extractor: str
+    waypoints: Mapping[Protocol, Sequence[FigureRow]]
+    responses: Sequence[FigureRow]
+    actions: Mapping[str, Sequence[ActionScore]]
+    pictures: Sequence[FigureRow]
+    comparisons: Sequence[Comparison]
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it as JSON's values."""
+        return {
+            "extractor": self.extractor,
+            "waypoints": {name: [row.to_json() for row in rows] for name, rows in self.waypoints.items()},
+            "responses": [row.to_json() for row in self.responses],
+            "actions": {name: [asdict(score) for score in of] for name, of in self.actions.items()},
+            "pictures": [row.to_json() for row in self.pictures],
+            "comparisons": [asdict(comparison) for comparison in self.comparisons],
+        }
+
+    def __str__(self) -> str:
+        return "\n\n".join("\n".join(aligned(lines)) for lines in self._tables()) + "\n"
+
+    def _tables(self) -> Iterator[list[list[str]]]:
+        for protocol, rows in self.waypoints.items():
+            yield _table(f"waypoints, {protocol}", rows, _WAYPOINT_COLUMNS)
+        yield _table("responses", self.responses, _RESPONSE_COLUMNS)
+        words = [score.action for score in next(iter(self.actions.values()))] if self.actions else []
+        yield [["actions, F1", *words]] + [
+            [name, *("-" if score.f1 is None else f"{score.f1:.1%}" for score in of)]
+            for name, of in self.actions.items()
+        ]
+        yield _table(f"pictures, by the {self.extractor}", self.pictures, _PICTURE_COLUMNS)
+        yield [comparison_cells(comparison) for comparison in self.comparisons]
+
+
+async def evaluate_imagination(
+    engine: Engine,
+    scenes: Sequence[LabelledScene],
+    variants: Sequence[Variant],
+    *,
+    loaded: Loaded,
+    concurrency: int = 16,
+    on_result: Callable[[Variant, SceneResult], None] | None = None,
+) -> ImaginationReport:
+    """Evaluate a started engine of a checkpoint that imagines.
+
+    Args:
+        engine: started.
+        scenes: with a route and with pictures half a second ahead.
+        variants: `imagination_variants`.
+        loaded: the same checkpoint: its tower looks at pictures, its codes write what came.
+        concurrency: scenes under way at once.
+        on_result: called after each scene of each variant, for progress.
+
+    Raises:
+        EngineError, RequestError: the engine's.
+        ValueError: a scene lacks what a variant asks for.
+    """
+    family = imagining(engine.card)
+    cameras = {labelled.scene.scene_id: next_camera(labelled) for labelled in scenes}
+    draws: dict[str, dict[str, Sequence[Draw]]] = {variant.name: {} for variant in variants}
+
+    def keep(variant: Variant, labelled: LabelledScene, of: Sequence[Draw]) -> None:
+        draws[variant.name][labelled.scene.scene_id] = of
+
+    await evaluate_variants(
+        engine, scenes, variants, concurrency=concurrency, on_result=on_result, on_draws=keep
+    )
+    waypoints = _waypoints(scenes, draws)
+    responses = {
+        name: [_response(each, of[each.scene.scene_id]) for each in scenes] for name, of in draws.items()
+    }
+    actions = {}
+    if family.actions is not None:
+        for name, of in draws.items():
+            said = {scene_id: [draw.action for draw in each] for scene_id, each in of.items()}
+            actions[name] = action_scores(family.actions, scenes, said)
+    painters = {name: _imagined(engine, draws[name]) for name in (ASKED, SHUFFLED) if name in draws}
+    assert loaded.visual_codes is not None, "a checkpoint that paints has them"
+    painters |= {COPIED: copied, WARPED: warped, CODED: through_codes(loaded.visual_codes)}
+    extractor = TowerFeatures(loaded)
+    pictures = measure_pictures(scenes, cameras, painters, extractor)
+    return ImaginationReport(
+        extractor.name,
+        {
+            protocol: [FigureRow.of(name, results, WAYPOINT_MEASURES) for name, results in of.items()]
+            for protocol, of in waypoints.items()
+        },
+        [FigureRow.of(name, of, ("imagine_rate", "passes")) for name, of in responses.items()],
+        actions,
+        [_picture_row(name, of) for name, of in pictures.items()],
+        list(_comparisons(waypoints, responses, pictures)),
+    )
+
+
+_Waypoints = Mapping[Protocol, Mapping[str, Sequence[WaypointResult]]]
+
+
+def _waypoints(
+    scenes: Sequence[LabelledScene], draws: Mapping[str, Mapping[str, Sequence[Draw]]]
+) -> _Waypoints:
+    results: dict[Protocol, dict[str, list[WaypointResult]]] = {protocol: {} for protocol in PROTOCOLS}
+    for labelled in scenes:
+        seen = WaypointScene(labelled)
+        told = {
+            name: seen.measured(waypoints_of(baseline(labelled.scene.history), TEN_HZ_S)[None])
+            for name, baseline in BASELINES.items()
+        }
+        for name, of in draws.items():
+            every = [waypoints_of(draw.trajectory, draw.times_s) for draw in of[labelled.scene.scene_id]]
+            told[name] = seen.measured(np.stack(every))
+        for name, by_protocol in told.items():
+            for protocol, result in by_protocol.items():
+                results[protocol].setdefault(name, []).append(result)
+    return results
+
+
+def _response(labelled: LabelledScene, draws: Sequence[Draw]) -> ResponseResult:
+    imagined = [draw.foreseen is not None and draw.foreseen.picture is not None for draw in draws]
+    passes = [draw.passes for draw in draws]
+    about = labelled.scene.scene_id, labelled.episode_id
+    return ResponseResult(*about, float(np.mean(imagined)), float(np.mean(passes)))
+
+
+def _imagined(engine: Engine, draws: Mapping[str, Sequence[Draw]]) -> Painter:
+    """The picture of each scene's first draw."""
+
+    def paint(labelled: LabelledScene, camera: str) -> Frame:
+        foreseen = draws[labelled.scene.scene_id][0].foreseen
+        assert foreseen is not None
+        assert foreseen.picture is not None, "a picture was asked for"
+        return engine.paint(foreseen.picture.codes)
+
+    return paint
+
+
+def _picture_row(name: str, pictures: Pictures) -> FigureRow:
+    row = FigureRow.of(name, pictures.results, _PICTURE_MEASURES)
+    return replace(
+        row,
+        values={**row.values, "frechet": pictures.frechet},
+        intervals={**row.intervals, "frechet": pictures.frechet_interval},
+    )
+
+
+def _comparisons(
+    waypoints: _Waypoints,
+    responses: Mapping[str, Sequence[ResponseResult]],
+    pictures: Mapping[str, Pictures],
+) -> Iterator[Comparison]:
+    """What should differ. The difference of passes is what a picture takes."""
+    for one, other in ((ALWAYS, NEVER), (AUTO, NEVER), (SHUFFLED, ASKED)):
+        for protocol, of in waypoints.items():
+            for measure in ("l2_m", "collision_rate"):
+                yield compare(f"{one} : {other} ({protocol})", of[one], of[other], measure)
+    for one in (ALWAYS, ASKED):
+        yield compare(f"{one} : {NEVER}", responses[one], responses[NEVER], "passes")
+    for one, other in ((ASKED, COPIED), (ASKED, WARPED), (SHUFFLED, ASKED)):
+        for measure in _PICTURE_MEASURES:
+            yield compare(f"{one} : {other}", pictures[one].results, pictures[other].results, measure)
+
+
+_Columns = Mapping[str, tuple[str, str]]
+"""Title and pattern, by measure."""
+_INTERVALS: Final = frozenset({"l2_m", "collision_rate", "passes", *_PICTURE_MEASURES, "frechet"})
+"""Measures whose intervals the text shows; JSON has all."""
+_TIMES: Final = ("1 s", "2 s", "3 s", "mean")
+_WAYPOINT_COLUMNS: Final[_Columns] = dict(
+    zip(
+        WAYPOINT_MEASURES,
+        (
+            *((f"L2 {time}, m", "{:.2f}") for time in _TIMES),
+            *((f"collisions {time}", "{:.2%}") for time in _TIMES),
+        ),
+        strict=True,
+    )
+)
+_RESPONSE_COLUMNS: Final[_Columns] = {
+    "imagine_rate": ("imagines", "{:.1%}"),
+    "passes": ("passes", "{:.1f}"),
+}
+_PICTURE_COLUMNS: Final[_Columns] = {
+    "psnr_db": ("PSNR, dB", "{:.2f}"),
+    "feature_distance": ("features apart", "{:.3f}"),
+    "frechet": ("frechet", "{:.3f}"),
+}
+
+
+def _table(title: str, rows: Sequence[FigureRow], columns: _Columns) -> list[list[str]]:
+    header = [title, "scenes"]
+    lines = [header]
+    for measure, (name, _) in columns.items():
+        header += [name, "95 %"] if measure in _INTERVALS else [name]
+    for row in rows:
+        cells = [row.name, str(row.scenes)]
+        for measure, (_, pattern) in columns.items():
+            value, interval = row.values[measure], row.intervals[measure]
+            cells.append("-" if value is None else pattern.format(value))
+            if measure in _INTERVALS:
+                cells.append("" if interval is None else "..".join(map(pattern.format, interval)))
+        lines.append(cells)
+    return lines

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from model.driving.cameras import CAMERA_SPECS
+from model.driving.next_view import FAR_M, moved_view
+
+FRONT = CAMERA_SPECS["front"]
+
+
+def marked(camera_name: str, point: tuple[float, float, float]) -> npt.NDArray[np.uint8]:
+    """A black picture with a white spot where a camera sees a point of the ego frame."""
+    frame = np.zeros((112, 224, 3), np.uint8)
+    column, row, depth = CAMERA_SPECS[camera_name].project(np.array([point]))[0]
+    assert depth > 0
+    frame[int(row) - 2 : int(row) + 3, int(column) - 2 : int(column) + 3] = 255
+    return frame
+
+
+def spot(frame: npt.NDArray[np.uint8]) -> tuple[float, float]:
+    """Column and row of the middle of what is white."""
+    rows, columns = np.nonzero(frame[..., 0])
+    return float(columns.mean()), float(rows.mean())
+
+
+@pytest.mark.parametrize("camera", ["front", "front_left", "back_right", "back"])
+def test_who_stays_sees_the_same(camera: str) -> None:
+    frame = np.random.default_rng(0).integers(0, 256, (112, 224, 3), np.uint8)
+    np.testing.assert_array_equal(moved_view(frame, CAMERA_SPECS[camera], np.zeros(3)), frame)
+
+
+@pytest.mark.parametrize(
+    ("camera", "point"),
+    [("front", (20.0, 1.0, 0.0)), ("front_left", (8.0, 8.0, 0.0)), ("back", (-9.0, 1.0, 0.0))],
+)
+def test_a_point_of_the_road_is_where_it_will_be(camera: str, point: tuple[float, float, float]) -> None:
+    pose = np.array([3.0, 0.4, 0.1])
+    seen = spot(moved_view(marked(camera, point), CAMERA_SPECS[camera], pose))
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x_m, y_m = point[0] - pose[0], point[1] - pose[1]
+    then = np.array([[cos * x_m + sin * y_m, -sin * x_m + cos * y_m, 0.0]])
+    assert seen == pytest.approx(CAMERA_SPECS[camera].project(then)[0, :2], abs=2.0)
+
+
+def test_a_turn_moves_what_is_far_to_the_other_side() -> None:
+    frame = marked("front", (FAR_M + FRONT.forward_m, 0.0, 3.0))
+    left_turn = spot(moved_view(frame, FRONT, np.array([0.0, 0.0, 0.1])))
+    right_turn = spot(moved_view(frame, FRONT, np.array([0.0, 0.0, -0.1])))
+    assert right_turn[0] + 10 < spot(frame)[0] < left_turn[0] - 10
+
+
+def test_it_fits_pictures_of_other_sizes() -> None:
+    frame = np.random.default_rng(0).integers(0, 256, (56, 112, 3), np.uint8)
+    assert moved_view(frame, FRONT, np.array([5.0, 0.0, 0.0])).shape == frame.shape
