@@ -13,6 +13,7 @@ import psutil
 from pydantic import ValidationError
 
 from clients import wire
+from loadtests.mix import Mix
 from loadtests.sending import Target
 
 _PATIENCE_S = 10.0
@@ -44,11 +45,12 @@ def versions() -> dict[str, str]:
     return found
 
 
-def about_service(target: Target) -> dict[str, Any]:
+def about_service(target: Target, mix: Mix) -> dict[str, Any]:
     """The models behind the service.
 
     Raises:
         ServiceAway: no answer, or not one of the contract.
+        ValueError: they cannot do what the mix asks for.
     """
     try:
         answer = httpx.get(
@@ -58,6 +60,9 @@ def about_service(target: Target) -> dict[str, Any]:
         cards = wire.ModelList.model_validate_json(answer.content).models
     except (httpx.HTTPError, httpx.InvalidURL, ValidationError) as error:
         raise ServiceAway(f"{target.url} is not ready to be tested: {error}") from error
+    if mix.works.get("imagine") and not any(card.imagines and card.paints for card in cards):
+        names = ", ".join(card.name for card in cards) or "no model"
+        raise ValueError(f"the mix has imagine, and {target.url} serves {names}: no pictures can be imagined")
     return {
         "models": [card.model_dump(include={"name", "revision", "engine", "parameters"}) for card in cards]
     }

@@ -12,7 +12,8 @@ import httpx
 import msgpack
 
 from clients import wire
-from clients.planner import label_request, plan_request, reflect_request
+from clients.planner import imagine_request, label_request, plan_request, reflect_request
+from clients.wire_imagine import ImagineControls
 from loadtests.call import Call
 from loadtests.mix import BATCH_SCENES, Kind, Mix, Payload, Work
 from model.driving.images import media_type
@@ -29,6 +30,7 @@ PATHS: Final[dict[Work, str]] = {
     "reflect": "/v1/reflect",
     "label": "/v1/label",
     "batch": "/v1/plan/batch",
+    "imagine": "/v1/imagine",
 }
 THINKING: Final[dict[Work, wire.Thinking]] = {"direct": "never", "think": "always"}
 PROPOSED: Final[Plan] = parse_plan(
@@ -77,11 +79,16 @@ def _asked(kind: Kind, labelled: LabelledScene, seed: int) -> dict[str, Any]:
     if kind.work == "label":
         asked = label_request(scene, PROPOSED, expert_plan(labelled), Surroundings.of(labelled), seed)
         return asked.model_dump(mode="json")
+    if kind.work == "imagine":
+        # In turn those that the scene shows, as a planner does that compares with what comes.
+        camera = scene.clips[seed % len(scene.clips)].camera
+        controls = ImagineControls(n=kind.n, seed=seed)
+        return imagine_request(scene, camera, controls).model_dump(mode="json")
     shared: dict[str, Any] = {"n": kind.n, "seed": seed, "deadline_ms": kind.deadline_ms}
     if kind.work == "reflect":
         return reflect_request(scene, PROPOSED, wire.ReflectControls(**shared)).model_dump(mode="json")
-    controls = wire.Controls(thinking=THINKING.get(kind.work, "adaptive"), **shared)
-    return plan_request(scene, controls).model_dump(mode="json")
+    planned = wire.Controls(thinking=THINKING.get(kind.work, "adaptive"), **shared)
+    return plan_request(scene, planned).model_dump(mode="json")
 
 
 def _json(document: dict[str, Any], scenes: Sequence[LabelledScene]) -> tuple[str, bytes]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 from loadtests.mix import Kind
 
@@ -11,8 +11,8 @@ Outcome = Literal["answered", "rejected", "failed", "missed"]
 """``rejected``: the service refused for load (429). ``failed``: everything else without a good answer.
 ``missed``: never sent, since a planner of a closed loop was still waiting when it was due."""
 
-Branch = Literal["direct", "think", "reflect", "label", "batch"]
-BRANCHES: Final[tuple[Branch, ...]] = ("direct", "think", "reflect", "label", "batch")
+Branch = Literal["direct", "think", "reflect", "label", "batch", "imagine"]
+BRANCHES: Final[tuple[Branch, ...]] = get_args(Branch)
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,8 +22,8 @@ class Verdict:
     Attributes:
         outcome: see `Outcome`.
         problem: the last part of the problem's type, or what else kept the answer away; empty when answered.
-        branch: ``think`` where any draw thought, ``direct`` where none did; reflections, labels and batches
-            are kinds of their own. None unless answered.
+        branch: ``think`` where any draw thought, ``direct`` where none did; reflections, labels, batches and
+            imagined pictures are kinds of their own. None unless answered.
         deadline_met, cut: as the service tells them; None without a deadline.
     """
 
@@ -47,7 +47,7 @@ class Exchange:
         sent_s: when it was sent; NaN where it never was.
         ended_s: when the answer's last byte, or the failure, was there.
         verdict: what came.
-        first_plan_s: when a stream's first plan was there; None elsewhere.
+        first_plan_s: when a stream's first plan, or its first picture, was there; None elsewhere.
     """
 
     kind: Kind

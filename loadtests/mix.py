@@ -8,13 +8,15 @@ from typing import Final, Literal, TypeVar, cast, get_args
 
 import numpy as np
 
-Work = Literal["plan", "direct", "think", "reflect", "label", "batch"]
+Work = Literal["plan", "direct", "think", "reflect", "label", "batch", "imagine"]
 Payload = Literal["json", "msgpack", "multipart"]
 _Choice = TypeVar("_Choice")
 
 BATCH_SCENES: Final = 4
 """Of one request to /v1/plan/batch."""
-_STREAMED: Final = ("plan", "direct", "think", "reflect")
+_STREAMED: Final = ("plan", "direct", "think", "reflect", "imagine")
+_UNHURRIED: Final = ("label", "imagine")
+"""What takes no deadline."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +25,9 @@ class Kind:
 
     Attributes:
         work: ``plan`` lets the model decide whether to think, ``direct`` and ``think`` decide for it;
-            ``reflect`` and ``label`` are the endpoints of these names, ``batch`` plans for several scenes.
-        n: draws of each scene.
+            ``reflect``, ``label`` and ``imagine`` are the endpoints of these names, ``batch`` plans for
+            several scenes.
+        n: draws of each scene; of ``imagine``, pictures.
         payload: how the body is written.
         stream: whether the answer comes as events.
         deadline_ms: told to the service; None for none.
@@ -41,6 +44,8 @@ class Kind:
             raise ValueError(f"{self.n} draws: there may be 1 to 64")
         if self.deadline_ms is not None and self.deadline_ms < 1:
             raise ValueError(f"a deadline of {self.deadline_ms} ms cannot be met")
+        if self.deadline_ms is not None and self.work in _UNHURRIED:
+            raise ValueError(f"{self.work} has no deadline")
         if self.stream and self.work not in _STREAMED:
             raise ValueError(f"{self.work} has no stream")
 
@@ -86,7 +91,13 @@ class Mix:
         return [
             Kind("label", 1, payload)
             if work == "label"
-            else Kind(work, n, payload, bool(stream) and work in _STREAMED, deadline_ms)
+            else Kind(
+                work,
+                n,
+                payload,
+                bool(stream) and work in _STREAMED,
+                None if work in _UNHURRIED else deadline_ms,
+            )
             for work, n, payload, deadline_ms, stream in zip(
                 works, draws, payloads, deadlines_ms, streams, strict=True
             )

@@ -22,6 +22,7 @@ _COLOURS: Final = {
     "reflect": "#2f855a",
     "label": "#805ad5",
     "batch": "#718096",
+    "imagine": "#0987a0",
 }
 _ALL: Final = "#1a202c"
 _PALE: Final = "#a0aec0"

@@ -27,6 +27,15 @@ class _Labelled(BaseModel):
     reflection: str
 
 
+class _Picture(BaseModel):
+    image: str
+    codes: list[int]
+
+
+class _Imagined(BaseModel):
+    pictures: list[_Picture]
+
+
 class _Result(BaseModel):
     status: int
 
@@ -49,6 +58,9 @@ def read_answer(kind: Kind, status: int, content: bytes) -> Verdict:
             return Verdict("answered", branch="label")
         if kind.work == "batch":
             return _batch([result.status for result in _Batch.model_validate_json(content).results])
+        if kind.work == "imagine":
+            pictures = _Imagined.model_validate_json(content).pictures
+            return Verdict("answered", branch="imagine") if len(pictures) == kind.n else BAD_ANSWER
         return _planned(kind, _Planned.model_validate_json(content))
     except ValidationError:
         return BAD_ANSWER

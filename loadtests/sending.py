@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from typing import Final
 
 import httpx
 from httpx_sse import EventSource, SSEError
@@ -15,6 +16,9 @@ from httpx_sse import EventSource, SSEError
 from loadtests.call import Call
 from loadtests.exchange import Exchange, Verdict
 from loadtests.reading import BAD_ANSWER, read_answer, refusal
+
+_FIRST: Final = ("plan", "picture")
+"""Events that somebody waits for; a stream has one of the two."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +76,13 @@ class Sender:
         return Exchange(call.kind, due_s, sent_s, ended_s, verdict, first_plan_s)
 
     async def _read_stream(self, call: Call, response: httpx.Response) -> tuple[Verdict, float | None]:
-        """The verdict on a stream's end, and when its first plan was there."""
+        """The verdict on a stream's end, and when its first plan or picture was there."""
         first_plan_s: float | None = None
         try:
             if response.status_code != 200:
                 return refusal(response.status_code, await response.aread()), None
             async for event in EventSource(response).aiter_sse():
-                if event.event == "plan" and first_plan_s is None:
+                if event.event in _FIRST and first_plan_s is None:
                     first_plan_s = self.now_s()
                 elif event.event == "done":
                     return read_answer(call.kind, 200, event.data.encode()), first_plan_s

@@ -30,9 +30,12 @@ def loadtest(
     seconds: Annotated[float, typer.Option(help="Of the measured run, or of each of its steps.", min=1)] = 60,
     warm_up: Annotated[float, typer.Option(help="Seconds before, left out of all figures.", min=0)] = 5.0,
     mix: Annotated[
-        str, typer.Option(help="plan, direct, think, reflect, label, batch, with weights: direct=3,think=1.")
+        str,
+        typer.Option(
+            help="plan, direct, think, reflect, label, batch, imagine, with weights: direct=3,think=1."
+        ),
     ] = "plan",
-    n: Annotated[str, typer.Option(help="Draws, with weights: 1=3,6=1.")] = "6",
+    n: Annotated[str, typer.Option(help="Draws, or imagined pictures, with weights: 1=3,6=1.")] = "6",
     payload: Annotated[str, typer.Option(help="json, msgpack, multipart, with weights.")] = "json",
     deadline_ms: Annotated[
         str, typer.Option(help="Told to the service, with weights: none=3,300=1.")
@@ -141,7 +144,7 @@ def loadtest(
             distinct=distinct,
             tell=lambda line: typer.echo(line, err=True),
         )
-        models, client = about_service(setup.target), about_client()
+        models, client = about_service(setup.target, setup.mix), about_client()
         began = datetime.now(UTC).isoformat(timespec="seconds")
         made = Report(setup, run[scenario](), began, client, models, versions())
         if report is not None:

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from clients import wire
+from clients.wire_imagine import ImagineRequest
 from loadtests.bodies import make_call, make_calls
 from loadtests.mix import BATCH_SCENES, Kind, Mix, Payload, Work
 from tests.loadtests.scenes import labelled_scenes
@@ -25,6 +26,9 @@ def test_a_json_body_is_what_the_contract_asks_for() -> None:
     assert (controls.n, controls.thinking, controls.deadline_ms, controls.seed) == (4, "always", 300, 3)
     wire.ReflectRequest.model_validate_json(make_call(Kind("reflect"), ONE, 3).body)
     wire.LabelRequest.model_validate_json(make_call(Kind("label", 1), ONE, 3).body)
+    imagine = ImagineRequest.model_validate_json(make_call(Kind("imagine", 2, stream=True), ONE, 3).body)
+    assert (imagine.controls.n, imagine.controls.seed, imagine.stream) == (2, 3, True)
+    assert imagine.camera in {clip.camera for clip in ONE[0].scene.clips}
 
 
 @pytest.mark.parametrize(
@@ -35,7 +39,7 @@ def test_who_decides_on_thinking(work: Work, thinking: str) -> None:
 
 
 @pytest.mark.parametrize("payload", ["msgpack", "multipart"])
-@pytest.mark.parametrize("work", ["plan", "reflect", "batch"])
+@pytest.mark.parametrize("work", ["plan", "reflect", "batch", "imagine"])
 def test_other_payloads_say_the_same_with_pictures_as_they_are(work: Work, payload: Payload) -> None:
     scenes = BATCH_SCENES if work == "batch" else 1
     plain, other = asked(Kind(work), scenes), asked(Kind(work, payload=payload), scenes)

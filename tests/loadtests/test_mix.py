@@ -21,6 +21,10 @@ def test_choices_occur_as_often_as_they_weigh() -> None:
 def test_labels_and_batches_do_not_stream() -> None:
     kinds = parse_mix("label,batch", "6", "json", "300", 1.0).kinds(50, seed=0)
     assert set(kinds) == {Kind("label", 1), Kind("batch", 6, deadline_ms=300)}
+    pictures = parse_mix("imagine", "2", "json", "300", 1.0).kinds(5, seed=0)
+    assert set(pictures) == {Kind("imagine", 2, stream=True)}
+    with pytest.raises(ValueError, match="no deadline"):
+        Kind("imagine", deadline_ms=300)
     with pytest.raises(ValueError, match="no stream"):
         Kind("batch", stream=True)
 

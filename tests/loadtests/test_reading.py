@@ -50,3 +50,10 @@ def test_a_batch_is_as_good_as_its_worst_part() -> None:
 def test_a_label_is_a_reflection() -> None:
     assert read(Kind("label", 1), 200, {"reflection": "Slow down."}).branch == "label"
     assert read(Kind("label", 1), 200, {}) == BAD_ANSWER
+
+
+def test_pictures_are_all_there_or_none() -> None:
+    picture = {"image": "iVBO", "codes": [0] * 98}
+    assert read(Kind("imagine", 2), 200, {"pictures": [picture, picture]}).branch == "imagine"
+    assert read(Kind("imagine", 2), 200, {"pictures": [picture]}) == BAD_ANSWER
+    assert read(Kind("imagine", 1), 200, {"pictures": [{"codes": [0] * 98}]}) == BAD_ANSWER

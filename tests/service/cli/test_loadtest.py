@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from service.settings import Settings
-from tests.service.scripted_engine import ScriptedEngine
+from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import serve
 
 
@@ -48,6 +49,21 @@ def test_scripts_find_what_they_rely_on(tmp_path: Path) -> None:
     assert told["service"]["models"][0]["name"] == "scripted"
     assert told["setup"]["mix"]["deadlines_ms"] == {"none": 1, "5000": 1}
     assert "</html>" in report.read_text()
+
+
+def test_pictures_come_out_of_services_that_imagine_and_others_are_refused_by_name() -> None:
+    engine = ScriptedEngine()
+    engine.card_shown = replace(CARD, formats=("cf_vla", "vla_world"), paints=True)
+    mix = ("--mix", "imagine=2,direct=1", "--n", "2", "--stream", "0.5", "--rate", "5", "--seconds", "4")
+    with serve(engine, Settings()) as served:
+        done = loadtest(served.url, *mix, "--lag-limit-ms", "5000", "--json")
+        told = json.loads(done.stdout)
+        engine.card_shown = CARD
+        refused = loadtest(served.url, *mix)
+    assert (told["errors"], told["rejected"]) == (0, 0), told["problems"]
+    assert told["by_branch"]["imagine"]["latency_s"]["count"] > 5
+    assert refused.returncode == 2
+    assert "serves scripted: no pictures can be imagined" in refused.stderr
 
 
 def test_a_run_that_does_not_count_says_so_and_why() -> None:
