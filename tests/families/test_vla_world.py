@@ -15,15 +15,18 @@ import torch
 import clients.wire as wire
 from clients.answers import PlannedDraw
 from clients.planner import PlannerClient
+from model.driving.cameras import CAMERA_SPECS
 from model.driving.images import encode_png
 from model.driving.labeller import expert_plan
+from model.driving.next_view import moved_view
 from model.driving.perceived import perceived_of
 from model.driving.scene import Clip, LabelledScene, NextFrame
+from model.driving.short_term import INERTIA
 from model.engines.engine import Controls, Draw, PlanRequest, RequestError
 from model.engines.requests import begin
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.torch.present_picture import present_picture
+from model.engines.torch.expected_picture import expected_picture
 from model.engines.torch.runner import Runner
 from model.engines.torch.shortcuts import Shortcuts
 from model.evaluation.open_loop import evaluate_draws
@@ -169,23 +172,26 @@ def test_what_the_camera_sees_now_saves_passes_and_changes_nothing(world: Loaded
         assert told["all"][1] < passes - 70
 
 
-def test_the_present_picture_is_what_the_asked_camera_shows_last(world: Loaded) -> None:
+def test_the_expected_picture_is_what_the_asked_camera_shows_last_moved_as_the_ego(world: Loaded) -> None:
     torch.manual_seed(0)
     painting = replace(world, visual_codes=VisualCodes(24).eval())
     scene = noisy_scene(1)
     wide, _ = scene.clips
 
     def told(parts: Loaded, camera: str | None) -> tuple[int, ...]:
-        return present_picture(PlanRequest("a", scene, "vla_world", Controls(camera=camera)), parts)
+        return expected_picture(PlanRequest("a", scene, "vla_world", Controls(camera=camera)), parts)
 
     assert painting.visual_codes is not None
     [ids] = world.vocabulary.alphabets["visual"]
-    codes = painting.visual_codes.encode(frame_of(wide.images[-1])).tolist()
+    pose = INERTIA.ego(scene.history, None)
+    assert np.hypot(*pose[:2]) > 0.5
+    moved = moved_view(frame_of(wide.images[-1]), CAMERA_SPECS[wide.camera], pose)
+    codes = painting.visual_codes.encode(moved).tolist()
     assert told(painting, wide.camera) == tuple(ids[code] for code in codes)
     assert told(world, wide.camera) == told(painting, "back") == told(painting, None) == ()
     broken = replace(scene, clips=(*scene.clips, Clip("back", (wide.images[0][:200],) * 4)))
     request = PlanRequest("a", broken, "vla_world", Controls(camera="back"))
-    assert present_picture(request, painting) == ()
+    assert expected_picture(request, painting) == ()
 
 
 def test_the_camera_that_is_asked_for_stands_in_the_prompt(world: Loaded) -> None:

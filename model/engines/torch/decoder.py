@@ -29,8 +29,8 @@ from model.engines.requests import begin, read
 from model.engines.torch.batch import Batch, Feed
 from model.engines.torch.deadlines import LatencyModel, drafts_of
 from model.engines.torch.drafter import Drafter
+from model.engines.torch.expected_picture import expected_picture
 from model.engines.torch.integrity import check
-from model.engines.torch.present_picture import present_picture
 from model.engines.torch.request import Phase, Request, Tree
 from model.engines.torch.rows import Row
 from model.engines.torch.runner import ROWS_A_TREE, Asked, Runner
@@ -128,7 +128,7 @@ class Decoder:
             plan_request: what is asked.
             submitted_s: when, on the decoder's clock, its deadline counts from; now if it is not given.
             binding: of the request, see `binding_of`; made here if it is not given.
-            picture: likewise, see `present_picture`.
+            picture: likewise, see `expected_picture`.
 
         Raises:
             RequestError: it can never be served: unknown format, too many draws, a missing camera, a
@@ -143,7 +143,7 @@ class Decoder:
         request = Request(plan_request, family, origin, arrived_s, self._least_error)
         request.binding = binding or binding_of(plan_request, loaded.codec, loaded.vocabulary)
         if self._shortcuts.speculate:
-            request.picture = present_picture(plan_request, loaded) if picture is None else picture
+            request.picture = expected_picture(plan_request, loaded) if picture is None else picture
         request.draws_a_tree = self._scheduler.draws_a_tree(request)
         request.plant(share=self._shortcuts.shared_rows)
         if not self._scheduler.fits(request):

@@ -5,7 +5,7 @@ There are four sources, asked in this order:
 
 1. the last response to the same pictures, while the row agrees with it (`_Responses`);
 2. the first plan, while a revised plan repeats it;
-3. within a picture that is imagined: what its camera sees now;
+3. within a picture that is imagined: what its camera sees now, moved as the ego;
 4. what followed the same last tokens in any response (`_Ngrams`).
 """
 
@@ -52,7 +52,7 @@ class Drafter:
     def __init__(self) -> None:
         self._ngrams, self._responses = _Ngrams(), _Responses()
         self._codes, self._codes_kept = 2, 1
-        """Codes of pictures that were written beside those of now, and how many were the same."""
+        """Codes of pictures that were written where one was expected, and how many were the same."""
 
     def propose(self, row: Row, rows: int) -> tuple[list[int], list[tuple[int, Ids]]]:
         """A row's pending tokens with guesses behind them, and the decisions among both.
@@ -82,9 +82,9 @@ class Drafter:
                 token = repeated[position]
             elif position < len(copied):
                 token = copied[position]
-            elif position < most and (now := _code_now(row, cursor)) is not None:
+            elif position < most and (expected := _code_expected(row, cursor)) is not None:
                 share *= self._codes_kept / self._codes
-                token = now if share > least else None
+                token = expected if share > least else None
             elif position < most and (len(ids) <= _MAX_OPTIONS or cursor.stop_id is not None):
                 number = uniform(controls.seed, row.draws[0], written + position)
                 likely = self._ngrams.likely(context, number if controls.temperature else None)
@@ -109,9 +109,9 @@ class Drafter:
 
     def observe(self, row: Row, options: int, chosen: Sequence[tuple[int, tuple[int, ...]]]) -> None:
         """Draws of a row are about to write ``chosen`` tokens, each out of so many options."""
-        if (now := _code_now(row, row.cursor)) is not None:
+        if (expected := _code_expected(row, row.cursor)) is not None:
             self._codes += sum(len(draws) for _, draws in chosen)
-            self._codes_kept += sum(len(draws) for token, draws in chosen if token == now)
+            self._codes_kept += sum(len(draws) for token, draws in chosen if token == expected)
         if options <= _MAX_OPTIONS or row.cursor.stop_id is not None:
             context = [token.id for token in row.tokens[-max(_CONTEXTS) :]]
             for token, draws in chosen:
@@ -128,8 +128,8 @@ class Drafter:
         return last[written:] if same else ()
 
 
-def _code_now(row: Row, cursor: Cursor) -> int | None:
-    """Before a code of a picture whose camera's present picture is known: the code at its place there."""
+def _code_expected(row: Row, cursor: Cursor) -> int | None:
+    """Before a code of a picture of which something is expected: the code at its place there."""
     imagination, picture = row.request.family.imagination, row.request.picture
     if not picture or imagination is None or cursor.section != imagination.section:
         return None

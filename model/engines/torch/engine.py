@@ -18,9 +18,9 @@ from model.engines.engine import DrawFinished, EngineError, Event, Load, PlanReq
 from model.engines.pictures import PictureThreads
 from model.engines.requests import painted
 from model.engines.torch.decoder import Counts, Decoder, Failed
+from model.engines.torch.expected_picture import expected_picture
 from model.engines.torch.frames import Frames
 from model.engines.torch.graphs import CudaGraph
-from model.engines.torch.present_picture import present_picture
 from model.engines.torch.runner import Runner
 from model.engines.torch.shortcuts import Shortcuts
 from model.engines.torch.threads import FreeCores, fit_threads
@@ -185,7 +185,7 @@ class TorchEngine:
         """Do what would hold up the decoding thread."""
         self._frames.look_at(request.scene)
         binding = binding_of(request, self._loaded.codec, self._loaded.vocabulary)
-        return binding, present_picture(request, self._loaded) if self._settings.shortcuts.speculate else ()
+        return binding, expected_picture(request, self._loaded) if self._settings.shortcuts.speculate else ()
 
     def _add(
         self,

@@ -15,7 +15,7 @@ class Shortcuts:
         shared_prompts: a scene's prompt is worked out and held once for all its draws.
         speculate: a revised plan is fed as far as it may repeat the first one, and any response as the last
             one to the same pictures, or others, went on, as far as that is likely; a picture that is imagined
-            as its camera sees it now; what is fed ahead is checked.
+            as its camera sees it now, moved as the ego; what is fed ahead is checked.
         reuse: what pictures come to, and what all prompts begin with, is kept for those that come again (by
             the `Runner`).
         capture: on a GPU a pass is replayed as a whole where one of its sizes came before (by the `Runner`).
