@@ -14,8 +14,9 @@ from clients.metadrive.actors import STEP_S
 from clients.metadrive.annotate import to_ego
 from clients.metadrive.drive import Shot
 from clients.metadrive.lettering import Colour, write_in_box
+from clients.metadrive.windows import PICTURE_STEPS
 from model.driving.cameras import FRONT_CAMERAS, CameraSpec
-from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
+from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, FRONT_WIDE
 from model.driving.trajectory import FloatArray
 
 _CAMERA_PX: Final = 560
@@ -35,6 +36,8 @@ _KINDS: Final = {
     "cone": (240, 140, 40),
     "barrier": (240, 140, 40),
 }
+IMAGINED: Final = FRONT_WIDE
+"""The camera of imagined pictures."""
 _FRAME_MS: Final = 400
 _COLOURS: Final = 255
 
@@ -43,10 +46,16 @@ class Film:
     """Gathers frames; write them with `save`.
 
     A frame shows both cameras, beside them the road from above and the plan in words.
+
+    Args:
+        imagines: below that, what `IMAGINED` sees, beside what the driver imagined of it half a second ago.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, imagines: bool = False) -> None:
         self._frames: list[Image.Image] = []
+        self._imagines = imagines
+        self._imagined: dict[int, bytes] = {}
+        """Pictures by the step that they are of."""
 
     def add(self, shot: Shot) -> None:
         """One moment."""
@@ -59,7 +68,29 @@ class Film:
         left = _CAMERA_PX + _ABOVE_PX + _MARGIN_PX
         box = (left, _MARGIN_PX, frame.width - _MARGIN_PX, height - _MARGIN_PX)
         write_in_box(ImageDraw.Draw(frame), box, _words(shot), _LETTERS_PX)
+        if self._imagines:
+            frame = self._with_imagined(shot, frame)
         self._frames.append(frame)
+
+    def _with_imagined(self, shot: Shot, frame: Image.Image) -> Image.Image:
+        """A frame with a strip below: what came, and what was imagined; dark where nothing was."""
+        taken = next(picture for picture in shot.pictures if picture.camera == IMAGINED)
+        strip = [("what came", taken.jpeg), ("imagined half a second ago", self._imagined.get(shot.step))]
+        if shot.planned is not None and shot.planned.imagined is not None:
+            self._imagined = {shot.step + PICTURE_STEPS: shot.planned.imagined}
+        width = frame.width // 2
+        height = width // 2
+        whole = Image.new("RGB", (frame.width, frame.height + height), _PAPER)
+        whole.paste(frame)
+        draw = ImageDraw.Draw(whole)
+        for place, (title, picture) in enumerate(strip):
+            left, top = place * width, frame.height
+            if picture is not None:
+                view = Image.open(io.BytesIO(picture)).convert("RGB")
+                whole.paste(view.resize((width, height), Image.Resampling.BICUBIC), (left, top))
+            box = (left + _MARGIN_PX, top + _MARGIN_PX, left + width - _MARGIN_PX, top + height)
+            write_in_box(draw, box, [(title, _INK)], _LETTERS_PX)
+        return whole
 
     def save(self, path: Path) -> None:
         """Write an animated GIF; raises `ValueError` without frames."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import time
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -9,7 +10,8 @@ from typing import Protocol
 import numpy as np
 
 from clients import wire
-from clients.planner import PlannerClient
+from clients.planner import PlannerClient, imagine_request
+from clients.wire_imagine import ImagineControls
 from model.driving.scene import Scene
 from model.driving.trajectory import FloatArray, constant_velocity
 
@@ -26,6 +28,7 @@ class Planned:
         think_rate: share of the draws that took one; None where nobody thinks.
         milliseconds: that it took.
         late: whether that was more than its deadline.
+        imagined: a PNG of what its camera will see in half a second; None where nobody asked for it.
     """
 
     trajectory: FloatArray
@@ -35,6 +38,7 @@ class Planned:
     think_rate: float | None = None
     milliseconds: float = 0.0
     late: bool = False
+    imagined: bytes | None = None
 
 
 class Pilot(Protocol):
@@ -76,6 +80,7 @@ class ServicePilot:
         route: whether the model is told the route.
         tracks: whether it is told the tracks of the objects around.
         format: a response format that the model writes; its first where None.
+        imagines: a camera whose next picture is asked for too, for a film; the time of plans is without it.
     """
 
     needs_pictures = True
@@ -89,7 +94,9 @@ class ServicePilot:
         route: bool = True,
         tracks: bool = False,
         format: str | None = None,
+        imagines: wire.Camera | None = None,
     ) -> None:
+        self._imagines = imagines
         self._planner, self.name, self._controls = planner, name, controls
         self._route, self._tracks, self._format = route, tracks, format
         self._asked = 0
@@ -118,4 +125,9 @@ class ServicePilot:
             think_rate=float(np.mean([draw.thinking is not None for draw in result.draws])),
             milliseconds=milliseconds,
             late=controls.deadline_ms is not None and milliseconds > controls.deadline_ms,
+            imagined=None if self._imagines is None else self._imagined(asked, self._imagines, controls.seed),
         )
+
+    def _imagined(self, scene: Scene, camera: wire.Camera, seed: int) -> bytes:
+        told = self._planner.imagine(imagine_request(scene, camera, ImagineControls(seed=seed)))
+        return base64.b64decode(told.pictures[0].image)

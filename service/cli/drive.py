@@ -12,7 +12,8 @@ import typer
 
 from service.cli.options import Json, told
 
-DRIVERS: Final = ("expert", "constant-velocity", "adaptive", "never", "always")
+SERVICE_DRIVERS: Final = ("adaptive", "never", "always")
+DRIVERS: Final = ("expert", "constant-velocity", *SERVICE_DRIVERS)
 
 
 def drive(
@@ -56,7 +57,7 @@ def drive(
     from clients.metadrive.drive import EXPERT, Drive, DriveConfig
     from clients.metadrive.drive import drive as drive_episode
     from clients.metadrive.drive_table import driver_rows, format_table, to_json
-    from clients.metadrive.film import Film
+    from clients.metadrive.film import IMAGINED, Film
     from clients.metadrive.kept_drives import KeptDrives
     from clients.metadrive.maps import MapError
     from clients.metadrive.pilots import ConstantVelocity, Pilot, ServicePilot
@@ -67,14 +68,22 @@ def drive(
     from model.driving.scene import split_of_seed
     from service.cli.small_pilot import SmallPilot
 
-    def pilot_of(driver: str, planner: PlannerClient) -> Pilot | None:
+    def pilot_of(driver: str, planner: PlannerClient, *, imagines: bool) -> Pilot | None:
         if driver == "expert":
             return None
         if driver == "constant-velocity":
             return ConstantVelocity()
         if driver in small_pilots:
             return small_pilots[driver]
-        return ServicePilot(planner, driver, controls_of(driver), route=route, tracks=tracks, format=format)
+        return ServicePilot(
+            planner,
+            driver,
+            controls_of(driver),
+            route=route,
+            tracks=tracks,
+            format=format,
+            imagines=IMAGINED if imagines else None,
+        )
 
     def controls_of(driver: str) -> wire.Controls:
         return wire.Controls(
@@ -97,7 +106,7 @@ def drive(
     with told():
         small_pilots = {pilot.name: pilot for pilot in map(SmallPilot, small or ())}
     wanted = [*(drivers or ([] if small else DRIVERS[:-1])), *small_pilots]
-    asks = any(driver in ("adaptive", "never", "always") for driver in wanted)
+    asks = any(driver in SERVICE_DRIVERS for driver in wanted)
     if unknown := set(drivers or ()) - set(DRIVERS):
         raise typer.BadParameter(f"unknown drivers: {', '.join(sorted(unknown))}")
     with (
@@ -112,7 +121,8 @@ def drive(
         models = [card.revision for card in cards]
         width_px = max((card.image_size[0] for card in cards), default=FRONT_CAMERAS[0].width)
         rig = Rig.of_width(width_px)
-        film, config = Film(), DriveConfig(seconds)
+        imagines = wanted[-1] in SERVICE_DRIVERS and any(card.imagines and card.paints for card in cards)
+        film, config = Film(imagines=imagines), DriveConfig(seconds)
         kept = KeptDrives(keep) if keep is not None else None
         found: dict[str, list[Drive]] = {}
         # Progress goes to stderr, so that stdout holds nothing but the table.
@@ -120,9 +130,9 @@ def drive(
             task = progress.add_task("", total=len(seeds) * len(wanted))
             for seed in seeds:
                 for driver in wanted:
-                    pilot = pilot_of(driver, planner)
-                    name = EXPERT if pilot is None else pilot.name
                     filmed = gif is not None and seed == seeds[0] and driver == wanted[-1]
+                    pilot = pilot_of(driver, planner, imagines=filmed and imagines)
+                    name = EXPERT if pilot is None else pilot.name
                     key = key_of(driver, seed, models)
                     drove = kept.find(key) if kept is not None and not filmed else None
                     try:

@@ -14,7 +14,7 @@ from clients.metadrive.drive import EXPERT, TAKE_OVER, Drive, DriveConfig, Shot,
 from clients.metadrive.drive_table import driver_rows, format_table, to_json
 from clients.metadrive.episode import make_world, run_episode
 from clients.metadrive.episode_log import EpisodeLog
-from clients.metadrive.film import Film
+from clients.metadrive.film import IMAGINED, Film
 from clients.metadrive.kept_drives import KeptDrives
 from clients.metadrive.pilots import ConstantVelocity, Planned, ServicePilot
 from clients.metadrive.rig import Rig
@@ -167,6 +167,38 @@ def test_it_drives_through_the_api(rig: Rig, tmp_path: Path) -> None:
     assert words[-1] > 0.3 * len(frame)
     with pytest.raises(ValueError, match="frame"):
         Film().save(tmp_path / "none.gif")
+
+
+def test_a_film_shows_what_was_imagined_beside_what_came(rig: Rig, tmp_path: Path) -> None:
+    engine, film, shots = ScriptedEngine(), Film(imagines=True), list[Shot]()
+    engine.card_shown = replace(CARD, formats=("cf_vla", "vla_world"), paints=True)
+
+    def on_shot(shot: Shot) -> None:
+        shots.append(shot)
+        film.add(shot)
+
+    with (
+        serve(engine, Settings(bundled_scenes=tmp_path / "none")) as served,
+        PlannerClient(served.url) as planner,
+    ):
+        pilot = ServicePilot(planner, "never", wire.Controls(n=1, thinking="never"), imagines=IMAGINED)
+        drove = drive(SEED, pilot, rig, replace(CONFIG, duration_s=3.0), on_shot)
+    cameras = [request.controls.camera for request in engine.submitted]
+    assert cameras == [None, IMAGINED] * drove.plans
+    film.save(tmp_path / "drive.gif")
+    strips = []
+    with Image.open(tmp_path / "drive.gif") as gif:
+        for place in range(len(shots)):
+            gif.seek(place)
+            strips.append(np.asarray(gif.convert("RGB")).astype(int)[-200:])
+    middle = strips[0].shape[1] // 2
+    paper = strips[0][-1, -1]
+    for shot, strip in zip(shots, strips, strict=True):
+        drawn = np.abs(strip - paper).max(axis=2) > 8
+        came, imagined = drawn[:, :middle], drawn[:, middle:]
+        assert came.mean() > 0.9
+        # The first picture is of half a second after the first plan.
+        assert (imagined.mean() > 0.9) == (shot.step > TAKE_OVER)
 
 
 def test_drivers_are_compared_over_the_same_episodes() -> None:
