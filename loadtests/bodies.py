@@ -6,7 +6,7 @@ import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import httpx
 import msgpack
@@ -81,7 +81,7 @@ def _asked(kind: Kind, labelled: LabelledScene, seed: int) -> dict[str, Any]:
         return asked.model_dump(mode="json")
     if kind.work == "imagine":
         # In turn those that the scene shows, as a planner does that compares with what comes.
-        camera = scene.clips[seed % len(scene.clips)].camera
+        camera = cast(wire.Camera, scene.clips[seed % len(scene.clips)].camera)
         controls = ImagineControls(n=kind.n, seed=seed)
         return imagine_request(scene, camera, controls).model_dump(mode="json")
     shared: dict[str, Any] = {"n": kind.n, "seed": seed, "deadline_ms": kind.deadline_ms}
