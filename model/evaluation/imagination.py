@@ -11,7 +11,7 @@ import numpy as np
 from model.driving.intervals import Interval
 from model.driving.scene import LabelledScene
 from model.driving.trajectory import TEN_HZ_S
-from model.engines.engine import Controls, Draw, Engine, ModelCard
+from model.engines.engine import Controls, Draw, Engine
 from model.evaluation.bootstrap import Comparison, Measured, compare, mean_interval
 from model.evaluation.next_frames import (
     Painter,
@@ -39,6 +39,7 @@ from model.evaluation.waypoints import (
 from model.families.family import Family
 from model.families.registry import family_named
 from model.network.checkpoint import Loaded
+from model.network.model_card import ModelCard
 from model.network.visual_codes import Frame
 
 AUTO: Final = "auto"
