@@ -24,6 +24,7 @@ from model.driving.pdm.world import STEP_S, STEPS, ScoreError, World
 from model.driving.trajectory import (
     HALF_SECONDS_S,
     TEN_HZ_S,
+    TIMES_OF,
     FloatArray,
     GeometryError,
     at_times,
@@ -51,7 +52,6 @@ from service.telling import PlanTeller, Written
 
 VERSION: Final[Version] = "v1.1"
 """PDMS, which the paper judges by."""
-_TIMES_S: Final = {len(times_s): times_s for times_s in (HALF_SECONDS_S, TEN_HZ_S)}
 _POINTER: Final = "/draft"
 
 
@@ -187,11 +187,11 @@ class RefineTeller:
 
 def _draft(asked: list[list[float]]) -> tuple[FloatArray, tuple[float, ...]]:
     """A draft [8, 4] or [64, 4], and when its poses are."""
-    if len(asked) not in _TIMES_S:
+    if len(asked) not in TIMES_OF:
         raise at(
             INVALID_TRAJECTORY, _POINTER, f"has {len(asked)} poses; 8 at 0.5 s or 64 at 0.1 s are refined"
         )
-    times_s = _TIMES_S[len(asked)]
+    times_s = TIMES_OF[len(asked)]
     try:
         return check_trajectory(asked, times_s), times_s
     except GeometryError as error:

@@ -59,6 +59,7 @@ class Inference:
         temperature, top_p, seed, thinking: as in `wire.Controls`.
         route, tracks: whether the model is told them.
         version: whose rules trajectories are scored by.
+        format: that it responds in; the model's first one where none is named.
     """
 
     n: int = 2
@@ -69,6 +70,7 @@ class Inference:
     route: bool = True
     tracks: bool = False
     version: Version = "v1.1"
+    format: str | None = None
 
     @property
     def controls(self) -> wire.Controls:
@@ -108,12 +110,9 @@ class Chosen(NamedTuple):
 
 def inference_config(model: wire.ModelName, inference: Inference) -> Record:
     """What decides an inference besides the scene."""
-    return {
-        "model": model.name,
-        "revision": model.revision,
-        "facts": FACTS_VERSION,
-        **asdict(inference),
-    }
+    # No format, no entry: what was inferred before one could be named is found again.
+    given = {name: value for name, value in asdict(inference).items() if value is not None}
+    return {"model": model.name, "revision": model.revision, "facts": FACTS_VERSION, **given}
 
 
 def feedback_config(inference: Run, teacher: FeedbackTeacher | None, threshold: float) -> Record:
@@ -139,7 +138,7 @@ async def infer(
     """
     scene = labelled.given(route=inference.route, tracks=inference.tracks)
     with of_the_service():
-        answer = await planner.plan(scene, inference.controls)
+        answer = await planner.plan(scene, inference.controls, format=inference.format)
     if answer.model != model:
         raise StageStopped(
             f"the service now runs {answer.model.name} {answer.model.revision} instead of {model.revision}"

@@ -25,6 +25,8 @@ TEN_HZ_S: Final = tuple(round(STEP_S * step, 1) for step in range(1, FUTURE_STEP
 """Times of the poses of a trajectory, unless a model family has its own."""
 HALF_SECONDS_S: Final = tuple(0.5 * step for step in range(1, 9))
 """Times of the eight poses of NAVSIM's plans."""
+TIMES_OF: Final = {len(times_s): times_s for times_s in (HALF_SECONDS_S, TEN_HZ_S)}
+"""Times of plans that are scored, by how many poses they have."""
 THREE_SECONDS_S: Final = HALF_SECONDS_S[:6]
 """Times of the six waypoints by which open-loop figures on nuScenes are told."""
 MAX_TIME_S: Final = 60.0

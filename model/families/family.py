@@ -190,6 +190,19 @@ class Reflection:
 
 
 @dataclass(frozen=True, eq=False)
+class JudgedAttempt:
+    """An example of refinement: what a model answered, what feedback says of it, and whether it was right.
+
+    Where it was right, the answer itself is taught once more behind the feedback. ``thinking`` is what led to
+    it; empty where it is not known, and not needed where the answer is wrong.
+    """
+
+    attempt: Attempt
+    thinking: str
+    correct: bool
+
+
+@dataclass(frozen=True, eq=False)
 class Lesson:
     """What a labelled scene has to teach.
 
@@ -201,6 +214,7 @@ class Lesson:
         thoughts: that lead to what the expert does; None where the scene's annotations do not tell.
         perceived: what there is to perceive; None where they do not tell.
         next_picture: None where there is none.
+        attempt: to be refined, for families that do.
     """
 
     plan: Plan
@@ -210,6 +224,7 @@ class Lesson:
     thoughts: Thoughts | None = None
     perceived: Perceived | None = None
     next_picture: NextPicture | None = None
+    attempt: JudgedAttempt | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
+from model.driving.plan import Plan
 from model.driving.scene import mirrored_camera
 from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, present_speed
-from model.families.family import Lesson, NextPicture, Reflection, Situation
+from model.families.family import FamilyError, JudgedAttempt, Lesson, NextPicture, Reflection, Situation
 from model.families.registry import families_of
 from model.families.trajectory_codes import CODES
 from model.formats.cursor import CompiledFormat
+from model.formats.pieces import FormatError
 from model.network.codec import TrajectoryCodec
 from model.network.inputs import InputBuilder
 from model.network.patches import patchify
@@ -61,6 +63,7 @@ class Item:
         asked: whether the prompt asks for that camera.
         reflections: places of reflections on it, whose responses all follow the same prompt; without any,
             the response is the expert's own.
+        attempt: place of the attempt on it that is refined; None where the format refines none.
     """
 
     index: int
@@ -73,6 +76,7 @@ class Item:
     pictures: bool = True
     camera: str | None = None
     asked: bool = False
+    attempt: int | None = None
 
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
@@ -117,13 +121,15 @@ class ResponseDataset(Dataset[Sample]):
         pictures: whether prompts have them.
         vision: what the tower sees in all examples, where it does not learn; else their patches are given.
         reflections: to be asked for by items.
+        attempts: to be asked for by items, which are refined in the format ``attempting``.
         own_plans: behind which trajectories are learned too, where nothing is reflected.
         visual_codes: of the checkpoint, where items are to teach pictures.
         seed: of the codes that are drawn.
 
     Raises:
         FormatError: a reflection holds text that the checkpoint cannot write.
-        ValueError: there are reflections, and it writes none.
+        ValueError: there are reflections, and it writes none; an attempt holds text that the checkpoint
+            cannot read or write.
     """
 
     def __init__(
@@ -137,10 +143,13 @@ class ResponseDataset(Dataset[Sample]):
         pictures: bool,
         vision: VisionCache | None = None,
         reflections: Sequence[Reflection] = (),
+        attempts: Sequence[JudgedAttempt] = (),
+        attempting: str | None = None,
         own_plans: OwnPlans | None = None,
         visual_codes: VisualCodes | None = None,
         seed: int = 0,
     ) -> None:
+        self._attempts = attempts
         self._own_plans = own_plans
         self._visual_codes, self._next = visual_codes, dict[tuple[int, str, bool], NextPicture]()
         self._examples, self._inputs, self._reflections = examples, inputs, reflections
@@ -160,6 +169,18 @@ class ResponseDataset(Dataset[Sample]):
             plan = reflection.revised_plan or reflection.first_plan
             nowhere = np.zeros((FUTURE_STEPS, 4), np.float32)
             self._target(self.reflecting, Lesson(plan, (0,) * CODES, nowhere, reflection))
+        for place, tried in enumerate(attempts if attempting is not None else ()):
+            self._check(str(attempting), place, tried)
+
+    def _check(self, task: str, place: int, tried: JudgedAttempt) -> None:
+        """Raise ValueError unless an attempt can be told, and its answer taught where that is right."""
+        try:
+            self._inputs.text(task, Situation(self._examples.history[0], attempt=tried.attempt))
+            if tried.correct:
+                nowhere = np.zeros((FUTURE_STEPS, 4), np.float32)
+                self._target(task, Lesson(Plan(), (0,) * CODES, nowhere, attempt=tried))
+        except (FormatError, FamilyError) as error:
+            raise ValueError(f"attempt {place} cannot be learned from in {task!r}: {error}") from error
 
     def __len__(self) -> int:
         return len(self._examples)
@@ -191,14 +212,17 @@ class ResponseDataset(Dataset[Sample]):
                 index, self.random, mirror=item.mirror, route=item.route, tracks=item.tracks
             )
             reflections.append(Reflection(own, "", judged=False))
+        tried = None if item.attempt is None else self._attempts[item.attempt]
         soft = [self._soft.draw(vector, self.random) for _ in reflections]
         lessons = [
-            Lesson(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived, picture)
+            Lesson(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived, picture, tried)
             for drawn, reflection in zip(soft, reflections, strict=True)
         ]
         camera = picture.camera if picture is not None and item.asked else None
+        attempt = None if tried is None else tried.attempt
+        situation = Situation(history, route if item.route else None, attempt, camera)
         return Sample(
-            prompt=self._prompt(item, Situation(history, route if item.route else None, camera=camera)),
+            prompt=self._prompt(item, situation),
             responses=[self._target(item.task, lesson) for lesson in lessons],
             seen=self._vision.tokens(index, item.mirror) if pictures and self._vision is not None else None,
             patches=self._patches(item) if pictures and self._vision is None else None,
@@ -255,7 +279,8 @@ class TaskSampler(BatchSampler):
     Examples without pictures are always given their tracks: else there would be nothing to go by.
 
     Reflections are examples of their own beside all others: the natural mixture of CF-VLA section 6. Those
-    on one scene share its prompt, and scenes with about as many share a batch.
+    on one scene share its prompt, and scenes with about as many share a batch. So are attempts, each with a
+    prompt of its own; their feedback tells of this scene, so they are neither mirrored nor blurred.
 
     Args:
         has_route: bool [m], which examples have one; so many there are.
@@ -276,6 +301,8 @@ class TaskSampler(BatchSampler):
         reflecting: the format of reflections and of examples that are learned once more; needed with them.
         reasoning: whether reflections are learned; otherwise their examples are learned once more without,
             the control "multi-round" of CF-VLA section 4.3.
+        attempted: int64 [a], the example that each attempt is on.
+        attempting: the format that refines them; needed with them.
     """
 
     def __init__(
@@ -297,7 +324,12 @@ class TaskSampler(BatchSampler):
         mirror_reflected: bool = False,
         next_cameras: Sequence[tuple[str, ...]] = (),
         picture_share: float = 0.0,
+        attempted: npt.NDArray[np.int64] = np.zeros(0, np.int64),
+        attempting: str | None = None,
     ) -> None:
+        if len(attempted) and attempting is None:
+            raise ValueError("attempts need a format that refines them")
+        self._attempted, self._attempting = attempted, attempting or ""
         self._pictured = np.ones(len(has_route), np.bool_) if pictured is None else pictured
         self._next_cameras, self._picture_share = next_cameras, picture_share
         self._mirror_reflected = mirror_reflected
@@ -325,16 +357,20 @@ class TaskSampler(BatchSampler):
 
     def __len__(self) -> int:
         plain = len(self._has_route) + len(self._again)
-        return plain // self._batch_size + len(self._reflections) // self._scenes_a_batch
+        own = (plain, len(self._attempted))
+        return (
+            sum(count // self._batch_size for count in own) + len(self._reflections) // self._scenes_a_batch
+        )
 
     def __iter__(self) -> Iterator[list[Item]]:  # type: ignore[override]  # items instead of positions
         random = np.random.default_rng((self._seed, self._epoch))
         plain, plain_rest = self._rounds(self._plain(random), self._batch_size)
         reflected, reflected_rest = self._rounds(self._reflected(random), self._scenes_a_batch)
-        rounds = plain + reflected
+        tried, tried_rest = self._rounds(self._tries(random), self._batch_size)
+        rounds = plain + reflected + tried
         for place in random.permutation(len(rounds)):
             yield from rounds[place]
-        yield from plain_rest + reflected_rest
+        yield from plain_rest + reflected_rest + tried_rest
 
     def _plain(self, random: np.random.Generator) -> list[Item]:
         """The expert's own responses, in a new order; those on ``again`` with a plan."""
@@ -378,6 +414,22 @@ class TaskSampler(BatchSampler):
             )
             for place in random.permutation(len(example))
             for index in [int(example[place])]
+        ]
+
+    def _tries(self, random: np.random.Generator) -> list[Item]:
+        given = self._given(self._attempted, random)
+        tracks = self._drawn("tracks", len(self._attempted), random)
+        return [
+            Item(
+                index,
+                self._attempting,
+                bool(given[place]),
+                tracks=bool(tracks[place] or not self._pictured[index]),
+                pictures=bool(self._pictured[index]),
+                attempt=int(place),
+            )
+            for place in random.permutation(len(self._attempted))
+            for index in [int(self._attempted[place])]
         ]
 
     def _drawn(self, name: str, count: int, random: np.random.Generator) -> npt.NDArray[np.bool_]:

@@ -64,6 +64,8 @@ class Recipe:
         head_weight: of a regression of the trajectory where its first code is written.
         reflections: what becomes of the reflections of a build: ``learned`` as counterfactual examples, or
             their ``scenes`` learned once more without them; None where there are none.
+        attempting: the format in which a model's own failures are learned from, where there is a file of
+            them; None where they are not.
         outcome: how own draws are judged; for that goal alone.
         seed: of order and initialisation.
     """
@@ -87,6 +89,7 @@ class Recipe:
     error_weight: float = 0.0
     head_weight: float = 0.0
     reflections: Literal["learned", "scenes"] | None = None
+    attempting: str | None = None
     outcome: OutcomeSettings | None = None
     seed: int = 0
 
@@ -170,11 +173,12 @@ NANO: Final[Mapping[str, Recipe]] = (
             picture_share=picture_share,
             error_weight=0.0,
             head_weight=0.0,
+            attempting=attempting,
         )
-        for name, task, weights, picture_share in (
-            ("elf-sft", "elf_vla", elf_vla.WEIGHTS, 0.0),
-            ("world-pretrain", "vla_world", vla_world.PICTURE_WEIGHTS, 1.0),
-            ("world-sft", "vla_world", vla_world.WEIGHTS, 0.5),
+        for name, task, weights, picture_share, attempting in (
+            ("elf-sft", "elf_vla", elf_vla.WEIGHTS, 0.0, "elf_vla_refine"),
+            ("world-pretrain", "vla_world", vla_world.PICTURE_WEIGHTS, 1.0, None),
+            ("world-sft", "vla_world", vla_world.WEIGHTS, 0.5, None),
         )
     }
     | {

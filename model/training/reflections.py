@@ -46,19 +46,41 @@ class OnExamples(NamedTuple):
     reflections: list[Reflection]
 
 
+def plain(text: str) -> str:
+    """A text in plain punctuation."""
+    return text.translate(_PLAIN)
+
+
+def places_of(examples: Examples, scene_ids: Iterable[str], what: str) -> npt.NDArray[np.int64]:
+    """The places of the examples that scenes are in, int64 [m].
+
+    Args:
+        examples: to look in.
+        scene_ids: one for each of what is learned.
+        what: is on the scenes, in the message.
+
+    Raises:
+        ValueError: a scene is missing.
+    """
+    place_of = {str(scene_id): place for place, scene_id in enumerate(examples.scene_id)}
+    places = []
+    for scene_id in scene_ids:
+        if scene_id not in place_of:
+            raise ValueError(f"there is {what} on scene {scene_id}, which is not among the scenes")
+        places.append(place_of[scene_id])
+    return np.array(places, np.int64)
+
+
 def reflections_on(examples: Examples, found: Iterable[LabelledReflection]) -> OnExamples:
     """Reflections, in plain punctuation, with the examples of their scenes.
 
     Raises:
         ValueError: a scene is missing.
     """
-    place_of = {str(scene_id): place for place, scene_id in enumerate(examples.scene_id)}
-    places, reflections = [], []
-    for each in found:
-        if each.scene_id not in place_of:
-            raise ValueError(f"there is a reflection on scene {each.scene_id}, which is not among the scenes")
-        places.append(place_of[each.scene_id])
-        thinking = each.reflection.translate(_PLAIN)
+    labelled, reflections = list(found), []
+    places = places_of(examples, (each.scene_id for each in labelled), "a reflection")
+    for each in labelled:
+        thinking = plain(each.reflection)
         revised = None if facts_of(thinking) is None else each.expert_plan
         reflections.append(Reflection(each.predicted_plan, thinking, revised, each.judged))
-    return OnExamples(np.array(places, np.int64), reflections)
+    return OnExamples(places, reflections)

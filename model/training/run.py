@@ -15,9 +15,11 @@ import torch
 from torch import nn
 from torch.utils.data import Dataset, Subset
 
+from model.driving.feedback_store import read_feedback
 from model.driving.reflection_store import read_reflections
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
+from model.families.registry import family_named
 from model.network.attention import MATMUL_ATTENTION
 from model.network.checkpoint import Loaded, create_nano, load, save, with_formats, with_sketches
 from model.network.codec import TrajectoryCodec
@@ -27,6 +29,7 @@ from model.network.settings import NANO_SETTINGS
 from model.network.visual_codes import load_visual_codes
 from model.network.vla import LookTwiceVla
 from model.network.vocabulary import Vocabulary, build_nano_tokenizer
+from model.training.attempts import AttemptsOn, attempts_on
 from model.training.batches import ResponseDataset, TaskSampler, collate
 from model.training.dense import DENSE_SHAPE
 from model.training.examples import Examples, load_examples
@@ -102,6 +105,7 @@ def run(
     vision_source: Path | None = None,
     reflections: Path | None = None,
     visual_codes: Path | None = None,
+    failures: Path | None = None,
 ) -> None:
     """Train ``source`` by a recipe and write the outcome to ``target``, weights in bfloat16.
 
@@ -119,17 +123,23 @@ def run(
             while another process trains the language.
         reflections: file of the reflections that the recipe asks for.
         visual_codes: folder of codes of pictures, which the checkpoint gets; without it, it keeps its own.
+        failures: file of a model's own answers with feedback, for recipes that can learn from them.
 
     Raises:
+        FeedbackFileError: ``failures`` is missing, damaged, or of another version.
         ValueError: the recipe wants reflections and there are none, or the other way round, or they are on
-            other scenes; it teaches pictures, and there are no codes for those that scenes bring; only one of
-            ``source`` and ``vision_source`` writes sketches.
+            other scenes; it takes no failures, and there are some, or they are on other scenes; it teaches
+            pictures, and there are no codes for those that scenes bring; only one of ``source`` and
+            ``vision_source`` writes sketches.
     """
     if (reflections is None) != (recipe.reflections is None):
         wants = "needs reflections" if reflections is None else "takes no reflections"
         raise ValueError(f"recipe {recipe.name} {wants}")
+    if failures is not None and recipe.attempting is None:
+        raise ValueError(f"recipe {recipe.name} takes no failures")
     loaded = load(source)
-    if new := [task for task in recipe.tasks if task not in loaded.settings.formats]:
+    refining = [recipe.attempting] if failures is not None and recipe.attempting is not None else []
+    if new := [task for task in (*recipe.tasks, *refining) if task not in loaded.settings.formats]:
         loaded = with_formats(loaded, new, seed=recipe.seed)
     if recipe.goal == "read" and not loaded.settings.sketch_tokens:
         loaded = with_sketches(loaded, NANO_SETTINGS.sketch_tokens, seed=recipe.seed)
@@ -156,7 +166,13 @@ def run(
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
     on_examples = None if reflections is None else reflections_on(examples, read_reflections(reflections))
-    learner, dataset, sampler, collator = _prepare(recipe, loaded, scenes, examples, on_examples, settings)
+    tried = None
+    if failures is not None and recipe.attempting is not None:
+        times_s = family_named(recipe.attempting).times_s
+        tried = attempts_on(examples, read_feedback(failures), times_s)
+    learner, dataset, sampler, collator = _prepare(
+        recipe, loaded, scenes, examples, on_examples, tried, settings
+    )
     if isinstance(learner, IntentLearner) and validation:
         held_out = Examples.from_scenes(validation, loaded.settings.cameras)
         held_out_read = None
@@ -197,7 +213,7 @@ def run(
             loaded.vocabulary,
             loaded.codec,
             dtype=torch.bfloat16,
-            details={"stages": [*stages, _about(recipe, examples, on_examples)]},
+            details={"stages": [*stages, _about(recipe, examples, on_examples, tried)]},
             visual_codes=loaded.visual_codes,
         )
     # gloo's threads drop what they gathered a moment later, and need the interpreter for it: a process that
@@ -253,6 +269,7 @@ def _prepare(
     scenes: Path,
     examples: Examples,
     on_examples: OnExamples | None,
+    tried: AttemptsOn | None,
     settings: RunSettings,
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
     pictured = np.flatnonzero(examples.pictured).tolist()
@@ -288,6 +305,8 @@ def _prepare(
         pictures=recipe.pictures,
         vision=vision,
         reflections=() if on_examples is None else on_examples.reflections,
+        attempts=() if tried is None else tried.attempts,
+        attempting=recipe.attempting,
         own_plans=own_plans,
         visual_codes=loaded.visual_codes,
         seed=recipe.seed,
@@ -342,6 +361,8 @@ def _prepare(
         if recipe.picture_share
         else (),
         picture_share=recipe.picture_share,
+        attempted=np.zeros(0, np.int64) if tried is None else tried.examples,
+        attempting=recipe.attempting,
     )
     return learner, responses, sampler, collate
 
@@ -357,11 +378,16 @@ def _inherit_log(log: Path, sources: Sequence[Path]) -> None:
     log.write_text("".join(rows))
 
 
-def _about(recipe: Recipe, examples: Examples, on_examples: OnExamples | None) -> Mapping[str, Any]:
+def _about(
+    recipe: Recipe, examples: Examples, on_examples: OnExamples | None, tried: AttemptsOn | None
+) -> Mapping[str, Any]:
     about = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     about |= {"tasks": dict(recipe.tasks), "weights": dict(recipe.weights)}
     about["outcome"] = None if recipe.outcome is None else asdict(recipe.outcome)
     if on_examples is not None:
         thought = sum(bool(each.thinking) for each in on_examples.reflections)
         about |= {"reflections_count": thought, "right_plans_count": len(on_examples.reflections) - thought}
+    if tried is not None:
+        right = sum(each.correct for each in tried.attempts)
+        about |= {"failures_count": len(tried.attempts) - right, "right_answers_count": right}
     return about | {"examples": len(examples), "episodes": len(np.unique(examples.episode))}

@@ -31,6 +31,9 @@ def failures(
     seed: Annotated[int, typer.Option(help="Of the draws, and of the choice among them.", min=0)] = 0,
     route: Annotated[bool, typer.Option(help="Tell the model the route.")] = True,
     tracks: Annotated[bool, typer.Option(help="Tell the model the tracks of the agents around.")] = False,
+    format: Annotated[
+        str | None, typer.Option(help="Response format; the checkpoint's first one if not given.")
+    ] = None,
     threshold: Annotated[float, typer.Option(help="Score of a correct response.", min=0, max=1)] = 0.8,
     correct: Annotated[int, typer.Option(help="Most correct responses that get feedback.", min=0)] = 4000,
     wrong: Annotated[int, typer.Option(help="Most wrong responses that get feedback.", min=0)] = 4000,
@@ -48,7 +51,7 @@ def failures(
     from clients.labelling.pipeline import Limits
     from model.driving.feedback_store import write_feedback
 
-    inference = Inference(n, temperature, top_p, seed, route=route, tracks=tracks)
+    inference = Inference(n, temperature, top_p, seed, route=route, tracks=tracks, format=format)
     limits = Limits(at_once, give_up_after, max_error_rate, limit)
     with told():
         sample = Sample(threshold, correct, wrong, seed)

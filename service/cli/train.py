@@ -36,6 +36,10 @@ def train(
     reflections: Annotated[
         Path | None, typer.Option(help="A build's reflections, for counterfactual and multi-round.")
     ] = None,
+    failures: Annotated[
+        Path | None,
+        typer.Option(help="File that `looktwice failures` wrote, for elf-sft: it learns to refine, too."),
+    ] = None,
     visual_codes: Annotated[
         Path | None,
         typer.Option(
@@ -169,6 +173,7 @@ def train(
             vision_from,
             reflections,
             visual_codes,
+            failures,
         )
         training_curves(target / LOG_FILE, target / "curves.png")
 

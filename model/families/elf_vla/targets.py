@@ -16,7 +16,16 @@ WEIGHTS: Final[Mapping[str, float]] = MappingProxyType({THINK: 1.0, ANSWER: 1.0}
 
 
 def teach(lesson: Lesson) -> Values:
-    """The expert's thoughts and poses; raises `FamilyError` for scenes that say nothing to think of."""
+    """The expert's thoughts and poses, or those of an attempt that was right.
+
+    The supplement does not say what is taught behind feedback on a right answer; the answer itself is ours.
+
+    Raises:
+        FamilyError: the scene says nothing to think of.
+    """
+    tried = lesson.attempt
+    if tried is not None and tried.correct:
+        return Values.of({THINK: tried.thinking, ANSWER: told_poses(tried.attempt.trajectory)})
     if lesson.thoughts is None:
         raise FamilyError("no thoughts: the scene lacks agents, lanes or road, or its expert is on no lane")
     poses = at_times(lesson.future, TEN_HZ_S, TIMES_S)

@@ -39,9 +39,12 @@ def test_responses_are_judged_sampled_and_written_once(
         assert (first["inferred"], first["inference_dead"]) == (4, 0)
         assert (again["done"], again["earlier"]) == (0, first["done"])
         assert len(engine.submitted) == 4
+        assert {asked.format for asked in engine.submitted} == {"cf_vla"}
         strict = ran(served.url, "--threshold", "1", "--to", str(tmp_path / "strict.parquet"))
         assert len(engine.submitted) == 4
         assert (strict["correct"], strict["wrong"]) == (0, 8)
+        ran(served.url, "--threshold", "0.5", "--format", "traj_only", "--to", str(tmp_path / "at once"))
+        assert [asked.format for asked in engine.submitted[4:]] == ["traj_only"] * 4
     found = list(read_feedback(folder / "feedback.parquet"))
     assert (sum(row.correct for row in found), sum(not row.correct for row in found)) == (
         first["correct"],

@@ -1,0 +1,56 @@
+"""A model's own answers with feedback on them, found again among the examples that are trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from model.driving.feedback_store import FeedbackRow
+from model.driving.trajectory import TIMES_OF, FloatArray, at_times
+from model.families.family import Attempt, JudgedAttempt
+from model.training.examples import Examples
+from model.training.reflections import places_of, plain
+
+
+class AttemptsOn(NamedTuple):
+    """Attempts, and the place of the example that each is on, int64 [m]."""
+
+    examples: npt.NDArray[np.int64]
+    attempts: list[JudgedAttempt]
+
+
+def attempts_on(examples: Examples, rows: Iterable[FeedbackRow], times_s: Sequence[float]) -> AttemptsOn:
+    """Answers with their feedback, in plain punctuation, with the examples of their scenes.
+
+    Args:
+        examples: to look in.
+        rows: of a file.
+        times_s: of the poses of drafts.
+
+    Raises:
+        ValueError: a scene is missing, or a right answer does not say what led to it.
+    """
+    told = list(rows)
+    places = places_of(examples, (row.scene_id for row in told), "feedback")
+    return AttemptsOn(places, [_attempt(row, times_s) for row in told])
+
+
+def _attempt(row: FeedbackRow, times_s: Sequence[float]) -> JudgedAttempt:
+    if row.correct and not row.think:
+        raise ValueError(
+            f"draw {row.draw} in scene {row.scene_id} is right and has no thoughts to be taught: "
+            "`looktwice failures --format` names the format that the model is to answer in"
+        )
+    draft = Attempt(_poses(row, times_s), plain(row.feedback))
+    return JudgedAttempt(draft, plain(row.think or ""), row.correct)
+
+
+def _poses(row: FeedbackRow, times_s: Sequence[float]) -> FloatArray:
+    """The trajectory of a row, float32 [t, 4]."""
+    told = np.array(row.trajectory, np.float32)
+    poses = np.zeros((len(told), 4), np.float32)
+    poses[:, [0, 1, 3]] = told
+    return at_times(poses, TIMES_OF[len(told)], times_s)
