@@ -35,11 +35,10 @@ from model.driving.hashing import hash_of, judged_hash
 from model.driving.pdm.comfort import Version
 from model.driving.pdm.feedback import RuleFeedback
 from model.driving.pdm.judged import THRESHOLD, JudgedPlan
-from model.driving.pdm.judging import Said, judged_plans
-from model.driving.pdm.labelled import plans_of, world_of
+from model.driving.pdm.judging import Said, judged_in_scene
+from model.driving.pdm.labelled import plans_of
 from model.driving.pdm.profiles import SolveError
 from model.driving.pdm.rule_teacher import NAME, REVISION, critique
-from model.driving.pdm.scoring import Others, score
 from model.driving.pdm.world import Array, ScoreError
 from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
@@ -157,21 +156,10 @@ def judge(
     labelled: LabelledScene, draws: Sequence[Mapping[str, Any]], version: Version, threshold: float
 ) -> list[JudgedPlan]:
     """Responses of a scene with facts, measured against the expert; raises `CannotBeDone`."""
-    world, truth = world_of(labelled), plans_of(labelled.future)
-    others = Others(truth, "expert")
     plans = np.array([draw["trajectory"] for draw in draws], np.float64)
+    said = [Said(draw["plan"], draw["think"]) for draw in draws]
     try:
-        scores = score(world, plans, version, others, centre=True)
-        return judged_plans(
-            world,
-            plans,
-            scores,
-            others,
-            threshold=threshold,
-            truth=truth,
-            said=[Said(draw["plan"], draw["think"]) for draw in draws],
-            centre=True,
-        )
+        return judged_in_scene(labelled, plans, version, threshold, said)
     except (ScoreError, SolveError) as error:
         raise CannotBeDone(f"the scene cannot be scored: {error}") from error
 

@@ -1,23 +1,32 @@
 """Learning from what comes of the network's own draws: they are made, judged and learned from in one step.
 
-Words, times and the branch are drawn, and learned from by `model.training.policy`; trajectory codes are those
-of least expected error, as they are when it drives, and are learned from the expert beside it. The policy is
-the distribution that decodes: over the tokens that the format allows, at the temperature of the draws.
+Words and numbers are drawn, and learned from by `model.training.policy`: plans with their times and the
+branch of CF-VLA, thoughts and poses of ELF-VLA. Trajectory codes are those of least expected error, as they
+are when it drives, and are learned from the expert beside it. The policy is the distribution that decodes:
+over the tokens that the format allows, at the temperature of the draws.
+
+Where all draws of a scene fail, nothing says what would be better. There the network refines its best draw by
+the built-in teacher's feedback, which knows what the expert did. The refinement joins the scene's draws as an
+answer to the first prompt: so the first answer learns what feedback led to (ELF-VLA section 9).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
+from model.driving.pdm.judging import Said, judged_in_scene
+from model.driving.pdm.rule_teacher import critique
 from model.driving.scene import LabelledScene
 from model.engines.engine import Controls, Draw, PlanRequest
 from model.engines.torch.offline import draws_of
 from model.engines.torch.runner import Runner
+from model.families.family import Attempt
 from model.families.trajectory_codes import TRAJECTORY
 from model.formats.replay import Decision, decisions
 from model.network.checkpoint import Loaded
@@ -25,7 +34,7 @@ from model.training.batches import Item, ResponseDataset, Sample, collate
 from model.training.learner import ResponseLearner
 from model.training.policy import advantages, policy_loss
 from model.training.recipes import OutcomeSettings
-from model.training.rewards import rewards
+from model.training.rewards import Rewards, rewards, scored_poses
 from model.training.rollouts import with_draws
 
 _MAX_SEED = 2**31
@@ -88,19 +97,31 @@ class OutcomeLearner(nn.Module):
     def forward(self, places: Tensor) -> dict[str, Tensor]:
         """The loss of one step from scenes int64 [b], and its parts without gradients."""
         items = [self._item(place) for place in places.tolist()]
-        draws = self._draws(items)
-        judged = [
-            rewards(self._scenes[item.index], found, self._settings.rewards)
-            for item, found in zip(items, draws, strict=True)
+        draws = self._drawn_by([self._request(number, item) for number, item in enumerate(items)])
+        judged = [self._judged(item, found) for item, found in zip(items, draws, strict=True)]
+        refined = self._refined(items, draws, judged)
+        again = [
+            self._judged(item, found) if found else None for item, found in zip(items, refined, strict=True)
         ]
-        reward = torch.from_numpy(np.stack([each for each, _ in judged]))
+        worth = []
+        for own, other in zip(judged, again, strict=True):
+            group = own.total if other is None else np.concatenate([own.total, other.total])
+            worth.append(advantages(torch.from_numpy(group)[None])[0])
         samples = [self._data[item] for item in items]
         imitated = self.learner(**collate(samples))
-        policy, ratio = self._policy(samples, draws, advantages(reward))
+        policy, ratio = self._policy(samples, draws, refined, worth)
         loss = policy + self._settings.imitation * imitated["loss"]
-        names = judged[0][1].keys()
-        parts = {name: float(np.mean([told[name] for _, told in judged])) for name in names}
-        parts |= {"reward": float(reward.mean()), "reward_spread": float(reward.std(dim=1).mean())}
+        reward = np.stack([each.total for each in judged])
+        parts = {name: float(np.mean([told.parts[name] for told in judged])) for name in judged[0].parts}
+        parts |= {"reward": float(reward.mean()), "reward_spread": float(reward.std(axis=1).mean())}
+        if self._settings.refining is not None:
+            gains = [
+                0.0 if other is None else float(other.outcome.mean() - own.outcome.max())
+                for own, other in zip(judged, again, strict=True)
+            ]
+            # Over all scenes of the step: those that are not refined gain nothing.
+            refined_rate = float(np.mean([other is not None for other in again]))
+            parts |= {"refined_rate": refined_rate, "refined_gain": float(np.mean(gains))}
         return {
             "loss": loss,
             "policy_ratio": ratio,
@@ -118,57 +139,109 @@ class OutcomeLearner(nn.Module):
             tracks=chance[1] < self._tracks_share,
         )
 
-    def _draws(self, items: Sequence[Item]) -> list[list[Draw]]:
-        """Draws of the network as it stands, in evaluation mode meanwhile."""
-        network, settings = self._loaded.model, self._settings
-        was_training = network.training
-        network.train(False)
-        seed = int(torch.randint(_MAX_SEED, ()))
+    def _judged(self, item: Item, draws: Sequence[Draw]) -> Rewards:
+        return rewards(self._scenes[item.index], draws, self._settings.rewards, self._settings.version)
+
+    def _request(self, number: int, item: Item) -> PlanRequest:
+        """A scene's draws, all with random numbers of the step."""
+        settings = self._settings
         controls = Controls(
             n=settings.draws,
             temperature=settings.temperature,
-            seed=seed,
             numbers="drawn",
             codes="least_error",
             logprobs=True,
         )
-        requests = [
-            PlanRequest(
-                str(number),
-                self._scenes[item.index].given(route=item.route, tracks=item.tracks),
-                item.task,
-                controls,
-            )
-            for number, item in enumerate(items)
-        ]
+        scene = self._scenes[item.index].given(route=item.route, tracks=item.tracks)
+        return PlanRequest(str(number), scene, item.task, controls)
+
+    def _drawn_by(self, requests: Sequence[PlanRequest]) -> list[list[Draw]]:
+        """Draws of the network as it stands, in evaluation mode meanwhile; with a new seed."""
+        network = self._loaded.model
+        was_training = network.training
+        network.train(False)
+        seed = int(torch.randint(_MAX_SEED, ()))
+        seeded = [replace(asked, controls=replace(asked.controls, seed=seed)) for asked in requests]
+        rows = sum(asked.controls.n for asked in seeded)
         device = next(network.parameters()).device
-        # The engine's memory has the weights' type, which autocast would not write into it.
+        # The engine's memory has the weights' type, which autocast would not write into it. A prompt's draws
+        # lie beside it; a few places more take those that grow long.
         with torch.inference_mode(), torch.autocast(device.type, enabled=False):
-            found = draws_of(Runner(self._loaded, len(items) * settings.draws), requests)
+            found = draws_of(Runner(self._loaded, rows, prompts=min(rows, 2 * len(seeded))), seeded)
         network.train(was_training)
         return list(found.values())
 
+    def _refined(
+        self, items: Sequence[Item], draws: Sequence[Sequence[Draw]], judged: Sequence[Rewards]
+    ) -> list[list[Draw]]:
+        """Refinements of each scene's best draw, none where it is good enough."""
+        refining, found = self._settings.refining, [list[Draw]() for _ in items]
+        if refining is None:
+            return found
+        failed = [place for place, own in enumerate(judged) if own.outcome.max() < refining.threshold]
+        requests = []
+        for place in failed:
+            asked = self._request(place, items[place])
+            requests.append(
+                replace(
+                    asked,
+                    format=refining.format,
+                    controls=replace(asked.controls, n=refining.count),
+                    attempt=self._attempt(items[place], draws[place][int(judged[place].outcome.argmax())]),
+                )
+            )
+        for place, refinements in zip(failed, self._drawn_by(requests) if requests else (), strict=True):
+            found[place] = refinements
+        return found
+
+    def _attempt(self, item: Item, draft: Draw) -> Attempt:
+        """A draft with the built-in teacher's feedback, measured against the expert."""
+        plan = None if draft.plan is None else str(draft.plan)
+        [judged] = judged_in_scene(
+            self._scenes[item.index],
+            scored_poses(draft)[None],
+            self._settings.version,
+            said=[Said(plan, draft.thinking)],
+        )
+        return Attempt(draft.trajectory, str(critique(judged)))
+
     def _policy(
-        self, samples: Sequence[Sample], draws: Sequence[Sequence[Draw]], worth: Tensor
+        self,
+        samples: Sequence[Sample],
+        draws: Sequence[Sequence[Draw]],
+        refined: Sequence[Sequence[Draw]],
+        worth: Sequence[Tensor],
     ) -> tuple[Tensor, Tensor]:
-        """The policy's loss and mean ratio; scenes whose draws are worth the same cost nothing."""
+        """The policy's loss and mean ratio; scenes whose draws are worth the same cost nothing.
+
+        Args:
+            samples: the prompts that were answered.
+            draws, refined: answers to them, and those that were led to and are learned as answers.
+            worth: advantages [draws + refined] of each scene.
+        """
         settings = self._settings
         told = [place for place, each in enumerate(worth) if bool(each.any())]
         if not told:
-            return worth.new_zeros(()), worth.new_ones(())
-        batch = collate([with_draws(samples[place], draws[place]) for place in told])
-        responses = [draw for place in told for draw in draws[place]]
-        drawn = [self._drawn(draw) for draw in responses]
-        now = self.learner.log_probabilities(batch, drawn, settings.temperature)
-        before = [
-            torch.tensor([draw.logprobs[each.position] for each in made], dtype=torch.float32)
-            for draw, made in zip(responses, drawn, strict=True)
-        ]
-        found = policy_loss(now, before, worth[told].flatten(), clip=settings.clip)
+            return torch.zeros(()), torch.ones(())
+        batch = collate([with_draws(samples[place], [*draws[place], *refined[place]]) for place in told])
+        made, before = list[list[Decision]](), list[Tensor | None]()
+        for place in told:
+            for draw in draws[place]:
+                made.append(self._drawn(draw))
+                logprobs = [draw.logprobs[each.position] for each in made[-1]]
+                before.append(torch.tensor(logprobs, dtype=torch.float32))
+            for draw in refined[place]:
+                made.append(self._drawn(draw))
+                before.append(None)
+        now = self.learner.log_probabilities(batch, made, settings.temperature)
+        gamma = {} if settings.refining is None else {"gamma": settings.refining.gamma}
+        found = policy_loss(
+            now, before, torch.cat([worth[place] for place in told]), clip=settings.clip, **gamma
+        )
         return found.loss, found.ratio
 
     def _drawn(self, draw: Draw) -> list[Decision]:
-        """The decisions of a draw that were drawn: all but its trajectory codes."""
+        """The decisions of a draw that were drawn: all but trajectory codes, where its format has any."""
         format = self._data.formats[self._task]
         codes = self._loaded.vocabulary.alphabets[TRAJECTORY]
         return [

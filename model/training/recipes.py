@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
+from model.driving.pdm.comfort import Version
+from model.driving.pdm.judged import THRESHOLD
 from model.families.cf_vla.targets import NANO_WEIGHTS, PAPER_WEIGHTS
 from model.families.elf_vla import targets as elf_vla
 from model.families.vla_world import targets as vla_world
@@ -18,6 +20,23 @@ from model.training.rewards import RewardWeights
 from model.training.targets import SectionWeights
 
 Goal = Literal["ground", "read", "respond", "outcome", "code"]
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """How a network's own refinements are learned from as first answers; see `model.training.outcomes`.
+
+    Attributes:
+        format: that it refines in; what it writes there must be an answer in the format of its draws.
+        threshold: scenes are refined whose best draw scores less.
+        count: refinements of a scene.
+        gamma: of the weight that their decisions have, see `policy_loss`.
+    """
+
+    format: str
+    threshold: float = THRESHOLD
+    count: int = 1
+    gamma: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -30,6 +49,8 @@ class OutcomeSettings:
         clip: see `policy_loss`.
         imitation: weight of the loss on the expert's responses, beside that of the draws.
         rewards: what counts.
+        version: whose rules score draws.
+        refining: what becomes of scenes whose draws all fail; None for nothing.
     """
 
     draws: int = 8
@@ -37,6 +58,8 @@ class OutcomeSettings:
     clip: float = 0.2
     imitation: float = 0.01
     rewards: RewardWeights = field(default_factory=RewardWeights)
+    version: Version = "v2.2"
+    refining: RefineSettings | None = None
 
 
 @dataclass(frozen=True)
@@ -196,10 +219,48 @@ NANO: Final[Mapping[str, Recipe]] = (
             head_weight=0.0,
             outcome=OutcomeSettings(),
         ),
+        # Section 9.1 and table 7; parts of the reward count alike, of which the supplement says nothing.
+        "elf-rl": replace(
+            _NANO,
+            name="elf-rl",
+            goal="outcome",
+            steps=400,
+            batch_size=8,
+            learning_rate=2e-5,
+            warmup_steps=10,
+            tasks={"elf_vla": 1.0},
+            weights=elf_vla.WEIGHTS,
+            mirror_share=0.0,
+            blur_share=0.0,
+            error_weight=0.0,
+            head_weight=0.0,
+            outcome=OutcomeSettings(
+                temperature=1.2,
+                rewards=RewardWeights(
+                    outcome=1.0, imitation=0.0, words=0.0, thinking=0.0, goal=1.0, form=1.0
+                ),
+                version="v1.1",
+                refining=RefineSettings("elf_vla_refine"),
+            ),
+        ),
     }
 )
-"""The stages of the shipped checkpoint, the control of its last one, the second stage of ELF-VLA, the
-first two of VLA-World, and outcome training."""
+"""The stages of the shipped checkpoint, the control of its last one, the second and third stages of
+ELF-VLA, the first two of VLA-World, and outcome training."""
+
+
+def refining_below(recipe: Recipe, threshold: float) -> Recipe:
+    """A recipe that refines scenes whose best draw scores below ``threshold``; 0 refines none.
+
+    Raises:
+        ValueError: it refines nothing.
+    """
+    outcome = recipe.outcome
+    if outcome is None or outcome.refining is None:
+        raise ValueError(f"recipe {recipe.name} refines no draws")
+    refining = replace(outcome.refining, threshold=threshold)
+    return replace(recipe, outcome=replace(outcome, refining=refining))
+
 
 PAPER: Final[Mapping[str, Recipe]] = {
     recipe.name: recipe

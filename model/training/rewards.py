@@ -8,17 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from model.driving.agreement import agreement
+from model.driving.pdm.comfort import Version
 from model.driving.pdm.labelled import plans_of, world_of
 from model.driving.pdm.scoring import COLLISIONS, Others, score
+from model.driving.pdm.world import Array
 from model.driving.scene import LabelledScene
-from model.driving.trajectory import FloatArray
+from model.driving.trajectory import HALF_SECONDS_S, FloatArray
 from model.engines.engine import Draw
 
 _FAR_M = 10.0
+_GOAL_BOUNDS_M: Final = (2.0, 4.0, 6.0, 10.0, 15.0)
+_GOAL_WORTH: Final = np.array([1.0, 0.8, 0.6, 0.4, 0.2, 0.0])
+"""ELF-VLA, equation 10, which leaves distances of 0 and 15 m open: here they are worth 1 and 0."""
 
 
 @dataclass(frozen=True)
@@ -31,39 +37,68 @@ class RewardWeights:
             find a gap in the score, such as those who reverse at the end.
         words: lost where a draw's parts contradict each other.
         thinking: lost for a second look, which takes time.
+        goal: of how near to the expert's the last pose is, 0 to 1 (ELF-VLA, equation 10).
+        form: of thoughts that are there and a trajectory that is whole, a half each (ELF-VLA section 8.1).
+            What a cursor writes always has both.
     """
 
     outcome: float = 1.0
     imitation: float = 0.5
     words: float = 0.1
     thinking: float = 0.02
+    goal: float = 0.0
+    form: float = 0.0
+
+
+class Rewards(NamedTuple):
+    """What `rewards` gives.
+
+    Attributes:
+        total: float32 [draws].
+        outcome: float32 [draws], NAVSIM's scores alone.
+        parts: means over the draws, for a log.
+    """
+
+    total: FloatArray
+    outcome: FloatArray
+    parts: Mapping[str, float]
 
 
 def rewards(
-    labelled: LabelledScene, draws: Sequence[Draw], weights: RewardWeights = RewardWeights()
-) -> tuple[FloatArray, Mapping[str, float]]:
-    """Rewards float32 [draws], and the means of their parts for a log.
+    labelled: LabelledScene,
+    draws: Sequence[Draw],
+    weights: RewardWeights = RewardWeights(),
+    version: Version = "v2.2",
+) -> Rewards:
+    """What draws of one scene are worth.
 
     Args:
         labelled: the scene with what really came.
-        draws: its responses, with trajectories at 10 Hz up to 6.4 s.
+        draws: its responses, at least one, with trajectories at 10 Hz up to 6.4 s or at 0.5 s up to 4 s.
         weights: of the parts.
+        version: whose rules score them.
 
     Raises:
         ScoreError: the scene's agents are not known for as long as the score looks ahead.
     """
     trajectories = np.stack([draw.at_10_hz for draw in draws])
-    expert = plans_of(labelled.future[None])[0]
-    scores = score(world_of(labelled), plans_of(trajectories), others=Others(expert, "expert"), centre=True)
+    expert = plans_of(labelled.future)
+    plans = np.stack([scored_poses(draw) for draw in draws])
+    scores = score(world_of(labelled), plans, version, Others(expert, "expert"), centre=True)
     outcome = np.nan_to_num(scores.partial_score)
-    away_m = np.linalg.norm(trajectories[..., :2] - labelled.future[:, :2], axis=-1).mean(axis=-1)
+    apart_m = trajectories[..., :2] - labelled.future[: trajectories.shape[1], :2]
+    away_m = np.linalg.norm(apart_m, axis=-1).mean(axis=-1)
+    goal = goal_reward(np.abs(apart_m[:, -1]).sum(axis=-1))
     contradict = np.array([_contradicts(labelled, draw) for draw in draws], np.float64)
     thinks = np.array([draw.looked_twice for draw in draws], np.float64)
+    form = np.array([form_reward(draw) for draw in draws])
     total = (
         weights.outcome * outcome
         - weights.imitation * np.minimum(away_m, _FAR_M) / _FAR_M
         - weights.words * contradict
         - weights.thinking * thinks
+        + weights.goal * goal
+        + weights.form * form
     )
     collisions = scores.sub_scores[COLLISIONS]
     parts = {
@@ -72,8 +107,27 @@ def rewards(
         "collision_rate": 0.0 if collisions is None else float((collisions < 1).mean()),
         "contradiction_rate": float(contradict.mean()),
         "think_rate": float(thinks.mean()),
+        "goal": float(goal.mean()),
+        "form": float(form.mean()),
     }
-    return total.astype(np.float32), parts
+    return Rewards(total.astype(np.float32), outcome.astype(np.float32), parts)
+
+
+def scored_poses(draw: Draw) -> Array:
+    """A draw's trajectory as it is scored: [8, 3] where it has such poses, else at 10 Hz."""
+    return plans_of(draw.trajectory if draw.times_s == HALF_SECONDS_S else draw.at_10_hz)
+
+
+def goal_reward(away_m: FloatArray) -> Array:
+    """Worth [n] of last poses that are so far from the expert's, in metres along x and y added up."""
+    worth: Array = _GOAL_WORTH[np.searchsorted(_GOAL_BOUNDS_M, away_m, side="right")]
+    return worth
+
+
+def form_reward(draw: Draw) -> float:
+    """A half for thoughts, a half for a trajectory with all its poses."""
+    whole = draw.trajectory.shape == (len(draw.times_s), 4) and bool(np.isfinite(draw.trajectory).all())
+    return 0.5 * bool(draw.thinking) + 0.5 * whole
 
 
 def _contradicts(labelled: LabelledScene, draw: Draw) -> bool:

@@ -138,6 +138,7 @@ def run(
     if failures is not None and recipe.attempting is None:
         raise ValueError(f"recipe {recipe.name} takes no failures")
     loaded = load(source)
+    _check_refining(recipe, loaded)
     refining = [recipe.attempting] if failures is not None and recipe.attempting is not None else []
     if new := [task for task in (*recipe.tasks, *refining) if task not in loaded.settings.formats]:
         loaded = with_formats(loaded, new, seed=recipe.seed)
@@ -219,6 +220,16 @@ def run(
     # gloo's threads drop what they gathered a moment later, and need the interpreter for it: a process that
     # ends before that is aborted. So nobody ends before the checkpoint is written.
     trainer.accelerator.wait_for_everyone()
+
+
+def _check_refining(recipe: Recipe, loaded: Loaded) -> None:
+    """Raise ValueError unless a checkpoint can refine what a recipe has it refine."""
+    refining = None if recipe.outcome is None else recipe.outcome.refining
+    if refining is not None and refining.format not in loaded.settings.formats:
+        raise ValueError(
+            f"recipe {recipe.name} refines what fails, and {loaded.card.name} does not write "
+            f"{refining.format}: `looktwice train elf-sft --failures` teaches it"
+        )
 
 
 def _check_pictures(recipe: Recipe, examples: Examples, loaded: Loaded) -> None:

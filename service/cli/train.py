@@ -58,6 +58,14 @@ def train(
     vision_rate: Annotated[
         float | None, typer.Option(help="The vision tower's, relative; 0 leaves it as it is.", min=0)
     ] = None,
+    refine_below: Annotated[
+        float | None,
+        typer.Option(
+            help="elf-rl: refine the best draw of a scene where it scores less, instead of 0.8; 0: nothing.",
+            min=0,
+            max=1,
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of order and initialisation.")] = 0,
     threads: Annotated[int | None, typer.Option(help="CPU threads.", min=1)] = None,
     bf16: Annotated[
@@ -90,7 +98,7 @@ def train(
     from model.network.allocator import keep_freed_memory
     from model.network.precision import bfloat16_is_fast
     from model.network.small_planner import DRIVING_KINDS
-    from model.training.recipes import NANO, PAPER, VISUAL_CODES
+    from model.training.recipes import NANO, PAPER, VISUAL_CODES, refining_below
     from model.training.run import RunSettings, create, run
     from model.training.small import SmallSettings
     from model.training.trainer import LOG_FILE
@@ -157,6 +165,8 @@ def train(
             vision_rate=chosen.vision_rate if vision_rate is None else vision_rate,
             seed=seed,
         )
+        if refine_below is not None:
+            chosen = refining_below(chosen, refine_below)
         held_out = []
         if validation is not None:
             every = max(1, count_scenes(validation) // validation_scenes)

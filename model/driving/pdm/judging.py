@@ -8,11 +8,14 @@ from typing import Final
 
 import numpy as np
 
+from model.driving.pdm.comfort import Version
 from model.driving.pdm.course import course_of
 from model.driving.pdm.failures import facts_of
 from model.driving.pdm.judged import THRESHOLD, JudgedPlan, Waypoint
-from model.driving.pdm.scoring import Others, Scores
+from model.driving.pdm.labelled import plans_of, world_of
+from model.driving.pdm.scoring import Others, Scores, score
 from model.driving.pdm.world import ACCELERATION, Array, ScoreError, World
+from model.driving.scene import LabelledScene
 
 _EVERY: Final = {8: 1, 64: 5}
 """Waypoints are told every half a second."""
@@ -91,6 +94,26 @@ def judged_plans(
             )
         )
     return judged
+
+
+def judged_in_scene(
+    labelled: LabelledScene,
+    plans: Array,
+    version: Version,
+    threshold: float = THRESHOLD,
+    said: Sequence[Said] | None = None,
+) -> list[JudgedPlan]:
+    """Plans [n, 8, 3] or [n, 64, 3] of the box's centre in a labelled scene, measured against its expert.
+
+    Raises:
+        ScoreError, SolveError: see `score`.
+    """
+    world, truth = world_of(labelled), plans_of(labelled.future)
+    others = Others(truth, "expert")
+    scores = score(world, plans, version, others, centre=True)
+    return judged_plans(
+        world, plans, scores, others, threshold=threshold, truth=truth, said=said, centre=True
+    )
 
 
 def _waypoints(plan: Array) -> tuple[Waypoint, ...]:

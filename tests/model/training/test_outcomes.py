@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +11,17 @@ import torch
 
 from model.driving.plan import parse_plan
 from model.driving.scene_store import write_scenes
-from model.driving.trajectory import constant_velocity
+from model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S, FloatArray, at_times, constant_velocity
+from model.engines.engine import Draw, PlanRequest
+from model.formats.replay import decisions
 from model.network.checkpoint import load
+from model.network.settings import NANO_SETTINGS
+from model.training.batches import Item, collate
 from model.training.outcomes import OutcomeLearner
-from model.training.recipes import NANO, OutcomeSettings, Recipe
-from model.training.rewards import RewardWeights, rewards
+from model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_below
+from model.training.rewards import RewardWeights, form_reward, goal_reward, rewards
 from model.training.run import RunSettings, run
+from tests.checkpoints import write_untrained
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
 from tests.model.evaluation.fakes import draw_of
 from tests.model.training.scenes import training_scene
@@ -30,7 +36,7 @@ ACCELERATES = parse_plan(
 
 def test_who_stops_in_time_is_worth_more_than_who_does_not() -> None:
     straight_on = constant_velocity(BRAKES.scene.history)
-    found, parts = rewards(BRAKES, [draw_of(BRAKES.future), draw_of(straight_on)])
+    found, _, parts = rewards(BRAKES, [draw_of(BRAKES.future), draw_of(straight_on)])
     assert found[0] > found[1] + 0.5
     # Not comfortable, but right.
     assert found[0] > 0.8
@@ -44,7 +50,7 @@ def test_thinking_and_contradictions_cost_what_they_are_said_to() -> None:
         draw_of(BRAKES.future, ACCELERATES),
         draw_of(BRAKES.future, ACCELERATES, revised=ACCELERATES),
     )
-    found, parts = rewards(BRAKES, [direct, looked], weights)
+    found, _, parts = rewards(BRAKES, [direct, looked], weights)
     assert parts["think_rate"] == 0.5
     # The plan says that the car accelerates all the time, and it stops.
     assert found[0] == pytest.approx(-0.25)
@@ -110,3 +116,149 @@ def test_what_is_worth_more_is_drawn_more_often(resampling_checkpoint: Path, tmp
     shares = noted("think_rate", recipe, scenes, resampling_checkpoint, tmp_path)
     assert shares[0] > 0.2
     assert shares[-1] < shares[0] / 2
+
+
+def test_the_goal_is_worth_what_equation_10_says() -> None:
+    away_m = np.array([0.0, 1.99, 2.0, 3.9, 4.0, 5.9, 6.0, 9.9, 10.0, 14.9, 15.0, 99.0], np.float32)
+    expected = [1, 1, 0.8, 0.8, 0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0, 0]
+    np.testing.assert_allclose(goal_reward(away_m), expected)
+
+
+def eight(trajectory: FloatArray) -> Draw:
+    """A draw with poses every half a second."""
+    poses = at_times(trajectory, TEN_HZ_S, HALF_SECONDS_S)
+    return replace(draw_of(poses), times_s=HALF_SECONDS_S, thinking="Road edges: both far.")
+
+
+def test_eight_poses_are_worth_what_64_are() -> None:
+    weights = RewardWeights(outcome=1.0, imitation=0.0, words=0.0, thinking=0.0, goal=1.0, form=1.0)
+    straight_on = constant_velocity(BRAKES.scene.history)
+    found = rewards(BRAKES, [eight(BRAKES.future), eight(straight_on)], weights, "v1.1")
+    dense = rewards(BRAKES, [draw_of(BRAKES.future), draw_of(straight_on)], version="v1.1")
+    np.testing.assert_allclose(found.outcome, dense.outcome, atol=0.05)
+    assert found.total[0] == pytest.approx(found.outcome[0] + 2.0)
+    # It collides, and ends 30 m behind where the expert stops.
+    assert found.total[1] == pytest.approx(1.0)
+    assert (found.parts["form"], found.parts["goal"]) == (1.0, 0.5)
+
+
+def test_form_is_a_half_for_thoughts_and_a_half_for_poses() -> None:
+    draw = eight(BRAKES.future)
+    assert form_reward(draw) == 1.0
+    assert form_reward(replace(draw, thinking=None)) == 0.5
+    assert form_reward(replace(draw, trajectory=draw.trajectory[:7])) == 0.5
+
+
+ELF = ("elf_vla", "elf_vla_refine")
+
+
+@pytest.fixture(scope="module")
+def refining_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Untrained, thinks and refines."""
+    folder = tmp_path_factory.mktemp("refining") / "checkpoint"
+    return write_untrained(folder, settings=replace(NANO_SETTINGS, formats=ELF))
+
+
+def elf_recipe(**outcome: Any) -> Recipe:
+    recipe = NANO["elf-rl"]
+    assert recipe.outcome is not None
+    settings = replace(recipe.outcome, draws=3, **outcome)
+    return replace(recipe, steps=2, batch_size=2, warmup_steps=1, outcome=settings)
+
+
+@pytest.fixture
+def two_scenes(tmp_path: Path) -> Path:
+    write_scenes(tmp_path / "scenes" / "a.parquet", [training_scene(index) for index in (1, 2)])
+    return tmp_path / "scenes"
+
+
+def test_failed_drafts_are_refined_by_feedback_and_learned_as_first_answers(
+    refining_checkpoint: Path, two_scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[tuple[list[PlanRequest], list[list[Draw]]]] = []
+    prompts: list[int] = []
+    plain_draws, plain_policy = OutcomeLearner._drawn_by, OutcomeLearner._policy
+
+    def drawing(self: OutcomeLearner, requests: list[PlanRequest]) -> list[list[Draw]]:
+        found = plain_draws(self, requests)
+        calls.append((requests, found))
+        return found
+
+    def learning(self: OutcomeLearner, samples: Any, draws: Any, refined: Any, worth: Any) -> Any:
+        prompts.extend(len(sample.prompt) for sample in samples)
+        assert [len(each) for each in worth] == [4, 4]
+        assert [each.sum().item() for each in worth] == pytest.approx([0, 0], abs=1e-5)
+        return plain_policy(self, samples, draws, refined, worth)
+
+    monkeypatch.setattr(OutcomeLearner, "_drawn_by", drawing)
+    monkeypatch.setattr(OutcomeLearner, "_policy", learning)
+    scenes = [training_scene(index) for index in (1, 2)]
+    # Untrained drafts end anywhere, and none of them is good enough for this threshold.
+    recipe = elf_recipe(refining=RefineSettings(ELF[1], threshold=1.1))
+    ratios = noted("policy_ratio", recipe, two_scenes, refining_checkpoint, tmp_path)
+    # Thoughts and poses are drawn by the distribution that is learned.
+    assert ratios == pytest.approx([1.0, 1.0], abs=1e-4)
+    assert [{asked.format for asked in requests} for requests, _ in calls] == [{ELF[0]}, {ELF[1]}] * 2
+    assert {asked.controls.n for asked in calls[1][0]} == {1}
+    for refined, drafts in zip(calls[1][0], calls[0][1], strict=True):
+        assert refined.attempt is not None
+        assert "Meta action analysis" in refined.attempt.feedback
+        labelled = next(each for each in scenes if each.scene.scene_id == refined.scene.scene_id)
+        best = int(rewards(labelled, drafts, version="v1.1").outcome.argmax())
+        np.testing.assert_array_equal(refined.attempt.trajectory, drafts[best].trajectory)
+    # What is learned stands behind the prompt without feedback.
+    loaded = load(refining_checkpoint)
+    longest = max(len(loaded.inputs.build(training_scene(k).scene, ELF[0]).prompt.ids) for k in (1, 2))
+    assert max(prompts) <= longest + 20
+    [stage] = load(tmp_path / "rl").card.details["stages"]
+    assert stage["outcome"]["refining"]["gamma"] == 0.1
+
+
+def test_below_no_threshold_nothing_is_refined(
+    refining_checkpoint: Path, two_scenes: Path, tmp_path: Path
+) -> None:
+    recipe = refining_below(elf_recipe(), 0.0)
+    assert noted("refined_rate", recipe, two_scenes, refining_checkpoint, tmp_path) == [0.0, 0.0]
+    with pytest.raises(ValueError, match="recipe cf-rl refines no draws"):
+        refining_below(NANO["cf-rl"], 0.5)
+
+
+def test_who_cannot_refine_is_refused(resampling_checkpoint: Path, two_scenes: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"does not write elf_vla_refine.*--failures` teaches it"):
+        run(elf_recipe(), two_scenes, resampling_checkpoint, tmp_path / "no", RunSettings(tmp_path / "cache"))
+
+
+@pytest.mark.parametrize("injected", [True, False])
+def test_an_answer_that_only_feedback_leads_to_becomes_likelier(
+    injected: bool,
+    refining_checkpoint: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing but the expert's end counts, which untrained drafts miss by far."""
+    likely: list[float] = []
+
+    def refined(self: OutcomeLearner, items: list[Item], draws: list[list[Draw]], judged: Any) -> Any:
+        found = []
+        for item, own in zip(items, draws, strict=True):
+            sample = self._data[item]
+            [expert] = sample.responses
+            made = decisions(self._data.formats[item.task].start(), expert.ids)
+            with torch.no_grad():
+                [now] = self.learner.log_probabilities(collate([sample]), [made], 1.2)
+            likely.append(float(now.sum()))
+            future = self._scenes[item.index].future
+            found.append([replace(own[0], ids=expert.ids, trajectory=eight(future).trajectory)])
+        return found if injected else [[] for _ in items]
+
+    monkeypatch.setattr(OutcomeLearner, "_refined", refined)
+    write_scenes(tmp_path / "scenes" / "a.parquet", [training_scene(1)])
+    weights = RewardWeights(outcome=0.0, imitation=0.0, words=0.0, thinking=0.0, goal=1.0)
+    # An untrained network gives each of a number's tokens less than a thousandth.
+    refining = RefineSettings(ELF[1], gamma=1e-3)
+    recipe = elf_recipe(imitation=0.0, rewards=weights, refining=refining)
+    recipe = replace(recipe, steps=8, batch_size=1, warmup_steps=0, learning_rate=1e-3)
+    worths = noted("goal", recipe, tmp_path / "scenes", refining_checkpoint, tmp_path)
+    assert max(worths) < 0.5
+    gained = likely[-1] - likely[0]
+    assert gained > 10 if injected else gained < 2
