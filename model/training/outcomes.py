@@ -1,9 +1,9 @@
 """Learning from what comes of the network's own draws: they are made, judged and learned from in one step.
 
-Words and numbers are drawn, and learned from by `model.training.policy`: plans with their times and the
-branch of CF-VLA, thoughts and poses of ELF-VLA. Trajectory codes are those of least expected error, as they
-are when it drives, and are learned from the expert beside it. The policy is the distribution that decodes:
-over the tokens that the format allows, at the temperature of the draws.
+Words, numbers and codes are drawn, and learned from by `model.training.policy`: plans with their times, the
+branch and the codes of CF-VLA, thoughts and poses of ELF-VLA. The policy is the distribution that decodes:
+over the tokens that the format allows, at the temperature of the draws. The expert is imitated a little
+beside it, against drivers who find a gap in the score.
 
 Where all draws of a scene fail, nothing says what would be better. There the network refines its best draw by
 the built-in teacher's feedback, which knows what the expert did. The refinement joins the scene's draws as an
@@ -149,7 +149,7 @@ class OutcomeLearner(nn.Module):
             n=settings.draws,
             temperature=settings.temperature,
             numbers="drawn",
-            codes="least_error",
+            codes=settings.codes,
             logprobs=True,
         )
         scene = self._scenes[item.index].given(route=item.route, tracks=item.tracks)
@@ -241,11 +241,9 @@ class OutcomeLearner(nn.Module):
         return found.loss, found.ratio
 
     def _drawn(self, draw: Draw) -> list[Decision]:
-        """The decisions of a draw that were drawn: all but trajectory codes, where its format has any."""
-        format = self._data.formats[self._task]
+        """The decisions of a draw that were drawn: all but trajectory codes of least expected error."""
+        found = decisions(self._data.formats[self._task].start(), draw.ids)
+        if self._settings.codes == "drawn":
+            return found
         codes = self._loaded.vocabulary.alphabets[TRAJECTORY]
-        return [
-            each
-            for each in decisions(format.start(), draw.ids)
-            if not any(int(each.ids[0]) in stage for stage in codes)
-        ]
+        return [each for each in found if not any(int(each.ids[0]) in stage for stage in codes)]

@@ -13,7 +13,8 @@ from typing import Final, Literal
 
 from model.driving.pdm.comfort import Version
 from model.driving.pdm.judged import THRESHOLD
-from model.families.cf_vla.targets import NANO_WEIGHTS, PAPER_WEIGHTS
+from model.engines.engine import Decision
+from model.families.cf_vla.targets import CODE_WEIGHTS, NANO_WEIGHTS, PAPER_WEIGHTS
 from model.families.elf_vla import targets as elf_vla
 from model.families.vla_world import targets as vla_world
 from model.training.rewards import RewardWeights
@@ -47,6 +48,8 @@ class OutcomeSettings:
         draws: of each scene, compared with each other.
         temperature: that they are drawn at.
         clip: see `policy_loss`.
+        codes: how trajectory codes are chosen; those of least expected error are no draws, and nothing is
+            learned from how they turned out.
         imitation: weight of the loss on the expert's responses, beside that of the draws.
         rewards: what counts.
         version: whose rules score draws.
@@ -55,6 +58,7 @@ class OutcomeSettings:
 
     draws: int = 8
     temperature: float = 1.0
+    codes: Decision = "least_error"
     clip: float = 0.2
     imitation: float = 0.01
     rewards: RewardWeights = field(default_factory=RewardWeights)
@@ -214,10 +218,12 @@ NANO: Final[Mapping[str, Recipe]] = (
             learning_rate=2e-5,
             warmup_steps=10,
             tasks={"cf_vla": 1.0},
+            # The expert's words lead to no second look: learned beside, they would end all of them.
+            weights=CODE_WEIGHTS,
             mirror_share=0.0,
             blur_share=0.0,
             head_weight=0.0,
-            outcome=OutcomeSettings(),
+            outcome=OutcomeSettings(codes="drawn", imitation=0.05),
         ),
         # Section 9.1 and table 7; parts of the reward count alike, of which the supplement says nothing.
         "elf-rl": replace(

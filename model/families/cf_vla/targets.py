@@ -31,6 +31,9 @@ NANO_WEIGHTS: Final = _weights(3.0, 10.0)
 """A model from scratch learns trajectories too, which the paper's brings along. The tenths of a plan's times
 are next to unknowable: with the paper's weights their noise drowns what codes teach."""
 
+CODE_WEIGHTS: Final = _weights(0.0, 10.0)
+"""Codes alone: beside what a model learns from its own draws, which decide about words."""
+
 
 def teach(lesson: Lesson) -> Values:
     """The response that an expert would give, behind the plan of a reflection where there is one."""
