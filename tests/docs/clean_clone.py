@@ -34,7 +34,7 @@ PORT: Final = 8000
 ELSEWHERE: Final = {"make test": "continuous integration runs it in a clean clone anyway; half an hour"}
 """Commands that are not run, and why."""
 _VIDEO: Final = "pip install -c constraints.txt -e '.[video]'"
-_MINUTE: Final = (
+MINUTE: Final = (
     "looktwice scenes import tests/data/comma2k19/segment_40 minute.parquet --route",
     "looktwice plan minute.parquet --limit 1",
 )
@@ -247,7 +247,7 @@ def follow_without_network(folder: Path, port: int) -> None:
 
 def left_out() -> dict[str, str]:
     """Commands of both pages that are not run without a network, and why."""
-    films = {} if find_spec("av") else dict.fromkeys(_MINUTE, "PyAV, which reads films, is not installed")
+    films = {} if find_spec("cv2") else dict.fromkeys(MINUTE, "OpenCV, which reads films, is not installed")
     return ELSEWHERE | {_VIDEO: "it downloads packages"} | films
 
 
