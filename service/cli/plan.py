@@ -1,4 +1,4 @@
-"""`looktwice plan`: plan for scenes on this machine, print the plans and draw a picture."""
+"""`looktwice plan`: plan for scenes or requests on this machine, print the plans and draw a picture."""
 
 from __future__ import annotations
 
@@ -7,22 +7,29 @@ import json
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, told
 
 if TYPE_CHECKING:
-    from model.driving.scene import LabelledScene, Scene
-    from model.engines.engine import Draw
+    import clients.wire as wire
+    from model.driving.scene import LabelledScene
+    from model.engines.engine import Draw, ModelCard, PlanRequest
+
+_BESIDE_REQUESTS: Final = ("scenes", "checkpoint", "limit", "skip", "out", "as_json")
+"""What a request does not say itself."""
 
 
 def plan(
+    context: typer.Context,
     scenes: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Scene files, or requests for /v1/plan as .json; the bundled test scenes without any."
+            help="Scene files, or requests for /v1/plan as .json; the bundled test scenes without any. "
+            "A request is planned for as the service would, by its own controls, format and attempt; "
+            "beside one, only --checkpoint, --out, --limit, --skip and --json are taken."
         ),
     ] = None,
     checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
@@ -45,9 +52,9 @@ def plan(
 ) -> None:
     """Plan for scenes and draw what was planned."""
     with told():
-        found = [
-            scene for file in scenes or [DEFAULT_SCENES] for scene in islice(_read(file), skip, skip + limit)
-        ]
+        files = scenes or [DEFAULT_SCENES]
+        _refuse_what_requests_say(context, files)
+        found = [each for file in files for each in islice(_read(file), skip, skip + limit)]
         if not found:
             raise ValueError("there are no scenes to plan for")
         asyncio.run(
@@ -63,8 +70,20 @@ def plan(
         )
 
 
-def _read(file: Path) -> Iterator[Scene | LabelledScene]:
-    """The scenes of a file; of a request, its one."""
+def _refuse_what_requests_say(context: typer.Context, files: list[Path]) -> None:
+    """Raise `ValueError` where a file is a request and an option that it says itself is given too."""
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    given = [
+        f"--{name}"
+        for name, source in sources.items()
+        if name not in _BESIDE_REQUESTS and source is not None and source.name == "COMMANDLINE"
+    ]
+    if given and (requests := [file for file in files if file.suffix == ".json"]):
+        raise ValueError(f"{requests[0]} says itself how it is planned for; leave out {', '.join(given)}")
+
+
+def _read(file: Path) -> Iterator[LabelledScene | wire.PlanRequest]:
+    """The scenes of a file, or its one request."""
     if file.suffix != ".json":
         from model.driving.scene_store import read_scenes
 
@@ -72,18 +91,38 @@ def _read(file: Path) -> Iterator[Scene | LabelledScene]:
         return
     import clients.wire as wire
     from service.errors import validated
-    from service.intake import scene_of
     from service.problems import ProblemError
 
     try:
-        document = json.loads(file.read_bytes())
-        yield scene_of(validated(wire.PlanRequest, document).scene)
+        yield validated(wire.PlanRequest, json.loads(file.read_bytes()))
     except (ProblemError, ValueError) as error:
         raise ValueError(f"{file} is no request for /v1/plan: {error}") from None
 
 
+def _requested(
+    found: LabelledScene | wire.PlanRequest,
+    card: ModelCard,
+    format: str | None,
+    given: dict[str, bool],
+    controls: dict[str, Any],
+) -> PlanRequest:
+    """The engine's request for a scene, or for a request as the service would make it."""
+    from model.driving.scene import LabelledScene
+    from model.engines.engine import Controls, PlanRequest
+    from service.intake import engine_request
+    from service.problems import ProblemError
+
+    if isinstance(found, LabelledScene):
+        scene = found.given(**given)
+        return PlanRequest(scene.scene_id, scene, format or card.default_format, Controls(**controls))
+    try:
+        return engine_request(found, card, found.scene.scene_id)
+    except ProblemError as error:
+        raise ValueError(f"{found.scene.scene_id} cannot be planned for: {error}") from None
+
+
 async def _plan(
-    scenes: list[Scene | LabelledScene],
+    found: list[LabelledScene | wire.PlanRequest],
     checkpoint: Path,
     out: Path,
     as_json: bool,
@@ -95,28 +134,26 @@ async def _plan(
 
     from model.driving.scene import LabelledScene
     from model.driving.trajectory import agreed
-    from model.engines.engine import Controls, DrawFinished, PlanRequest
+    from model.engines.engine import DrawFinished
     from model.engines.torch.engine import TorchEngine
     from model.evaluation.pictures import plan_picture
 
     engine = TorchEngine(checkpoint)
     await engine.start()
     try:
-        for scene in scenes:
-            asked = scene.given(**given) if isinstance(scene, LabelledScene) else scene
-            request = PlanRequest(
-                asked.scene_id, asked, format or engine.card.default_format, Controls(**controls)
-            )
+        for each in found:
+            request = _requested(each, engine.card, format, given, controls)
+            scene = request.scene
             draws = [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
             draws.sort(key=lambda draw: draw.index)
-            picture = out / f"{asked.scene_id}.png"
+            picture = out / f"{scene.scene_id}.png"
             picture.parent.mkdir(parents=True, exist_ok=True)
             chosen = agreed(np.stack([draw.trajectory for draw in draws]))
-            plan_picture(scene, draws, picture, shown=chosen)
+            plan_picture(each if isinstance(each, LabelledScene) else scene, draws, picture, shown=chosen)
             if as_json:
-                typer.echo(json.dumps(_as_json(asked.scene_id, draws, chosen, picture)))
+                typer.echo(json.dumps(_as_json(scene.scene_id, draws, chosen, picture)))
             else:
-                typer.echo("\n".join(_told(asked.scene_id, draws, chosen)))
+                typer.echo("\n".join(_told(scene.scene_id, draws, chosen)))
                 typer.echo(f"\npicture {picture}")
     finally:
         await engine.stop()

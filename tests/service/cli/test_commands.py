@@ -5,15 +5,28 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, Final
 
 import httpx
+import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
 
+from model.bundled import CHECKPOINT
+from model.engines.torch.engine import TorchEngine
 from service.cli.commands import app
 from service.settings import Settings, TeacherSettings
-from tests.service.serving import body
+from tests.service.serving import body, serve
+
+PLAN: Final = """\
+- longitudinal
+  - 0.0s-6.4s: Keep Speed
+- lateral
+  - 0.0s-6.4s: Straight
+- lane
+  - 0.0s-6.4s: Keep Lane"""
+ATTEMPT: Final = {"trajectory": [[1.2 * k, 0.0, 0.0, 0.0] for k in range(1, 65)], "feedback": "too fast"}
 
 
 def ran(*arguments: str, code: int = 0) -> str:
@@ -71,8 +84,8 @@ def test_a_load_test_says_what_its_rate_is() -> None:
 
 def test_a_request_can_be_planned_for_without_a_service(tmp_path: Path) -> None:
     request = tmp_path / "request.json"
-    request.write_text(json.dumps(body()))
-    told = ran("plan", str(request), "--n", "3", "--out", str(tmp_path))
+    request.write_text(json.dumps(body(n=3)))
+    told = ran("plan", str(request), "--out", str(tmp_path))
     lines = told.splitlines()
     assert [line.split()[:2] for line in lines[1:4] if not line.startswith("*")] == [
         ["draw", str(k)] for k in range(3) if f"* draw {k} " not in told
@@ -81,6 +94,36 @@ def test_a_request_can_be_planned_for_without_a_service(tmp_path: Path) -> None:
     assert "Meta actions:\n- longitudinal" in told
     assert "<" not in told, "codes say nothing to people"
     assert list(tmp_path.glob("*.png"))
+
+
+def test_a_request_is_planned_for_as_the_service_does(tmp_path: Path) -> None:
+    document = body(n=3, seed=5, thinking="always", temperature=0.7, prefill=PLAN) | {"format": "cf_vla"}
+    request = tmp_path / "request.json"
+    request.write_text(json.dumps(document))
+    told = json.loads(ran("plan", str(request), "--out", str(tmp_path), "--json"))
+    with serve(TorchEngine(CHECKPOINT), Settings()) as served:
+        answer = served.http.post("/v1/plan", json=document).raise_for_status().json()
+    assert told["agreed"] == answer["agreed"]
+    for here, there in zip(told["draws"], answer["draws"], strict=True):
+        same = ("index", "branch", "think_probability", "tokens")
+        assert {name: here[name] for name in same} == {name: there[name] for name in same}
+        assert np.allclose(here["trajectory"], there["trajectory"], atol=0.001)
+        for text in (there["plan"]["text"], there["thinking"], there["revised_plan"]["text"]):
+            assert text in here["text"]
+
+
+@pytest.mark.parametrize("said", [{"attempt": ATTEMPT}, {"format": "none-such"}])
+def test_what_the_service_refuses_of_a_request_is_refused_here(tmp_path: Path, said: dict[str, Any]) -> None:
+    (tmp_path / "request.json").write_text(json.dumps(body() | said))
+    told = ran("plan", str(tmp_path / "request.json"), "--out", str(tmp_path), code=2)
+    assert f"/{next(iter(said))}: " in told
+
+
+@pytest.mark.parametrize("option", [("--n", "3"), ("--seed", "0"), ("--no-route",), ("--format", "cf_vla")])
+def test_options_that_a_request_says_itself_are_refused(tmp_path: Path, option: tuple[str, ...]) -> None:
+    (tmp_path / "request.json").write_text(json.dumps(body()))
+    told = ran("plan", str(tmp_path / "request.json"), *option, code=2)
+    assert told.endswith(f"leave out {option[0].replace('no-', '')}\n")
 
 
 @pytest.mark.parametrize("content", ["{}", "nothing", '{"scene": {"scene_id": "a"}}'])
