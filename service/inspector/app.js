@@ -165,26 +165,34 @@ async function ask(doing, request) {
 
 // What decides a plan of a bundled scene stands behind the address's #, so that it can be sent to others.
 const LINKED = ["scene", "thinking", "n", "temperature", "seed", "deadline"];
+const LINKED_CHOICES = ["with-route", "with-tracks"];
 
 function showLink() {
   const shared = Boolean(state.view) && !state.opened.has(byId("scene").value);
   byId("link").hidden = !shared;
   if (!shared) return;
   const values = new URLSearchParams(LINKED.map((id) => [id, byId(id).value]));
+  for (const id of LINKED_CHOICES) values.set(id, byId(id).checked);
   if (usesThreshold()) values.set("threshold", byId("threshold").value);
   history.replaceState(null, "", `#${values}`);
   byId("link").href = location.href;
 }
 
-function followLink() {
+// Show the scene that the address names, and plan as it says; without a link, the scene that is chosen.
+async function followLink() {
   const values = new URLSearchParams(location.hash.slice(1));
-  for (const id of LINKED) if (values.has(id)) byId(id).value = values.get(id);
-  if (values.has("threshold")) {
-    byId("with-threshold").checked = true;
-    byId("threshold").value = values.get("threshold");
+  const linked = values.get("scene");
+  if (linked !== null && ![...byId("scene").options].some(({ value }) => value === linked)) {
+    if (!state.view) await chooseScene();
+    throw new Error("The link names a scene that is not here.");
   }
+  for (const id of LINKED) if (values.has(id)) byId(id).value = values.get(id);
+  for (const id of LINKED_CHOICES) if (values.has(id)) byId(id).checked = values.get(id) === "true";
+  if (linked !== null) byId("with-threshold").checked = values.has("threshold");
+  if (values.has("threshold")) byId("threshold").value = values.get("threshold");
   showThreshold();
-  return values.has("scene");
+  if (linked !== null || !state.view) await chooseScene();
+  if (linked !== null) await plan();
 }
 
 // Where the first plan would have led: under a deadline the service keeps that, otherwise it is asked for.
@@ -303,10 +311,9 @@ async function begin() {
   const [scenes] = await Promise.all([api.sceneList(), showModel()]); // the model says what it takes
   byId("scene").replaceChildren(...scenes.map(({ scene_id: id, tags }) =>
     element("option", { value: id, textContent: tags.length ? `${id} · ${tags.join(", ").replaceAll("_", " ")}` : id })));
-  const linked = followLink();
-  if (!byId("scene").value && scenes.length) throw new Error("The link names a scene that is not here.");
-  if (scenes.length) await chooseScene();
-  if (linked) await plan();
+  if (!scenes.length) return;
+  addEventListener("hashchange", () => attempt(followLink)); // a link pasted into the page that is open
+  await followLink();
 }
 
 async function showModel() {

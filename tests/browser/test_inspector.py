@@ -393,6 +393,57 @@ def test_a_link_leads_to_the_same_plan(inspector: Page, served: Served, engine: 
     expect(inspector.get_by_role("alert")).to_contain_text("not here")
 
 
+def link_to_this_plan(page: Page) -> str:
+    link = page.get_by_role("link", name="Link to this plan").get_attribute("href")
+    assert link is not None
+    return link
+
+
+def test_a_link_says_whether_route_and_tracks_are_given(
+    page: Page, served: Served, engine: ScriptedEngine
+) -> None:
+    plain = engine.card_shown
+    engine.card_shown = replace(plain, inputs=("route", "tracks"))
+    try:
+        page.goto(served.url)
+        page.get_by_label("give the route").uncheck()
+        page.get_by_label("give the tracks").check()
+        plan(page)
+        expect(page.locator("#draws tbody tr")).to_have_count(6)
+        link = link_to_this_plan(page)
+        page.goto("about:blank")
+        engine.submitted.clear()
+        page.goto(link)
+        expect(page.locator("#draws tbody tr")).to_have_count(6)
+        (again,) = engine.submitted
+        assert again.scene.route is None
+        assert again.scene.tracks
+    finally:
+        engine.card_shown = plain
+
+
+def test_a_link_is_followed_on_the_page_that_is_open(inspector: Page, engine: ScriptedEngine) -> None:
+    inspector.get_by_label("Use a think threshold").check()
+    inspector.get_by_label("Scene", exact=True).select_option("second/scene")
+    expect(inspector.get_by_role("status")).to_contain_text("second/scene")
+    inspector.get_by_role("spinbutton", name="Draws").fill("2")
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(2)
+    engine.submitted.clear()
+    other = "scene=slow-leader&thinking=always&n=3&seed=5&with-route=false"
+    inspector.evaluate("link => { location.hash = link; }", other)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(3)
+    (asked,) = engine.submitted
+    assert asked.scene.scene_id == "slow-leader"
+    assert asked.scene.route is None
+    controls = asked.controls
+    assert (controls.thinking, controls.n, controls.seed) == ("always", 3, 5)
+    assert controls.think_threshold is None
+    inspector.evaluate("() => { location.hash = 'scene=nowhere'; }")
+    expect(inspector.get_by_role("alert")).to_contain_text("not here")
+    expect(inspector.get_by_label("Scene", exact=True)).to_have_value("slow-leader")
+
+
 def test_what_became_of_the_deadline_is_shown_beside_every_draw(
     inspector: Page, engine: ScriptedEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
