@@ -30,7 +30,13 @@ def egodriver(
         typer.Option(envvar="ALPASIM_DRIVER_HOST", help="Address to listen on, or unix:///path/of.sock."),
     ] = "127.0.0.1",
     port: Annotated[
-        int, typer.Option(envvar="ALPASIM_DRIVER_PORT", help="Port to listen on; 0 takes a free one.", min=0)
+        int,
+        typer.Option(
+            envvar="ALPASIM_DRIVER_PORT",
+            help="Port to listen on; 0 takes a free one.",
+            min=0,
+            max=65535,
+        ),
     ] = 6789,
     cameras: Annotated[
         list[str] | None,

@@ -81,6 +81,7 @@ def test_it_plans_through_a_service_on_the_port_that_the_environment_says() -> N
     [
         (["--camera", "front=x", "--camera", "above=y"], "'above=y' is not OURS=LOGICAL_ID"),
         (["--service", "http://127.0.0.1:1"], "ConnectError"),
+        (["--port", "65536"], "65535"),
     ],
 )
 def test_it_says_what_is_wrong(arguments: list[str], message: str) -> None:
