@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -12,6 +13,10 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
 from typer.testing import CliRunner
 
 from model.bundled import CHECKPOINT, SCENES
@@ -25,6 +30,7 @@ from model.network.repository import write_repository
 from model.network.settings import VlaSettings
 from service.cli.commands import app
 from tests.checkpoints import write_untrained
+from tests.sockets import listening
 
 ROOT = Path(__file__).parents[3]
 # In a process of its own: `transformers` keeps what it loads from a folder's code for the whole process.
@@ -46,10 +52,12 @@ save_file({"logits": logits}, out)
 """
 
 
-def run(code: str, *arguments: object, home: Path, offline: bool = True) -> subprocess.CompletedProcess[str]:
+def run(
+    code: str, *arguments: object, home: Path, hub: str | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run code, or a module, with ``home`` for the hub's client; offline, or with a ``hub`` at that URL."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "HF_HOME": str(home)}
-    if offline:
-        environment["HF_HUB_OFFLINE"] = "1"
+    environment |= {"HF_HUB_OFFLINE": "1"} if hub is None else {"HF_HUB_OFFLINE": "0", "HF_ENDPOINT": hub}
     command = [sys.executable, *(["-c", code] if code else []), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, check=False)
 
@@ -144,6 +152,70 @@ def test_a_name_on_the_hub_is_a_checkpoint(tmp_path: Path) -> None:
     assert json.loads(done.stdout)["draws"]
     other = run("", *PLAN, *out, "--checkpoint", "somebody/nano@v2", home=tmp_path)
     assert other.returncode == 2
+
+
+COMMIT = "89abcdef0123456789abcdef0123456789abcdef"
+
+
+def hub_of(name: str, folder: Path, asked: list[str]) -> Starlette:
+    """A hub with one model repository; it notes which files are downloaded of it.
+
+    It answers as the hub's documented API does: https://huggingface.co/docs/hub/api.
+    """
+    files = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+    digests = {path: hashlib.sha1(file.read_bytes()).hexdigest() for path, file in files.items()}
+
+    async def info(request: Request) -> Response:
+        siblings = [{"rfilename": path} for path in files]
+        return JSONResponse({"id": name, "modelId": name, "sha": COMMIT, "siblings": siblings})
+
+    async def tree(request: Request) -> Response:
+        assert request.path_params["revision"] == COMMIT
+        return JSONResponse(
+            [
+                {"type": "file", "path": path, "size": file.stat().st_size, "oid": digests[path]}
+                for path, file in files.items()
+            ]
+        )
+
+    async def content(request: Request) -> Response:
+        path = request.path_params["path"]
+        if request.method == "GET":
+            asked.append(path)
+        headers = {"X-Repo-Commit": COMMIT, "ETag": f'"{digests[path]}"'}
+        return Response(files[path].read_bytes(), headers=headers, media_type="application/octet-stream")
+
+    return Starlette(
+        routes=[
+            Route(f"/api/models/{name}/revision/main", info),
+            Route(f"/api/models/{name}/tree/{{revision}}", tree),
+            Route(f"/{name}/resolve/{COMMIT}/{{path:path}}", content, methods=["GET", "HEAD"]),
+        ]
+    )
+
+
+def test_a_checkpoint_is_downloaded_from_the_hub_without_what_it_does_not_need(tmp_path: Path) -> None:
+    folder = write_untrained(tmp_path / "new", narrow=True)
+    write_repository(folder)
+    for unneeded in ("pytorch_model.bin", "weights.pkl", "log.jsonl", "extra/setup.py"):
+        (folder / unneeded).parent.mkdir(exist_ok=True)
+        (folder / unneeded).write_bytes(b"not needed")
+    told = (*PLAN, "--out", tmp_path / "out", "--checkpoint", "somebody/nano")
+    asked: list[str] = []
+    with listening(hub_of("somebody/nano", folder, asked)) as (url, _):
+        done = run("", *told, home=tmp_path, hub=url)
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["draws"]
+        assert {"model.safetensors", "looktwice.json", "tokenizer.json", "README.md"} <= set(asked)
+        assert {Path(path).suffix for path in asked} == {".json", ".safetensors", ".jinja", ".md"}
+        assert len(asked) == len(set(asked))
+        asked.clear()
+        missing = run("", *told[:-1], "somebody/other", home=tmp_path, hub=url)
+        assert missing.returncode == 2
+        assert "no such model on the Hugging Face hub" in missing.stderr
+        assert missing.stderr.count("\n") == 1
+    again = run("", *told, home=tmp_path)  # what was downloaded is kept
+    assert json.loads(again.stdout)["draws"] == json.loads(done.stdout)["draws"]
 
 
 def test_without_the_hub_it_says_so_in_a_line(tmp_path: Path) -> None:
