@@ -22,11 +22,11 @@ def loadtest(
     rate: Annotated[
         float,
         typer.Option(
-            help="Requests offered per second, on average: they come by chance, so 60 s at 1 offer 60 "
-            "give or take 8. Where a sweep begins.",
+            help="Requests offered per second, on average: they come by chance, so 60 s at 0.5 offer 30 "
+            "give or take 5. Where a sweep begins.",
             min=0.2,
         ),
-    ] = 1.0,
+    ] = 0.5,
     seconds: Annotated[float, typer.Option(help="Of the measured run, or of each of its steps.", min=1)] = 60,
     warm_up: Annotated[float, typer.Option(help="Seconds before, left out of all figures.", min=0)] = 5.0,
     mix: Annotated[

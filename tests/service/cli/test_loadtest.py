@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import subprocess
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from loadtests.arrivals import Phase, poisson_arrivals
+from service.admission import Admission
+from service.cli.loadtest import loadtest as command
 from service.settings import Settings
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import serve
@@ -64,6 +69,24 @@ def test_pictures_come_out_of_services_that_imagine_and_others_are_refused_by_na
     assert told["by_branch"]["imagine"]["latency_s"]["count"] > 5
     assert refused.returncode == 2
     assert "serves scripted: no pictures can be imagined" in refused.stderr
+
+
+def test_by_default_a_service_of_one_plan_a_second_refuses_none() -> None:
+    asked = {name: each.default for name, each in inspect.signature(command).parameters.items()}
+    assert (asked["scenario"], asked["mix"]) == ("poisson", "plan")
+    phases = [Phase(name, asked[name], asked["rate"]) for name in ("warm_up", "seconds")]
+    due_s = poisson_arrivals(phases, asked["seed"]).tolist()
+    now_s, settings = 0.0, Settings()
+    admission = Admission(settings.max_draws, settings.max_scenes, lambda: now_s)
+    held: list[tuple[float, ExitStack]] = []
+    for now_s in due_s:
+        while held and held[0][0] <= now_s:
+            held.pop(0)[1].close()
+        began_s = max(now_s, held[-1][0] if held else 0.0)
+        place = ExitStack()
+        place.enter_context(admission.place(int(asked["n"])))  # raises where there is none
+        held.append((began_s + 1.0, place))
+    assert len(due_s) > 30
 
 
 def test_a_run_that_does_not_count_says_so_and_why() -> None:
