@@ -118,24 +118,85 @@ def trained(source: Path, reflections: Path, target: Path) -> Result:
     return CliRunner().invoke(app, ["train", "counterfactual", *arguments])
 
 
-def test_a_full_disk_is_a_message_and_loses_nothing(rolled: Path, tmp_path: Path) -> None:
+FULL = """
+import resource
+from clients.labelling.ledger import Ledger
+from service.cli.commands import app
+
+entered = Ledger.__enter__
+
+
+def fill(ledger):
+    resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
+    return entered(ledger)
+
+
+Ledger.__enter__ = fill
+app()
+"""
+
+
+def stopped_by_a_full_disk(limit_bytes: int, *arguments: object) -> str:
+    """What `build` says where, once its ledger is open, no file may grow beyond so many bytes."""
+    code = FULL.format(limit=limit_bytes)
+    command = [sys.executable, "-c", code, "build", *map(str, arguments)]
+    stopped = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert stopped.returncode == 2, stopped.stderr
+    assert "Traceback" not in stopped.stderr
+    last = stopped.stderr.splitlines()[-1]
+    assert last.startswith("looktwice: ")
+    return last
+
+
+def test_a_full_disk_stops_labels_with_a_message_and_loses_none(rolled: Path, tmp_path: Path) -> None:
     build = tmp_path / "build"
     shutil.copytree(rolled, build)
-    # No file may grow beyond so many bytes: the ledger can be opened, and is full after a few labels.
-    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({0}, {0}))\n"
-    begin = "from service.cli.commands import app; app()"
-    for limit, arguments in (
-        (40_000, ("label", build, SCENES, "--seed", 7)),
-        (500, ("export", build, "--form", "messages", "--scenes", SCENES, "--to", tmp_path / "m")),
-    ):
-        command = [sys.executable, "-c", full.format(limit) + begin, "build", *map(str, arguments)]
-        stopped = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert stopped.returncode == 2, stopped.stderr
-        assert "Traceback" not in stopped.stderr
-        assert stopped.stderr.splitlines()[-1].startswith("looktwice: ")
+    # Full after a few labels.
+    stopped_by_a_full_disk(40_000, "label", build, SCENES, "--seed", 7)
     done = told("label", build, SCENES, "--seed", 7, "--json")
     assert done["done"] + done["dead"] + done["earlier"] == COUNT
     assert done["done"] > 0
+
+
+def test_a_full_disk_stops_a_rollout_with_a_message_and_loses_nothing(url: str, tmp_path: Path) -> None:
+    rollout = ("rollout", tmp_path / "build", SCENES, "--service", url, "--n", 2)
+    # Full after a few scenes.
+    stopped_by_a_full_disk(100_000, *rollout)
+    done = told(*rollout, "--json")
+    assert done["done"] + done["earlier"] == COUNT
+    assert done["done"] > 0
+
+
+def test_a_full_disk_stops_a_filter_with_a_message(rolled: Path, tmp_path: Path) -> None:
+    build = tmp_path / "build"
+    shutil.copytree(rolled, build)
+    stopped_by_a_full_disk(100, "filter", build)
+    picture = build / "filter.png"
+    picture.unlink()
+    picture.symlink_to("/dev/full")
+    assert "No space left" in ran("filter", build, "--everything", code=2)
+    picture.unlink()
+    assert told("filter", build, "--everything", "--json")["kept"] == COUNT
+
+
+@pytest.mark.parametrize("form", ["parquet", "messages", "openai-batch"])
+def test_a_full_disk_stops_an_export_with_a_message(
+    rolled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    for name, value in {"KIND": "openai", "MODEL": "batched"}.items():
+        monkeypatch.setenv(f"LOOKTWICE_TEACHER_{name}", value)
+    build, folder = tmp_path / "build", tmp_path / "made"
+    shutil.copytree(rolled, build)
+    with monkeypatch.context() as built_in:
+        built_in.setenv("LOOKTWICE_TEACHER_KIND", "rules")
+        assert told("label", build, SCENES, "--seed", 8, "--json")["done"] > 0
+    scenes = () if form == "parquet" else ("--scenes", SCENES)
+    export = ("export", build, "--form", form, *scenes, "--to", folder / "made")
+    ran(*export)  # so that nothing is left to be told to the ledger
+    shutil.rmtree(folder)
+    assert "File too large" in stopped_by_a_full_disk(100, *export)
+    left = [path for path in folder.rglob("*") if path.is_file() and path.parent.name != "images"]
+    assert not left, "what was not finished must not look so; pictures are written over"
 
 
 def test_labelled_by_the_service(rolled: Path, url: str) -> None:
