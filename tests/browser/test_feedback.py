@@ -12,7 +12,13 @@ from playwright.sync_api import Page, expect
 from model.driving.scene_store import write_scenes
 from model.driving.trajectory import TEN_HZ_S
 from service.settings import Settings
-from tests.browser.test_inspector import near, pixels, plan
+from tests.browser.test_inspector import (
+    INSIDE_OF_DOTS_RGB,
+    colours_drawn_and_named,
+    near,
+    pixels,
+    plan,
+)
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, serve
@@ -65,6 +71,24 @@ def test_a_wrong_first_plan_is_red_and_told_why_beside_what_came_of_it(inspector
     after = pixels(inspector, "#birdseye")
     assert near(after, WRONG_RGB).any()
     assert near(after, TRUTH_RGB).sum() > near(before, TRUTH_RGB).sum()
+
+
+@pytest.mark.parametrize("thinking", ["always", "never"])
+def test_the_legend_names_every_colour_of_a_draw_that_is_judged(inspector: Page, thinking: str) -> None:
+    inspector.get_by_label("Thinking", exact=True).select_option(thinking)
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+
+    def judge() -> None:
+        inspector.get_by_role("button", name=WHY).click()
+        expect(inspector.locator("#birdseye")).to_have_attribute(
+            "aria-label", re.compile("by its score"), timeout=PATIENCE_S * 1000
+        )
+
+    drawn, named = colours_drawn_and_named(inspector, judge)
+    assert WRONG_RGB in drawn
+    assert TRUTH_RGB in drawn
+    assert drawn - named == {INSIDE_OF_DOTS_RGB}
 
 
 def test_feedback_is_of_the_chosen_draw_only(inspector: Page, served: Served) -> None:

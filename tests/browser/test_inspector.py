@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,12 +20,14 @@ from model.engines.engine import EngineError
 from service.keys import new_line
 from service.settings import Settings
 from tests.service.scenes import labelled
-from tests.service.scripted_engine import REASONING, ScriptedEngine
+from tests.service.scripted_engine import KEEP_ON, REASONING, ScriptedEngine
 from tests.service.serving import Served, body, serve
 
 CHOSEN_RGB = (29, 95, 209)  # --chosen of the light theme
 DRAFT_RGB = (194, 24, 127)  # --draft of the light theme
 DARK_PAGE_RGB = (18, 22, 28)  # --page of the dark theme
+INSIDE_OF_DOTS_RGB = (255, 255, 255)  # --panel of the light theme
+RGB = tuple[int, int, int]
 
 
 @pytest.fixture(scope="module")
@@ -362,6 +364,18 @@ def test_a_plan_can_be_edited_and_looked_at_twice(inspector: Page, engine: Scrip
     expect(inspector.get_by_role("button", name="Look twice")).to_be_enabled()
 
 
+def test_a_plan_can_be_pasted_before_anything_was_planned(inspector: Page, engine: ScriptedEngine) -> None:
+    pasted = str(KEEP_ON)
+    inspector.get_by_label("A plan to look at twice").fill(pasted)
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
+    inspector.get_by_role("button", name="Look twice").click()
+    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+    expect(inspector.locator("blockquote")).to_have_text(REASONING)
+    (asked,) = engine.submitted
+    assert str(asked.controls.prefill) == pasted
+    assert asked.scene.scene_id == "slow-leader"
+
+
 def test_without_a_deadline_the_first_plan_is_followed_too(inspector: Page, engine: ScriptedEngine) -> None:
     inspector.get_by_label("Thinking", exact=True).select_option("always")
     inspector.get_by_label("Deadline, ms").fill("")
@@ -458,11 +472,9 @@ def test_what_became_of_the_deadline_is_shown_beside_every_draw(
     expect(told).to_have_text([re.compile("^.$")] * 6)  # a dash
 
 
-def test_the_legend_names_every_colour_that_is_drawn(inspector: Page) -> None:
-    inspector.get_by_label("Thinking", exact=True).select_option("always")
-    plan(inspector)
-    expect(inspector.locator("#birdseye")).to_have_attribute("aria-label", re.compile("its draft ended"))
-    inspector.evaluate(
+def colours_drawn_and_named(page: Page, redraws: Callable[[], None]) -> tuple[set[RGB], set[RGB]]:
+    """What the bird's-eye view is drawn in when ``redraws`` is called, and what its legend names."""
+    page.evaluate(
         """() => {
           window.drawn = new Set();
           const pens = CanvasRenderingContext2D.prototype;
@@ -475,20 +487,40 @@ def test_the_legend_names_every_colour_that_is_drawn(inspector: Page) -> None:
           }
         }"""
     )
-    inspector.locator("#draws tbody tr").nth(1).click()
+    redraws()
     drawn = {
-        tuple(int(text[place : place + 2], 16) for place in (1, 3, 5))
-        for text in inspector.evaluate("[...window.drawn]")
+        (int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16))
+        for text in page.evaluate("[...window.drawn]")
     }
-    named = inspector.evaluate(
+    named = page.evaluate(
         """() => [...document.querySelectorAll(".legend li")].flatMap((item) => {
           const style = getComputedStyle(item, "::before");
           return [style.borderTopColor, style.backgroundColor];
         })"""
     )
+    numbers = [[int(number) for number in re.findall(r"\d+", text)] for text in named]
+    return drawn, {(red, green, blue) for red, green, blue, *_ in numbers}
+
+
+def test_a_deadline_that_was_missed_is_told_beside_every_draw(
+    inspector: Page, engine: ScriptedEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "cut", "replaced")
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
+    inspector.get_by_label("Deadline, ms").fill("1")  # which no service keeps
+    plan(inspector)
+    expect(inspector.get_by_role("status")).to_contain_text("deadline missed")
+    told = inspector.locator("#draws tbody tr td:nth-child(4)")
+    expect(told).to_have_text(["missed replaced"] * 6)
+
+
+def test_the_legend_names_every_colour_that_is_drawn(inspector: Page) -> None:
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
+    plan(inspector)
+    expect(inspector.locator("#birdseye")).to_have_attribute("aria-label", re.compile("its draft ended"))
+    drawn, named = colours_drawn_and_named(inspector, inspector.locator("#draws tbody tr").nth(1).click)
     assert len(drawn) > 8
-    inside_of_dots = (255, 255, 255)
-    assert drawn - {tuple(map(int, re.findall(r"\d+", text)))[:3] for text in named} == {inside_of_dots}
+    assert drawn - named == {INSIDE_OF_DOTS_RGB}
 
 
 def test_a_service_that_is_gone_is_told(browser: Browser, tmp_path: Path) -> None:
