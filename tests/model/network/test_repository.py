@@ -3,6 +3,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -74,6 +75,13 @@ def test_auto_classes_load_the_whole_network(tmp_path: Path) -> None:
     theirs = load_file(tmp_path / "out")["logits"]
     assert logits.shape == theirs.shape
     np.testing.assert_allclose(theirs, logits, atol=1e-4)
+
+
+def test_the_snippet_of_the_card_runs_with_its_folder(tmp_path: Path) -> None:
+    (snippet,) = re.findall(r"^```python\n(.*?)^```", (CHECKPOINT / "README.md").read_text(), re.S | re.M)
+    done = run(f"FOLDER = {str(CHECKPOINT)!r}\n{snippet}", home=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"torch\.Size\(\[1, [0-9]+, [0-9]+\]\)\n", done.stdout)
 
 
 def test_the_bundled_folder_is_what_is_written_today(tmp_path: Path) -> None:
