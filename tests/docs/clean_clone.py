@@ -2,8 +2,8 @@
 
 It clones the commit that is checked out and runs every block of commands in order, against the real service.
 The README's Python runs in an environment that holds nothing but what the README names. Of every command that
-the README lists it asks for the help. This takes a network and minutes. Nothing but Python is needed, since
-the environments are made on the way.
+the README lists it asks for the help, and those that take seconds it runs (`TRIED`). This takes a network and
+minutes. Nothing but Python is needed, since the environments are made on the way.
 
 `make test` follows them too, without a network: see `follow_without_network`.
 """
@@ -38,6 +38,36 @@ MINUTE: Final = (
     "looktwice scenes import tests/data/comma2k19/segment_40 minute.parquet --route",
     "looktwice plan minute.parquet --limit 1",
 )
+_SCENES: Final = "model/bundled/scenes.parquet"
+TRIED: Final = {
+    "serve": "looktwice serve --settings",
+    "scenes stats": "looktwice scenes stats",
+    "scenes show": "looktwice scenes show --limit 2",
+    "scenes pick": f"looktwice scenes pick {_SCENES} out/picked.parquet --count 2",
+    "build rollout": f"looktwice build rollout out/build {_SCENES} --service http://localhost:{PORT} --n 1",
+    "build filter": "looktwice build filter out/build --everything",
+    "build label": f"looktwice build label out/build {_SCENES}",
+    "build export": "looktwice build export out/build --to out/reflections.parquet",
+    "describe": "cp -r model/bundled/looktwice-nano out/nano && looktwice describe out/nano",
+    "keys new": "looktwice keys new somebody",
+    "evaluate": "looktwice evaluate --limit 2 --n 1",
+}
+"""How commands that the README lists are run beside its service, in this order."""
+HELP_ONLY: Final = {
+    "plan": "the README's `make plan` runs it",
+    "scenes generate": "it needs the simulator",
+    "scenes import": "docs/own-cameras.md runs it",
+    "train": "minutes to hours",
+    "train create": "minutes",
+    "drive": "it needs the simulator",
+    "loadtest": "a busy machine makes its run not valid, which is an exit code of 1",
+    "egodriver": "it serves until it is ended",
+    "bench engine": "minutes",
+    "bench precision": "minutes",
+    "bench egodriver": "minutes",
+    "bench http": "minutes",
+}
+"""Commands that the README lists and of which only the help is asked for, and why."""
 ACTIVATE: Final = "source .venv/bin/activate"
 SERVE: Final = "looktwice serve"
 _READY_S: Final = 120.0
@@ -179,6 +209,7 @@ def follow_readme(newcomer: Newcomer) -> None:
     for target in sorted(set(re.findall(r"`make ([a-z-]+)`", page))):
         newcomer.run(f"make --dry-run {target}")
     with newcomer.service():
+        run_block(newcomer, "\n".join(TRIED.values()))
         for language, block in rest:
             if language == "bash":
                 run_block(newcomer, block)

@@ -13,8 +13,10 @@ from clients.importers.recording import RecordingError
 from tests.comma2k19 import SEGMENT
 from tests.docs.clean_clone import (
     ACTIVATE,
+    HELP_ONLY,
     MINUTE,
     SERVE,
+    TRIED,
     blocks,
     follow_without_network,
     left_out,
@@ -36,6 +38,14 @@ def test_what_is_left_out_stands_in_the_pages() -> None:
         line for page in PAGES for _, block in blocks((ROOT / page).read_text()) for line in lines(block)
     ]
     assert left_out().keys() <= set(commands)
+
+
+def test_every_command_that_the_readme_lists_is_run_or_it_is_said_why_not() -> None:
+    names = {name for name, _ in listed((ROOT / "README.md").read_text())}
+    assert not TRIED.keys() & HELP_ONLY.keys()
+    assert names == TRIED.keys() | HELP_ONLY.keys()
+    for name, command in TRIED.items():
+        assert f"looktwice {name} " in f"{command} "
 
 
 def test_the_real_minute_is_followed_wherever_its_film_can_be_read() -> None:
