@@ -21,6 +21,9 @@ from model.driving.scene_store import SCENE_VERSION
 
 _JSON: Final = "application/json"
 _SCANS, _CHUNKS, _MEMBERS, _MAPS, _NAME = 3000, 500_000, 1_000_000, 20_000_000, 15_000_000
+_TURN: Final = {"role": "user", "content": [0] * 3900}
+_TURNS: Final = 62
+"""Of a chat: less than 1 MB, so that they are read on the loop."""
 _SIDE: Final = 2000
 """Pixels: as many as a service takes."""
 
@@ -41,6 +44,7 @@ def costly_calls(polite: Call) -> list[Call]:
         _call("/v1/plan", _JSON, json.dumps(document | {"n" * _NAME: 0}).encode()),
         _call("/v1/plan", _JSON, json.dumps(_with_history(document)).encode()),
         _call("/v1/plan", MSGPACK_MEDIA_TYPE, b"\xdd" + struct.pack(">I", _MAPS) + b"\x80" * _MAPS),
+        _call("/v1/chat/completions", _JSON, json.dumps({"messages": [_TURN] * _TURNS}).encode()),
         _call("/v1/scenes:read", "application/octet-stream", scene_file()),
     ]
 

@@ -77,11 +77,18 @@ class TextPart(_Dialect):
     text: str = Field(max_length=100_000)
 
 
+_Parts = Annotated[
+    list[Annotated[ImagePart | TextPart, Field(discriminator="type")]],
+    Field(max_length=256, fail_fast=True),
+]
+"""Of a message: four pictures of each camera, and text between them."""
+
+
 class Message(_Dialect):
     """One turn of the dialogue; only pictures of users matter."""
 
     role: Literal["system", "developer", "user", "assistant"]
-    content: str | list[Annotated[ImagePart | TextPart, Field(discriminator="type")]] | None
+    content: str | _Parts | None
 
 
 class StreamOptions(_Dialect):

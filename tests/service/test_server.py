@@ -357,8 +357,8 @@ def test_a_log_that_nobody_reads_holds_up_nobody_and_dear_requests_are_refused()
             http.post(call.path, content=call.body, headers=dict(call.headers)).status_code
             for call in costly_calls(polite)
         ]
-        # Scans, chunks, large pictures; names, a name, points; maps; a file.
-        assert statuses == [422, 422, 200, 413, 413, 422, 400, 422]
+        # Scans, chunks, large pictures; names, a name, points; maps; a chat; a file.
+        assert statuses == [422, 422, 200, 413, 413, 422, 400, 400, 422]
         lines = http.get("/metrics").text.splitlines()
         [lost] = [line for line in lines if line.startswith("looktwice_log_lines_lost ")]
         assert float(lost.split()[1]) > 0
