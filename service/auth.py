@@ -1,4 +1,4 @@
-"""Nobody gets in without a key, but to the probes."""
+"""Nobody gets in without a key, or under a strange name, but to the probes."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from service.openai_errors import PATHS
 from service.problems import MISDIRECTED, UNAUTHORIZED, ProblemError
 
 OPEN_PATHS: Final = frozenset({"/healthz", "/readyz"})
+"""Probes: whoever runs a service asks them without a key, and under its address of the moment."""
 NOBODY: Final = ""
 """Whoever asks where no keys are set."""
 _QUOTED: Final = 100
@@ -42,13 +43,17 @@ class Guard:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
+        if scope["path"] in OPEN_PATHS:
+            scope["state"]["owner"] = NOBODY
+            await self._app(scope, receive, send)
+            return
         host = _host(Headers(scope=scope).get("host", ""))
         if not self._keys and self._hosts is not None and host not in self._hosts:
             detail = f"this is not {host[:_QUOTED]!r}; LOOKTWICE_HOSTS tells its names"
             await self._refuse(ProblemError(MISDIRECTED, detail), scope, receive, send)
             return
         owner: str | None = NOBODY
-        if self._keys and scope["path"] not in OPEN_PATHS:
+        if self._keys:
             key = _key(Headers(scope=scope).get("authorization", ""))
             owner = None if key is None else self._keys.owner(key)
         if owner is None:

@@ -110,7 +110,9 @@ def describe(app: FastAPI, *, keys: bool) -> None:
             for path, operations in description["paths"].items():
                 for operation in operations.values():
                     _move_problems(operation["responses"])
-                    if keys and path not in OPEN_PATHS:
+                    if path in OPEN_PATHS:
+                        del operation["responses"][str(MISDIRECTED.status)]
+                    elif keys:
                         operation["security"] = [{"key": []}]
             if keys:
                 scheme = {"type": "http", "scheme": "bearer"}

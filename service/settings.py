@@ -30,8 +30,8 @@ class Settings(BaseSettings):
         log_format: ``json`` for machines, ``console`` for people.
         api_keys_file: a line ``name:sha256`` for each key; without it everybody may ask.
         open: listen beyond this machine although there are no keys.
-        hosts: names that a service without keys answers to; by default this machine's own for itself, and any
-            for a service that is open.
+        hosts: names that a service without keys answers to, but for probes, which it always answers; by
+            default this machine's own for itself, and any for a service that is open.
         rate_limit: draws per key, such as ``6000/minute``; None for no limit.
         max_draws, max_scenes: accepted at once, those that wait included; the next one gets a 429 problem,
             but a scene that would be alone is let in. Few keep answers quick under a burst, many keep a

@@ -135,10 +135,21 @@ def test_without_keys_only_known_names_are_answered_to(served: Served, host: str
         problem(answer, "misdirected")
 
 
+def test_probes_are_answered_under_any_name(engine: ScriptedEngine) -> None:
+    """Docker, the kubelet and Ray ask under addresses that no operator knows beforehand."""
+    with serve(engine, Settings(open=True, hosts=frozenset({"127.0.0.1"}))) as served:
+        described = served.http.get("/openapi.json").json()["paths"]
+        for host in ("10.1.2.3:8000", "replica", ""):
+            for path in ("/healthz", "/readyz"):
+                assert served.http.get(path, headers={"Host": host}).status_code == 200
+                assert "421" not in described[path]["get"]["responses"]
+            problem(served.http.get("/v1/models", headers={"Host": host}), "misdirected")
+
+
 def test_a_name_that_is_not_its_own_is_counted_and_not_told_at_length(served: Served) -> None:
     counted = {"reason": "misdirected"}
     before = served.metric("looktwice_rejections_total", **counted)
-    for path in ("/readyz", "/v1/models", "/v1/chat/completions"):
+    for path in ("/metrics", "/v1/scenes", "/v1/chat/completions"):
         answer = served.http.get(path, headers={"Host": "x" * 20_000})
         assert problem(answer, "misdirected").status == 421
         assert len(answer.content) < 1000

@@ -8,6 +8,7 @@ import pytest
 
 from clients.wire import PlanRequest
 from service.app import create_app
+from service.auth import OPEN_PATHS
 from service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served
@@ -20,10 +21,11 @@ def description(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def test_every_error_is_described_as_a_problem(description: dict[str, Any]) -> None:
-    for operations in description["paths"].values():
+    for path, operations in description["paths"].items():
         for operation in operations.values():
             responses = operation["responses"]
-            assert {"200", "421", "500"} <= responses.keys()
+            assert {"200", "500"} <= responses.keys()
+            assert ("421" in responses) == (path not in OPEN_PATHS)
             for status, response in responses.items():
                 if status != "200":
                     (media_type,) = response["content"]
