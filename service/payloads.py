@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
@@ -28,8 +29,6 @@ from service.problems import INVALID_BODY, INVALID_IMAGE, INVALID_JSON, ProblemE
 _JSON: Final = b"application/json"
 _MAX_PARTS: Final = 2048
 """Pictures of a batch."""
-_ONE_AT_A_TIME: Final = ThreadPoolExecutor(1, "looktwice-bodies")
-"""Reads large bodies beside the answers of others: several at once would leave planning no processor."""
 _MAX_JSON_BYTES: Final = 8_000_000
 """Of the JSON part of a multipart body."""
 
@@ -100,10 +99,36 @@ def packed(value: Any) -> bytes:
     return content
 
 
+class _LargeBodies:
+    """Reads large bodies beside the answers of others: several at once would leave planning no processor."""
+
+    def __init__(self) -> None:
+        self._one_at_a_time = ThreadPoolExecutor(1, "looktwice-bodies")
+        self._since_s: float | None = None
+
+    @property
+    def reading_s(self) -> float:
+        """How long the one that is being read has been; those behind it wait their turn."""
+        since_s = self._since_s
+        return 0.0 if since_s is None else time.monotonic() - since_s
+
+    async def read(self, read: Callable[[bytes], Any], body: bytes) -> Any:
+        """What ``read`` makes of ``body``."""
+        return await asyncio.get_running_loop().run_in_executor(self._one_at_a_time, self._run, read, body)
+
+    def _run(self, read: Callable[[bytes], Any], body: bytes) -> Any:
+        self._since_s = time.monotonic()
+        try:
+            return read(body)
+        finally:
+            self._since_s = None
+
+
+LARGE_BODIES: Final = _LargeBodies()
+
+
 async def _read(read: Callable[[bytes], Any], body: bytes) -> Any:
-    if len(body) <= LARGE_BYTES:
-        return read(body)
-    return await asyncio.get_running_loop().run_in_executor(_ONE_AT_A_TIME, read, body)
+    return read(body) if len(body) <= LARGE_BYTES else await LARGE_BODIES.read(read, body)
 
 
 async def _whole(request: Request) -> bytes:

@@ -21,7 +21,7 @@ from service.labelling import label, teacher_name
 from service.openai_routes import openai_router
 from service.openapi import PACKED, Responses, payloads, problems
 from service.parts import Parts
-from service.payloads import payload_route
+from service.payloads import LARGE_BODIES, payload_route
 from service.planning import full_as_problem, let_in
 from service.planning_routes import arrival_of, planning_router, respond
 from service.problems import (
@@ -176,11 +176,14 @@ def _add_probes(router: APIRouter, parts: Parts) -> None:
     async def readyz() -> dict[str, str]:
         """Whether requests can be served now, and were lately."""
         parts.lifecycle.check_ready()
-        still_s, limit_s = parts.pulse.stood_still_s, parts.settings.stall_s
-        if still_s > limit_s:
-            raise ProblemError(NOT_READY, f"nobody was answered for {still_s:.1f} s")
-        if (wait_s := parts.lifecycle.load.pictures_wait_s) > limit_s:
-            raise ProblemError(NOT_READY, f"pictures have waited for {wait_s:.1f} s to be decoded")
+        for stood_s, what in (
+            (parts.pulse.stood_still_s, "nobody was answered for {:.1f} s"),
+            (parts.pulse.threads_wait_s, "requests have waited for {:.1f} s to be checked"),
+            (LARGE_BODIES.reading_s, "one large body has been read for {:.1f} s"),
+            (parts.lifecycle.load.pictures_wait_s, "pictures have waited for {:.1f} s to be decoded"),
+        ):
+            if stood_s > parts.settings.stall_s:
+                raise ProblemError(NOT_READY, what.format(stood_s))
         return {"status": "ready"}
 
     @router.get(

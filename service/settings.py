@@ -42,8 +42,8 @@ class Settings(BaseSettings):
         headers_timeout_s, body_timeout_s: a connection that takes longer to send them is closed, or gets a
             408 problem.
         write_timeout_s: a caller that takes nothing of its answer for so long is disconnected.
-        stall_s: a service that answered nobody for so long lately, or whose pictures wait for so long to be
-            decoded, says that it is not ready.
+        stall_s: a service that answered nobody for so long lately, or where requests wait for so long to be
+            read, checked or decoded, says that it is not ready.
         drain_s: after SIGTERM accepted requests have so long to finish.
         drain_notice_s: after SIGTERM the service listens, and says that it is draining, at least so long.
         idempotency_s: answers are kept for so long for callers that ask again with the same key.
