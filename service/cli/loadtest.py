@@ -103,6 +103,7 @@ def loadtest(
         from loadtests.sending import Target
         from model.driving.scene_store import read_scenes
         from service.cli.serving import served
+        from service.settings import Settings
 
         def soaked() -> Result:
             if knee is None or server_pid is None:
@@ -128,7 +129,7 @@ def loadtest(
             settings = {"KIND": "openai", "BASE_URL": teacher.url, "MODEL": "no-good"}
             environment = {f"LOOKTWICE_TEACHER_{name}": value for name, value in settings.items()}
             process, service = stack.enter_context(served((), environment, unread_log=True))
-            own = OwnService(process, teacher)
+            own = OwnService(process, teacher, Settings().drain_s)
         goal_s = (1 / hz if scenario == "fleet" else 1.0) if goal_ms is None else goal_ms / 1000
         setup = Setup(
             target=Target(service.rstrip("/"), api_key, timeout_s),

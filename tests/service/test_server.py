@@ -218,6 +218,42 @@ def test_what_is_cut_off_at_the_end_of_a_drain_is_told_to_ask_elsewhere(
     assert b"draining" in told
 
 
+def test_a_drain_ends_although_an_engine_never_finishes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody sets ``may_finish``: only the end of the drain can end the request, the engine, and the rest."""
+    monkeypatch.setattr("service.server._LAST_WORDS_S", 0.2)
+    ended: list[str] = []
+
+    class StuckEngine(ScriptedEngine):
+        def cancel(self, request_id: str) -> None:
+            ended.append("request")
+
+        async def stop(self) -> None:
+            ended.append("engine")
+
+    class LastTeacher(SlowTeacher):
+        async def close(self) -> None:
+            ended.append("teacher")
+
+    engine, settings = StuckEngine(), Settings(drain_s=0.5, drain_notice_s=0.0)
+    app = create_app(engine, settings, teacher=LastTeacher())
+    server = make_server(app, settings)
+    with listening(app, 0, server) as (url, loop), httpx.Client(base_url=url, timeout=30) as http:
+        served = Served(engine, url, http, loop)
+        served.until_ready()
+        served.in_loop(engine.may_finish.clear)
+        answers: list[httpx.Response] = []
+        thread = threading.Thread(
+            target=lambda: answers.append(httpx.post(url + "/v1/plan", json=body(), timeout=30))
+        )
+        thread.start()
+        served.until(lambda: len(engine.submitted) == 1)
+        served.in_loop(server.drain)
+        served.until(loop.is_closed)
+        thread.join()
+    assert "stopped before this was answered" in problem(answers[0], "draining").detail
+    assert ended == ["request", "engine", "teacher"]
+
+
 def test_it_does_not_open_itself_to_others_without_keys(engine: ScriptedEngine, tmp_path: Path) -> None:
     app = create_app(engine, Settings())
     for host in ("0.0.0.0", "::", "192.0.2.1", "looktwice.example"):
