@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Final
 
 import numpy as np
@@ -30,14 +33,30 @@ class ImageError(ValueError):
     """Bytes that are not an acceptable picture; the text says why."""
 
 
+_wanted: ContextVar[Callable[[], bool]] = ContextVar("_wanted", default=lambda: True)
+
+
+@contextmanager
+def decoding_while(wanted: Callable[[], bool]) -> Generator[None]:
+    """Within the block, pictures end with an `ImageError` at their next read once they are not ``wanted``."""
+    token = _wanted.set(wanted)
+    try:
+        yield
+    finally:
+        _wanted.reset(token)
+
+
 class _Reader(io.BytesIO):
-    """Bytes that can be read so many times, and not for longer than a picture may take."""
+    """Bytes that can be read so many times, while they are wanted, and no longer than a picture may take."""
 
     def __init__(self, encoded: bytes) -> None:
         super().__init__(encoded)
         self._reads, self._ends_s = 0, time.thread_time() + MAX_DECODE_CPU_S
+        self._wanted = _wanted.get()
 
     def read(self, size: int | None = -1, /) -> bytes:
+        if not self._wanted():
+            raise ImageError("nobody waits for the picture any more")
         self._reads += 1
         if self._reads > MAX_READS:
             raise ImageError("the picture is in too many pieces")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 from typing import Final, TypeVar
 
-from model.driving.images import check_image
+from model.driving.images import check_image, decoding_while
 from model.engines.engine import EngineError
 
 _Result = TypeVar("_Result")
@@ -25,6 +26,7 @@ class PictureThreads:
     def __init__(self) -> None:
         self._pools: dict[bool, ThreadPoolExecutor] = {}
         self._numbers, self._since_s = count(), dict[int, float]()
+        self._left: dict[int, threading.Event] = {}
 
     @property
     def waiting_s(self) -> float:
@@ -36,7 +38,7 @@ class PictureThreads:
         return time.monotonic() - min(self._since_s.values()) if self._since_s else 0.0
 
     async def run(self, work: Callable[[], _Result], pictures: Sequence[bytes] = ()) -> _Result:
-        """What ``work`` on ``pictures`` gives. Who stops waiting leaves work that has begun to end by itself.
+        """What ``work`` on ``pictures`` gives; it ends at its next picture once nobody waits for it any more.
 
         Raises:
             ImageError: one of the pictures is none.
@@ -50,25 +52,34 @@ class PictureThreads:
         if large not in self._pools:
             threads = LARGE_THREADS if large else THREADS
             self._pools[large] = ThreadPoolExecutor(threads, "looktwice-pictures")
-        pool, number = self._pools[large], next(self._numbers)
+        pool, number, left = self._pools[large], next(self._numbers), threading.Event()
 
         def begun() -> _Result:
             self._since_s.setdefault(number, time.monotonic())
-            return work()
+            with decoding_while(lambda: not left.is_set()):
+                return work()
+
+        def done(_: object) -> None:
+            self._since_s.pop(number, None)
+            self._left.pop(number, None)
 
         if not large:
             self._since_s[number] = time.monotonic()
+        self._left[number] = left
         future = pool.submit(begun)
-        future.add_done_callback(lambda _: self._since_s.pop(number, None))
+        future.add_done_callback(done)
         try:
             return await asyncio.wrap_future(future)
         except asyncio.CancelledError:
+            left.set()
             if future.cancelled() and self._pools.get(large) is not pool:
                 raise EngineError("the engine was stopped") from None
             raise
 
     def close(self) -> None:
-        """Drop what has not begun."""
+        """Drop what has not begun; what has begun ends at its next picture."""
+        for left in list(self._left.values()):
+            left.set()
         for pool in self._pools.values():
             pool.shutdown(wait=False, cancel_futures=True)
         self._pools.clear()

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from model.driving.images import ImageError, encode_jpeg
+from model.driving.images import ImageError, decode_image, encode_jpeg
 from model.engines.engine import EngineError
 from model.engines.pictures import LARGE_PIXELS, THREADS, PictureThreads
 
@@ -62,6 +62,43 @@ def test_large_pictures_hold_up_no_small_ones() -> None:
         assert threads.waiting_s == 0.0
         with pytest.raises(ImageError):
             await threads.run(lambda: 7, [b"no picture"])
+        threads.close()
+
+    asyncio.run(asyncio.wait_for(test(), 60))
+
+
+@pytest.mark.parametrize("ends", ["its caller leaves", "the threads are closed"])
+def test_work_on_pictures_ends_with_who_waits_for_it(ends: str) -> None:
+    picture = encode_jpeg(np.zeros((32, 32, 3), np.uint8))
+
+    async def test() -> None:
+        threads, begun, go_on = PictureThreads(), threading.Event(), threading.Event()
+        outcomes: list[str] = []
+
+        def work() -> None:
+            decode_image(picture)
+            begun.set()
+            assert go_on.wait(30)
+            try:
+                decode_image(picture)
+                outcomes.append("decoded")
+            except ImageError as error:
+                outcomes.append(str(error))
+
+        task = asyncio.create_task(threads.run(work, [picture]))
+        while not begun.is_set():
+            await asyncio.sleep(0.01)
+        if ends == "its caller leaves":
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+        else:
+            threads.close()
+        go_on.set()
+        while not outcomes:
+            await asyncio.sleep(0.01)
+        assert outcomes == ["nobody waits for the picture any more"]
+        if ends == "its caller leaves":
+            assert await threads.run(lambda: decode_image(picture).shape, [picture]) == (32, 32, 3)
         threads.close()
 
     asyncio.run(asyncio.wait_for(test(), 60))
