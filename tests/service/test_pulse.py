@@ -44,7 +44,12 @@ def test_a_probe_that_waited_through_a_stall_hears_of_it(engine: ScriptedEngine)
         probe.request("GET", "/readyz")
         assert probe.getresponse().read()  # connected, so that only the next request waits
         stalled, go_on = threading.Event(), threading.Event()
-        served.loop.call_soon_threadsafe(lambda: (stalled.set(), go_on.wait(30)))
+
+        def stall() -> None:
+            stalled.set()
+            go_on.wait(30)
+
+        served.loop.call_soon_threadsafe(stall)
         assert stalled.wait(30)
         probe.request("GET", "/readyz")
         time.sleep(1.0)
