@@ -17,7 +17,7 @@ HELD: Final = (
     "looktwice_queue_scenes",
     "looktwice_queue_draws",
 )
-_LOST: Final = "looktwice_log_lines_lost"
+_LOST: Final = "looktwice_log_lines_lost_total"
 _PATIENCE_S: Final = 30.0
 _PAUSE_S: Final = 0.2
 

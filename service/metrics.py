@@ -13,6 +13,8 @@ from prometheus_client import (
     ProcessCollector,
     disable_created_metrics,
 )
+from prometheus_client.core import CounterMetricFamily
+from prometheus_client.registry import Collector
 
 from model.driving.agreement import PARTS, Agreement
 from model.driving.plan import plan_iou
@@ -33,6 +35,14 @@ PROBABILITY_BUCKETS: Final = tuple(step / 10 for step in range(1, 11))
 
 # When a series began is of use to nobody here, and in Prometheus' own format it is one more gauge each.
 disable_created_metrics()  # type: ignore[no-untyped-call]
+
+
+class _LinesLost(Collector):
+    """Counted by the log itself, which cannot wait for a registry."""
+
+    def collect(self) -> Iterable[CounterMetricFamily]:
+        text = "Lines of the log that nobody took in time."
+        yield CounterMetricFamily("looktwice_log_lines_lost", text, value=lines_lost())
 
 
 class Metrics:
@@ -220,8 +230,7 @@ class Metrics:
             "Draws accepted that the engine has not begun with.",
             lambda: sum(place.draws for place in admission.waiting),
         )
-
-        gauge("looktwice_log_lines_lost", "Lines of the log that nobody took in time.", lines_lost)
+        self.registry.register(_LinesLost())
 
     def problem_told(self, kind: Kind) -> None:
         """Count a request, or a scene of a batch, that may have been right and was not served."""

@@ -25,15 +25,21 @@ WORDS = {"by", "or", "unless", "and", "on", "without", "ignoring", "bool", "offs
 
 
 @pytest.fixture(scope="module")
-def shown() -> dict[str, set[str]]:
-    """What a service shows at /metrics: names of samples, and the labels seen on them."""
+def exposed() -> dict[str, str]:
+    """What a service shows at /metrics: before it was asked anything, and after."""
     with serve(ScriptedEngine(), Settings()) as served:
+        before = served.http.get("/metrics").text
         for thinking in ("always", "never", "adaptive"):
             assert served.http.post("/v1/plan", json=body(thinking=thinking, deadline_ms=60_000)).is_success
-        text = served.http.get("/metrics").text
+        return {"before": before, "after": served.http.get("/metrics").text}
+
+
+@pytest.fixture(scope="module")
+def shown(exposed: dict[str, str]) -> dict[str, set[str]]:
+    """Names of samples at /metrics, and the labels seen on them."""
     suffixes = {"counter": ("_total",), "histogram": ("_bucket", "_sum", "_count"), "gauge": ("",)}
     names: dict[str, set[str]] = {}
-    for family in text_string_to_metric_families(text):
+    for family in text_string_to_metric_families(exposed["after"]):
         for suffix in suffixes[family.type]:
             names[family.name + suffix] = set()
         for sample in family.samples:
@@ -77,6 +83,15 @@ def test_every_label_is_one_that_the_metric_has(shown: dict[str, set[str]]) -> N
             named = set(re.findall(r"(\w+)\s*(?:=~|!~|!=|=)", selector)) - SCRAPED_LABELS
             if shown.get(metric):
                 assert named <= shown[metric], (where, metric)
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_metrics_are_named_as_prometheus_wants_them(exposed: dict[str, str], when: str) -> None:
+    assert run("promtool", "check", "metrics", told=exposed[when]) == ""
+
+
+def test_what_only_grows_is_a_counter(shown: dict[str, set[str]]) -> None:
+    assert "looktwice_log_lines_lost_total" in shown
 
 
 def test_rules_are_in_order() -> None:

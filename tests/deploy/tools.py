@@ -31,15 +31,17 @@ _CUSTOM: Final = {
 }
 
 
-def run(tool: str, *arguments: object) -> str:
-    """What a tool of this environment prints; fails when it finds fault, or warns."""
+def run(tool: str, *arguments: object, told: str | None = None) -> str:
+    """What a tool of this environment prints, which reads ``told``; fails when it finds fault, or warns."""
     command = Path(sys.executable).parent / tool
     assert command.exists(), f"{tool} is missing: make deploy-check installs it"
-    done = subprocess.run([command, *map(str, arguments)], capture_output=True, text=True, check=False)
-    told = done.stdout + done.stderr
-    assert done.returncode == 0, told
-    assert "warn" not in told.lower(), told
-    return told
+    done = subprocess.run(
+        [command, *map(str, arguments)], capture_output=True, text=True, check=False, input=told
+    )
+    printed = done.stdout + done.stderr
+    assert done.returncode == 0, printed
+    assert "warn" not in printed.lower(), printed
+    return printed
 
 
 def documents(text: str) -> list[dict[str, Any]]:

@@ -399,7 +399,7 @@ def test_a_log_that_nobody_reads_holds_up_nobody_and_dear_requests_are_refused()
         # Scans, chunks, large pictures; names, a name, points; maps; a chat; a file.
         assert statuses == [422, 422, 200, 413, 413, 422, 400, 400, 422]
         lines = http.get("/metrics").text.splitlines()
-        [lost] = [line for line in lines if line.startswith("looktwice_log_lines_lost ")]
+        [lost] = [line for line in lines if line.startswith("looktwice_log_lines_lost_total ")]
         assert float(lost.split()[1]) > 0
         started.send_signal(signal.SIGTERM)
         assert started.wait(WAIT_S) == 0
