@@ -57,6 +57,10 @@ class NoModel:
         raise RequestError("this service runs without a model")
         yield
 
+    def prompt_tokens(self, request: PlanRequest) -> int:
+        """Nothing is read."""
+        raise RequestError("this service runs without a model")
+
     def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
         """Nothing is imagined."""
         raise RequestError("this service runs without a model")

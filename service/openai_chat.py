@@ -285,10 +285,7 @@ class Completion:
 
     def _usage(self, planned: Planned) -> dict[str, int]:
         written = sum(sum(draw.tokens.values()) for draw in planned.draws)
-        given = {"route": self._chat.looktwice.route, "tracks": self._chat.looktwice.tracks}
-        lacking = [name for name, value in given.items() if value is None]
-        card = planned.card
-        prompt = card.prompt_tokens - sum(card.input_tokens.get(name, 0) for name in lacking)
+        prompt = planned.prompt_tokens()
         return {"prompt_tokens": prompt, "completion_tokens": written, "total_tokens": prompt + written}
 
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncGenerator, Callable, Generator, Sequence
 from contextlib import AbstractContextManager, ExitStack, aclosing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, TypeVar
 
 import numpy as np
@@ -93,6 +94,7 @@ class Planned:
         timing: where the time went.
         deadline: what became of it; None where none was set.
         paint: paints the pictures that its draws imagine; takes ms, so not for the event loop.
+        prompt_tokens: counts the tokens of its prompt.
     """
 
     draws: tuple[Draw, ...]
@@ -102,6 +104,7 @@ class Planned:
     timing: wire.Timing
     deadline: wire.Deadline | None
     paint: Paint
+    prompt_tokens: Callable[[], int]
 
 
 @dataclass(frozen=True)
@@ -240,7 +243,10 @@ class Planning:
             if deadline_met is not None:
                 cut = [draw.index for draw in draws if draw.cut is not None]
                 deadline = wire.Deadline(met=deadline_met, cut=cut)
-            yield Planned(tuple(draws), agreements, drafts, engine.card, timing, deadline, engine.paint)
+            yield Planned(
+                *(tuple(draws), agreements, drafts, engine.card, timing, deadline, engine.paint),
+                prompt_tokens=partial(engine.prompt_tokens, request),
+            )
 
     async def _checked(
         self, asked: Asked, card: ModelCard, arrival: Arrival, geometry: Geometry | None

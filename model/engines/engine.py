@@ -331,6 +331,13 @@ class Engine(Protocol):
         """
         ...
 
+    def prompt_tokens(self, request: PlanRequest) -> int:
+        """Tokens of the prompt that a request is answered to, those of its pictures among them.
+
+        ``request`` is one that was served.
+        """
+        ...
+
     def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
         """An imagined picture, uint8 RGB [112, 224, 3], of its 98 codes; takes ms of the caller's thread.
 

@@ -83,6 +83,10 @@ class KeptDraws:
         """The engine's."""
         self._engine.cancel(request_id)
 
+    def prompt_tokens(self, request: PlanRequest) -> int:
+        """The engine's."""
+        return self._engine.prompt_tokens(request)
+
     def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
         """The engine's."""
         return self._engine.paint(codes)

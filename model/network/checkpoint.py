@@ -181,12 +181,6 @@ def read_parts(folder: Path) -> Parts:
             image_size=(settings.image_width, settings.image_height),
             parameters=card["parameters"],
             inputs=settings.inputs,
-            prompt_tokens=inputs.longest_prompt(settings.formats[0]),
-            input_tokens={
-                name: inputs.longest_prompt(settings.formats[0], (name,))
-                - inputs.longest_prompt(settings.formats[0], ())
-                for name in settings.inputs
-            },
             paints=visual_codes is not None,
             details=card["details"],
         ),

@@ -92,16 +92,22 @@ class InputBuilder:
             FamilyError: an unknown format, or one that refines an attempt where there is none.
             FormatError: its family says of the scene what its prompt cannot say.
         """
-        route, tracks = self.way(scene), self.tracks(scene)
-        situation = Situation(scene.history, route, attempt, camera)
         return ModelInputs(
-            prompt=self.prompt(format, situation, tracks=tracks is not None),
+            prompt=self.prompt_for(scene, format, attempt, camera),
             patches=np.concatenate([self.patches(pictures) for pictures in self.slices(scene)]),
             video_grid_thw=self.video_grid_thw,
             history=scene.history,
-            route=route,
-            tracks=tracks,
+            route=self.way(scene),
+            tracks=self.tracks(scene),
         )
+
+    def prompt_for(
+        self, scene: Scene, format: str, attempt: Attempt | None = None, camera: str | None = None
+    ) -> Prompt:
+        """The prompt alone of what `build` gives; raises `FamilyError` and `FormatError` as it does."""
+        situation = Situation(scene.history, self.way(scene), attempt, camera)
+        tracks = self.settings.with_tracks and scene.tracks is not None
+        return self.prompt(format, situation, tracks=tracks)
 
     def way(self, scene: Scene) -> FloatArray | None:
         """The route [20, 2] that the network is given, or None."""
@@ -159,9 +165,9 @@ class InputBuilder:
             return []
         return [token.id for token in self._text(format, inputs).render(inputs.values(situation))]
 
-    def longest_prompt(self, format: str, inputs: Sequence[str] | None = None) -> int:
-        """Tokens of the longest prompt of scenes that bring ``inputs`` (``route``, ``tracks``), or both."""
-        inputs = self.settings.inputs if inputs is None else inputs
+    def longest_prompt(self, format: str) -> int:
+        """Tokens of the longest prompt, of scenes that bring all that the checkpoint takes."""
+        inputs = self.settings.inputs
         prompt = self._prompt(format, "route" in inputs, "tracks" in inputs, [])
         texts = family_named(format).inputs
         return len(prompt.ids) + (0 if texts is None else self._text(format, texts).longest())

@@ -14,14 +14,12 @@ class ModelCard:
     Attributes:
         name: e.g. ``looktwice-nano``.
         revision: changes with the weights.
-        engine: ``torch`` or ``vllm``.
+        engine: ``torch``, ``vllm`` or ``transformers``.
         formats: response formats it can write; the first is that of requests that name none.
         cameras: cameras it looks at; a scene must have these.
         image_size: width, height in pixels that pictures are resized to.
         parameters: how many weights.
         inputs: what it takes of a scene beside pictures and history: ``route``, ``tracks``.
-        prompt_tokens: of a scene that brings all of these.
-        input_tokens: of them, how many each of ``inputs`` takes.
         paints: whether it can paint the pictures that it imagines.
         details: anything else worth showing, JSON-like.
     """
@@ -34,8 +32,6 @@ class ModelCard:
     image_size: tuple[int, int]
     parameters: int
     inputs: tuple[str, ...] = ("route",)
-    prompt_tokens: int = 0
-    input_tokens: Mapping[str, int] = field(default_factory=dict)
     paints: bool = False
     details: Mapping[str, Any] = field(default_factory=dict)
 

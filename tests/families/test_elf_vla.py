@@ -25,7 +25,7 @@ from model.engines.engine import Controls, Draw, PlanRequest, RequestError
 from model.engines.requests import begin
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.torch.runner import Runner
+from model.engines.torch.runner import Asked, Runner
 from model.evaluation.open_loop import evaluate_draws
 from model.evaluation.variants import standard_variants
 from model.families.elf_vla import ELF_VLA, ELF_VLA_REFINE
@@ -178,6 +178,22 @@ def test_prompts_say_command_speeds_and_history(elf: Loaded) -> None:
     tagged = replace(ATTEMPT, feedback=f"<feedback>\n{FEEDBACK}\n</feedback>")
     assert (elf.inputs.build(scene, "elf_vla_refine", tagged).prompt.ids == built).all()
     assert len(built) <= elf.inputs.longest_prompt("elf_vla_refine")
+
+
+def test_an_engine_counts_the_words_of_its_prompts(elf: Loaded, checkpoint: Path) -> None:
+    """As many as its network reads, which depends on what is said of the scene."""
+    engine, runner = TorchEngine(checkpoint, TorchSettings(rows=1)), Runner(elf, 1)
+    faster = replace(noisy_scene(1, route=True), history=HISTORY)
+    for scene, format, attempt in (
+        (noisy_scene(1, route=True), "elf_vla", None),
+        (faster, "elf_vla", None),
+        (faster, "elf_vla_refine", ATTEMPT),
+    ):
+        with torch.inference_mode():
+            [read] = runner.begin_prompts([Asked(scene, format, 0, attempt)])
+        assert not isinstance(read, Exception)
+        request = PlanRequest("count", scene, format, attempt=attempt)
+        assert engine.prompt_tokens(request) == read.length + 1
 
 
 @pytest.mark.parametrize(

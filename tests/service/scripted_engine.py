@@ -41,8 +41,6 @@ CARD: Final = ModelCard(
     cameras=("front_wide_120", "front_tele_30"),
     image_size=(224, 128),
     parameters=0,
-    prompt_tokens=100,
-    input_tokens={"route": 5},
 )
 KEEP_ON: Final = parse_plan(
     "- longitudinal\n  - 0.0s-2.1s: Keep Speed\n  - 2.1s-6.4s: Accelerate\n"
@@ -150,6 +148,9 @@ class ScriptedEngine:
             raise
         finally:
             self.finished += 1
+
+    def prompt_tokens(self, request: PlanRequest) -> int:
+        return 100 - 5 * (request.scene.route is None) - 20 * (request.format == "traj_only")
 
     def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
         if not self.card_shown.paints:

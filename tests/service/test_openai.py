@@ -5,15 +5,24 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import openai
 import pytest
 from openai.types.chat import ChatCompletionContentPartParam, ChatCompletionMessageParam
 
+from clients.wire_values import wire_tracks
+from model.bundled import CHECKPOINT
+from model.driving.scene import Scene
+from model.engines.torch.engine import TorchEngine, TorchSettings
+from model.network.checkpoint import read_parts
+from service.settings import Settings
+from tests.checkpoints import made_up_tracks, noisy_scene
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
-from tests.service.serving import Served, body
+from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem
 
 SCENE = body()["scene"]
@@ -25,9 +34,9 @@ def client(served: Served) -> Iterator[openai.OpenAI]:
         yield made
 
 
-def messages() -> list[ChatCompletionMessageParam]:
+def messages(of: Scene | None = None) -> list[ChatCompletionMessageParam]:
     parts: list[ChatCompletionContentPartParam] = [{"type": "text", "text": "What next?"}]
-    for clip in scene().clips:
+    for clip in (of or scene()).clips:
         for image in clip.images:
             url = "data:image/jpeg;base64," + base64.b64encode(image).decode()
             parts.append({"type": "image_url", "image_url": {"url": url}})
@@ -128,6 +137,26 @@ def test_the_prompt_is_counted_as_it_was_given(client: openai.OpenAI) -> None:
     assert without.usage is not None
     assert with_route.usage is not None
     assert with_route.usage.prompt_tokens - without.usage.prompt_tokens == 5
+
+
+def test_the_prompt_is_counted_in_each_format_as_the_network_reads_it() -> None:
+    inputs = read_parts(CHECKPOINT).inputs
+    with_all = replace(noisy_scene(3, route=True), tracks=made_up_tracks(3))
+    scenes = [with_all, replace(with_all, route=None), replace(with_all, tracks=None)]
+    with serve(TorchEngine(CHECKPOINT, TorchSettings(rows=2)), Settings()) as served:
+        formats = served.engine.card.formats
+        assert len(formats) > 1
+        counted = set()
+        for format, asked in product(formats, scenes):
+            told = {"history": asked.history.tolist(), "format": format}
+            told |= {} if asked.route is None else {"route": asked.route.tolist()}
+            if asked.tracks is not None:
+                told["tracks"] = [track.model_dump() for track in wire_tracks(asked.tracks)]
+            document = {"messages": messages(asked), "looktwice": told}
+            usage = served.http.post("/v1/chat/completions", json=document).json()["usage"]
+            assert usage["prompt_tokens"] == len(inputs.build(asked, format).prompt.ids)
+            counted.add(usage["prompt_tokens"])
+        assert len(counted) > 1
 
 
 def test_what_was_assumed_is_said(client: openai.OpenAI, engine: ScriptedEngine) -> None:

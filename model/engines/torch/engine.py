@@ -172,6 +172,11 @@ class TorchEngine:
             if self._listeners.pop(request.request_id, None):
                 self.cancel(request.request_id)
 
+    def prompt_tokens(self, request: PlanRequest) -> int:
+        """See `Engine.prompt_tokens`."""
+        scene, format, attempt = request.scene, request.format, request.attempt
+        return len(self._loaded.inputs.prompt_for(scene, format, attempt, request.controls.camera).ids)
+
     def paint(self, codes: Sequence[int]) -> Frame:
         """An imagined picture; see `Engine.paint`."""
         return painted(self._loaded.visual_codes, codes)

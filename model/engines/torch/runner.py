@@ -41,7 +41,7 @@ from model.engines.torch.layout import (
 from model.engines.torch.memory import IntArray, Memory, SlotMapping
 from model.engines.torch.packed import Attention, PackedDecoder, Rotation
 from model.engines.torch.vision import Encoded, VisionEncoder
-from model.families.family import Attempt, Family, Situation
+from model.families.family import Attempt, Family
 from model.families.registry import families_of
 from model.formats.cursor import CompiledFormat
 from model.network.checkpoint import Loaded
@@ -335,8 +335,7 @@ class Runner:
     def _begin_prompt(self, asked: Asked, encoded: Encoded) -> Prompt:
         loaded, (scene, format, kv_row, attempt, camera) = self.loaded, asked
         route, tracks = loaded.inputs.way(scene), loaded.inputs.tracks(scene)
-        situation = Situation(scene.history, route, attempt, camera)
-        prompt = loaded.inputs.prompt(format, situation, tracks=tracks is not None)
+        prompt = loaded.inputs.prompt_for(scene, format, attempt, camera)
         embedded = loaded.model.embed_prompt(prompt, encoded.tokens, scene.history, route, tracks)
         shown = format.encode() + encoded.digest
         rotation = self._decoder.rotation(embedded.position_ids)

@@ -169,6 +169,11 @@ class VllmEngine:
         finally:
             del self._running[request.request_id]
 
+    def prompt_tokens(self, request: PlanRequest) -> int:
+        """See `Engine.prompt_tokens`."""
+        scene, format, attempt = request.scene, request.format, request.attempt
+        return len(self._parts.inputs.prompt_for(scene, format, attempt, request.controls.camera).ids)
+
     def paint(self, codes: Sequence[int]) -> Frame:
         """An imagined picture; see `Engine.paint`."""
         return painted(self._parts.visual_codes, codes)

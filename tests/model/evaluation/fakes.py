@@ -81,6 +81,9 @@ class FakeEngine:
     def cancel(self, request_id: str) -> None:
         return None
 
+    def prompt_tokens(self, request: PlanRequest) -> int:
+        raise RequestError("a fake reads nothing")
+
     def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
         raise RequestError("a fake paints nothing")
 

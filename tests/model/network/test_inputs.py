@@ -50,7 +50,6 @@ def test_prompts_share_their_beginning(vocabulary: Vocabulary) -> None:
     assert vocabulary.decode(without.ids).endswith("<|im_end|>\n<|im_start|>assistant\n")
     assert builder.build(scenes[1], "traj_only").prompt.ids.shape != without.ids.shape
     assert builder.longest_prompt("cf_vla") == len(with_route.ids)
-    assert builder.longest_prompt("cf_vla", ()) == len(without.ids)
 
 
 def test_without_route(vocabulary: Vocabulary) -> None:
