@@ -12,7 +12,6 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from service.errors import problem_response
 from service.keys import Keys
 from service.metrics import Metrics
-from service.openai_errors import PATHS
 from service.problems import MISDIRECTED, UNAUTHORIZED, ProblemError
 
 OPEN_PATHS: Final = frozenset({"/healthz", "/readyz"})
@@ -65,8 +64,7 @@ class Guard:
 
     async def _refuse(self, problem: ProblemError, scope: Scope, receive: Receive, send: Send) -> None:
         self._metrics.problem_told(problem.kind)
-        dialect = scope["path"].startswith(PATHS)
-        answer = problem_response(problem, scope["state"]["request_id"], dialect=dialect)
+        answer = problem_response(problem, scope["state"]["request_id"], scope["path"])
         await answer(scope, receive, send)
 
 

@@ -82,8 +82,7 @@ def install_error_handlers(app: FastAPI, metrics: Metrics) -> None:
 
     def answer(request: Request, problem: ProblemError, headers: dict[str, str] | None = None) -> Response:
         metrics.problem_told(problem.kind)
-        dialect = request.url.path.startswith(openai_errors.PATHS)
-        return problem_response(problem, request.state.request_id, headers, dialect=dialect)
+        return problem_response(problem, request.state.request_id, request.url.path, headers)
 
     @app.exception_handler(ProblemError)
     async def _problem(request: Request, error: ProblemError) -> Response:
@@ -107,11 +106,10 @@ def install_error_handlers(app: FastAPI, metrics: Metrics) -> None:
 def problem_response(
     error: ProblemError,
     request_id: str,
+    path: str,
     headers: Mapping[str, str] | None = None,
-    *,
-    dialect: bool = False,
 ) -> Response:
-    """The answer to a request that ended with ``error``; as OpenAI's clients read it too with ``dialect``."""
+    """The answer to a request to ``path`` that ended with ``error``; OpenAI's clients may read it there."""
     kind = error.kind
     extra = dict(headers or {})
     if error.retry_after_s is not None:
@@ -120,7 +118,7 @@ def problem_response(
         extra["Connection"] = "close"
     # Plain ASCII: details quote what callers sent, which need not be encodable otherwise.
     document = problem_document(error, request_id).model_dump(exclude_defaults=True)
-    if dialect:
+    if openai_errors.in_dialect(path):
         document["status"] = openai_errors.dialect_status(kind.status)
         document["error"] = openai_errors.dialect_error(error)
     response = Response(json.dumps(document), document["status"], extra, media_type=PROBLEM_MEDIA_TYPE)

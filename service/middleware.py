@@ -73,14 +73,14 @@ class Around:
                 log.exception("request failed")
                 if status:  # too late for another answer; the server breaks the connection
                     raise
-                await problem_response(unforeseen(), request_id)(scope, receive, send_with_id)
+                await problem_response(unforeseen(), request_id, scope["path"])(scope, receive, send_with_id)
             except asyncio.CancelledError:
                 # The server's last word at the end of a drain; whoever waits is better asking elsewhere.
                 # At other times it is the caller who ends it, in this very process.
                 if status or not self._stopping():
                     raise
                 stopped = ProblemError(DRAINING, "the service stopped before this was answered; ask another")
-                await problem_response(stopped, request_id)(scope, receive, send_with_id)
+                await problem_response(stopped, request_id, scope["path"])(scope, receive, send_with_id)
             finally:
                 route = getattr(scope.get("route"), "path", None)
                 span.answered(route, status)

@@ -7,8 +7,13 @@ from typing import Final
 
 from service.problems import ProblemError
 
-PATHS: Final = ("/v1/chat/", "/v1/models/")
-"""Where OpenAI's dialect is spoken."""
+_LIST: Final = "/v1/models"
+_BELOW: Final = ("/v1/chat/", f"{_LIST}/")
+
+
+def in_dialect(path: str) -> bool:
+    """Whether OpenAI's dialect is spoken at ``path``."""
+    return path == _LIST or path.startswith(_BELOW)
 
 
 def dialect_status(status: int) -> int:

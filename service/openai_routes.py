@@ -65,7 +65,7 @@ def openai_router(parts: Parts) -> APIRouter:
         """Planning in OpenAI's dialect: pictures as image parts, a message per draw; see docs/http.md."""
         arrival = arrival_of(request)
         card = parts.lifecycle.card
-        completion = Completion(arrival.request_id, card.name, chat)
+        completion, places = Completion(arrival.request_id, card.name, chat), ChatPlaces(chat)
         try:
             asked = validated(wire.PlanRequest, plan_document(chat, card))
             events = parts.planning.events(asked, arrival)
@@ -75,11 +75,11 @@ def openai_router(parts: Parts) -> APIRouter:
                 request,
                 events,
                 PlanTeller(format_of(asked, card)),
-                lambda told: _chunks(told, completion),
+                lambda told: _chunks(told, completion, places),
                 parts.metrics,
             )
         except ProblemError as problem:
-            raise ChatPlaces(chat).problem(problem) from problem
+            raise places.problem(problem) from problem
 
     @router.get(
         "/v1/models/{name}",
@@ -96,7 +96,7 @@ def openai_router(parts: Parts) -> APIRouter:
 
 
 async def _chunks(
-    told: AsyncGenerator[tuple[str, Written] | Planned], completion: Completion
+    told: AsyncGenerator[tuple[str, Written] | Planned], completion: Completion, places: ChatPlaces
 ) -> AsyncGenerator[bytes]:
     async with aclosing(told):
         try:
@@ -107,7 +107,7 @@ async def _chunks(
                 elif (text := _text(*event)) is not None:
                     yield _data(completion.delta(event[1].index, text))
         except ProblemError as error:
-            yield _data({"error": dialect_error(error)})
+            yield _data({"error": dialect_error(places.problem(error))})
     yield b"data: [DONE]\n\n"
 
 

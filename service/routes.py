@@ -130,7 +130,7 @@ def _add_labelling(router: APIRouter, parts: Parts) -> None:
 
 
 def _add_models(router: APIRouter, parts: Parts) -> None:
-    @router.get("/v1/models", tags=["planning"], responses=problems(UNAUTHORIZED, *NOT_NOW))
+    @router.get("/v1/models", tags=["planning"], responses=problems(UNAUTHORIZED, *NOT_NOW, dialect=True))
     async def models() -> wire.ModelList:
         """The models that answer here."""
         parts.lifecycle.check_ready()

@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import openai
@@ -18,6 +19,8 @@ from model.bundled import CHECKPOINT
 from model.driving.scene import Scene
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.network.checkpoint import read_parts
+from service.keys import new_line
+from service.problems import INVALID_IMAGE, at
 from service.settings import Settings
 from tests.checkpoints import made_up_tracks, noisy_scene
 from tests.service.scenes import scene
@@ -139,6 +142,54 @@ def test_the_prompt_is_counted_as_it_was_given(client: openai.OpenAI) -> None:
     assert with_route.usage.prompt_tokens - without.usage.prompt_tokens == 5
 
 
+def test_a_stream_says_what_became_of_the_deadline(client: openai.OpenAI) -> None:
+    with client.chat.completions.create(
+        model="scripted", messages=messages(), stream=True, extra_body=extra(deadline_ms=60_000)
+    ) as stream:
+        *_, last = stream
+    assert last.model_extra is not None
+    assert last.model_extra["looktwice"]["deadline"] == {"met": True, "cut": []}
+
+
+def test_an_error_within_a_stream_points_at_the_chat(client: openai.OpenAI, engine: ScriptedEngine) -> None:
+    engine.failure_later = at(INVALID_IMAGE, "/scene/clips/1/images/2", "/scene/clips/1/images/2 is damaged")
+    stream = client.chat.completions.create(model="scripted", messages=messages(), stream=True)
+    with stream, pytest.raises(openai.APIError) as error:
+        list(stream)
+    assert (error.value.code, error.value.type) == ("invalid-image", "invalid_request_error")
+    assert error.value.param == "messages[1].content[7].image_url.url"
+    assert "/scene" not in error.value.message
+
+
+@pytest.mark.parametrize("path", ["/models", "/models/scripted", "/chat/completions"])
+def test_openais_clients_understand_that_they_are_not_let_in(
+    tmp_path: Path, engine: ScriptedEngine, path: str
+) -> None:
+    _, line = new_line("car")
+    (tmp_path / "keys").write_text(line)
+    with (
+        serve(engine, Settings(api_keys_file=tmp_path / "keys"), wait=False) as served,
+        openai.OpenAI(base_url=f"{served.url}/v1", api_key="wrong", max_retries=0) as client,
+        pytest.raises(openai.AuthenticationError) as error,
+    ):
+        client.get(path, cast_to=object)
+    assert (error.value.code, error.value.type) == ("unauthorized", "authentication_error")
+
+
+def test_openais_clients_understand_that_it_is_not_ready() -> None:
+    engine = ScriptedEngine()
+    engine.may_start.clear()
+    with (
+        serve(engine, Settings(), wait=False) as served,
+        openai.OpenAI(base_url=f"{served.url}/v1", api_key="none", max_retries=0) as client,
+    ):
+        for path in ("/models", "/models/scripted"):
+            with pytest.raises(openai.InternalServerError) as error:
+                client.get(path, cast_to=object)
+            assert (error.value.code, error.value.type) == ("not-ready", "server_error")
+        served.in_loop(engine.may_start.set)
+
+
 def test_the_prompt_is_counted_in_each_format_as_the_network_reads_it() -> None:
     inputs = read_parts(CHECKPOINT).inputs
     with_all = replace(noisy_scene(3, route=True), tracks=made_up_tracks(3))
@@ -248,5 +299,7 @@ def test_what_says_nothing_is_let_pass(served: Served) -> None:
         "a field of tomorrow": 7,
     }
     document = {"model": "scripted", "messages": messages(), "user": "car-7", "max_tokens": 5} | said
-    answer = served.http.post("/v1/chat/completions", json=document)
-    assert len(answer.json()["choices"]) == 1
+    nulls = dict.fromkeys(("stop", "tools", "tool_choice", "response_format", "top_k", "logit_bias"))
+    for each in (document, document | nulls):
+        answer = served.http.post("/v1/chat/completions", json=each)
+        assert len(answer.json()["choices"]) == 1
