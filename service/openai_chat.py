@@ -23,7 +23,7 @@ from service.problems import INVALID_CLIP, INVALID_IMAGE, INVALID_REQUEST, UNKNO
 
 THINKING: Final = f"{wire_branch(looked_twice=True)} "
 _EVERY: Final = 5
-"""Poses of a trajectory between those that are told in a message: every half second."""
+"""Of the poses at 10 Hz, a message tells one in so many: every half second."""
 _DATA: Final = "data:"
 _STANDING: Final = [[0.0, 0.0, 0.0, 0.0]] * 16
 
@@ -233,7 +233,7 @@ class Completion:
 
     def __init__(self, completion_id: str, model: str, chat: ChatRequest) -> None:
         self._chat = chat
-        self._begun: set[int] = set()
+        self._told: dict[int, str] = {}
         self._head = {
             "id": f"chatcmpl-{completion_id}",
             "created": int(time.time()),
@@ -256,12 +256,13 @@ class Completion:
         told = {"choices": choices, "usage": self._usage(planned), "looktwice": _outcome(answer)}
         return self._head | {"object": "chat.completion"} | told
 
-    def delta(self, index: int, text: str) -> dict[str, Any]:
-        """More of one choice."""
+    def delta(self, index: int, text: str, *, own_line: bool = False) -> dict[str, Any]:
+        """More of one choice, on a line of its own where that is wanted; all of it makes `text_of`."""
         # Clients join deltas field by field, so the role is told once.
-        role = {} if index in self._begun else {"role": "assistant"}
-        self._begun.add(index)
-        return self._chunk([{"index": index, "delta": role | {"content": text}}])
+        role = {} if index in self._told else {"role": "assistant"}
+        content = _behind(self._told.get(index, ""), text) if own_line else text
+        self._told[index] = content
+        return self._chunk([{"index": index, "delta": role | {"content": content}}])
 
     def last(self, planned: Planned) -> list[dict[str, Any]]:
         """What ends a stream."""
@@ -296,14 +297,21 @@ def _outcome(answer: wire.PlanResponse) -> dict[str, Any]:
 
 def text_of(draw: wire.Draw) -> str:
     """A draw as a message."""
-    parts = [] if draw.plan is None else [draw.plan.text]
-    if draw.thinking is not None and draw.revised_plan is not None:
-        parts += [THINKING, draw.thinking, "\n", draw.revised_plan.text]
-    return "".join([*parts, trajectory_text(draw.trajectory)])
+    told = "" if draw.plan is None else draw.plan.text
+    if draw.thinking is not None:
+        told += (THINKING if draw.branch == wire_branch(looked_twice=True) else "") + draw.thinking
+    if draw.revised_plan is not None:
+        told += _behind(told, draw.revised_plan.text)
+    return told + _behind(told, trajectory_text(draw.trajectory, draw.times_s))
 
 
-def trajectory_text(trajectory: list[list[float]]) -> str:
-    """A trajectory as a line of text: x and y in m, heading in rad, every half second."""
-    told = trajectory[_EVERY - 1 :: _EVERY]
+def _behind(told: str, text: str) -> str:
+    """``text`` on a line of its own behind what was told."""
+    return text if not told or told.endswith("\n") else f"\n{text}"
+
+
+def trajectory_text(trajectory: list[list[float]], times_s: list[float] | None) -> str:
+    """A trajectory as a line of text: x and y in m, heading in rad, every half second or at its own times."""
+    told = trajectory[_EVERY - 1 :: _EVERY] if times_s is None else trajectory
     rows = [[round(x, 2), round(y, 2), round(heading, 3)] for x, y, _, heading in told]
     return f"Trajectory: {json.dumps(rows)}\n"

@@ -105,7 +105,8 @@ async def _chunks(
                     for chunk in completion.last(event):
                         yield _data(chunk)
                 elif (text := _text(*event)) is not None:
-                    yield _data(completion.delta(event[1].index, text))
+                    own_line = isinstance(event[1], wire.PlanWritten | wire.TrajectoryWritten)
+                    yield _data(completion.delta(event[1].index, text, own_line=own_line))
         except ProblemError as error:
             yield _data({"error": dialect_error(places.problem(error))})
     yield b"data: [DONE]\n\n"
@@ -115,13 +116,13 @@ def _text(name: str, data: Written) -> str | None:
     """What an event adds to a message; see `text_of`."""
     match data:
         case wire.PlanWritten():
-            return f"\n{data.plan.text}" if name == "revised_plan" else data.plan.text
+            return data.plan.text
         case wire.BranchTaken() if data.branch == wire_branch(looked_twice=True):
             return THINKING
         case wire.ThinkingWritten():
             return data.text
         case wire.TrajectoryWritten() if name == "trajectory":
-            return trajectory_text(data.trajectory)
+            return trajectory_text(data.trajectory, data.times_s)
     return None
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -314,6 +316,31 @@ def test_it_plans_over_http_and_is_evaluated(checkpoint: Path) -> None:
     expert = labelled.future[[4, 9, 14, 19, 24, 29, 34, 39], :2]
     apart = np.linalg.norm([draw.trajectory[:, :2] - expert for draw in draws], axis=-1)
     assert evaluate_draws(labelled, draws).avg_ade_m == pytest.approx(apart.mean(), rel=1e-4)
+
+
+def test_a_chat_tells_its_thoughts_streamed_or_not(checkpoint: Path) -> None:
+    """There is no revised plan behind them, and no branch before them."""
+    scene = labelled_scene(12.0, pictures=1).scene
+    images = [image for clip in scene.clips for image in clip.images]
+    urls = ["data:image/jpeg;base64," + base64.b64encode(image).decode() for image in images]
+    parts = [{"type": "image_url", "image_url": {"url": url}} for url in urls]
+    extras = {"history": scene.history.tolist(), "format": "elf_vla"}
+    asked = {"messages": [{"role": "user", "content": parts}], "n": 2, "looktwice": extras}
+    engine = TorchEngine(checkpoint, TorchSettings(rows=4, products=None))
+    with serve(engine, Settings()) as served:
+        whole = served.http.post("/v1/chat/completions", json=asked).json()["choices"]
+        lines = served.http.post("/v1/chat/completions", json=asked | {"stream": True}).text.splitlines()
+    told = {0: "", 1: ""}
+    for line in lines:
+        if line.startswith("data: {"):
+            for choice in json.loads(line.removeprefix("data: "))["choices"]:
+                told[choice["index"]] += choice["delta"].get("content", "")
+    for choice in whole:
+        content = choice["message"]["content"]
+        assert told[choice["index"]] == content
+        thoughts, _, poses = content.rpartition("\nTrajectory: ")
+        assert thoughts.strip() == choice["message"]["looktwice"]["thinking"].strip() != ""
+        assert len(json.loads(poses)) == len(TIMES_S)
 
 
 def test_tables_leave_out_what_needs_an_attempt() -> None:
