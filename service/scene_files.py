@@ -24,7 +24,7 @@ MAX_SECONDS: Final = 20
 MAX_ANSWER_BYTES: Final = 64_000_000
 _PARQUET: Final = b"PAR1"
 """How a whole file begins, and how it ends."""
-_REFUSED: Final = 3
+REFUSED: Final = 3
 """Exit status of a file that is told what is wrong with it."""
 
 
@@ -62,7 +62,7 @@ async def read_scene_file(content: bytes) -> bytes:
             await reader.wait()
     if reader.returncode == 0:
         return told
-    if reader.returncode == _REFUSED:
+    if reader.returncode == REFUSED:
         raise _refusal(complaint.decode(errors="replace"))
     raise _refusal("the file takes too much memory or time to read")
 
@@ -79,9 +79,9 @@ def main(path: Path) -> int:
         told = wire.SceneFile(scenes=scenes_of_file(path)).model_dump_json().encode()
     except ProblemError as error:
         sys.stderr.write(error.detail)
-        return _REFUSED
+        return REFUSED
     if len(told) > MAX_ANSWER_BYTES:
         sys.stderr.write(f"the file's scenes are {len(told)} bytes to tell; at most {MAX_ANSWER_BYTES} are")
-        return _REFUSED
+        return REFUSED
     sys.stdout.buffer.write(told)
     return 0

@@ -26,6 +26,7 @@ from loadtests.bodies import make_call
 from loadtests.costly import costly_calls
 from loadtests.mix import Kind
 from model.bundled import CHECKPOINT
+from model.engines.engine import EngineError
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from service.app import create_app
 from service.keys import new_line
@@ -356,6 +357,32 @@ def test_a_checkpoint_that_cannot_be_served_changes_nothing(engine: ScriptedEngi
         problem(served.http.post("/v1/models:load", json={"checkpoint": "none"}), "unknown-checkpoint")
         for strange in ("../bad", "", "/etc", ".hidden"):
             problem(served.http.post("/v1/models:load", json={"checkpoint": strange}), "invalid-request")
+        assert served.http.post("/v1/plan", json=body()).json()["model"]["revision"] == "r1"
+
+
+def test_a_checkpoint_that_fails_when_it_starts_leaves_no_thread(
+    engine: ScriptedEngine, tmp_path: Path, untrained_checkpoint: Path
+) -> None:
+    (tmp_path / "bad").mkdir()
+    before: set[threading.Thread] = set()
+    running: set[threading.Thread] = set()
+
+    class Failing(TorchEngine):
+        async def start(self) -> None:
+            await super().start()
+            begun = set(threading.enumerate()) - before
+            running.update(thread for thread in begun if thread.name.startswith("looktwice-"))
+            raise EngineError("no memory left")
+
+    def load(path: Path) -> TorchEngine:
+        before.update(threading.enumerate())
+        return Failing(untrained_checkpoint)
+
+    with serve(engine, Settings(checkpoints=tmp_path), load=load) as served:
+        refused = served.http.post("/v1/models:load", json={"checkpoint": "bad"}, timeout=60)
+        assert "no memory left" in problem(refused, "checkpoint-failed").detail
+        assert "looktwice-engine" in {thread.name for thread in running}
+        served.until(lambda: not any(thread.is_alive() for thread in running))
         assert served.http.post("/v1/plan", json=body()).json()["model"]["revision"] == "r1"
 
 

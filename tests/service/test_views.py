@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import re
 import resource
 from dataclasses import replace
 from pathlib import Path
@@ -174,11 +175,14 @@ def test_a_small_file_that_holds_gigabytes_is_refused(served: Served, scene_file
 
 
 def test_a_file_with_much_to_tell_is_refused(
-    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(scene_files, "MAX_ANSWER_BYTES", 1000)
     monkeypatch.setattr(resource, "setrlimit", lambda *_: None)
-    assert scene_files.main(scene_file) != 0
+    assert scene_files.main(scene_file) == scene_files.REFUSED
+    told = capsys.readouterr()
+    assert re.fullmatch(r"the file's scenes are \d+ bytes to tell; at most 1000 are", told.err)
+    assert told.out == ""
 
 
 def test_a_file_that_takes_too_long_is_ended(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
