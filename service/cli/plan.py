@@ -16,7 +16,8 @@ from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, 
 if TYPE_CHECKING:
     import clients.wire as wire
     from model.driving.scene import LabelledScene
-    from model.engines.engine import Draw, ModelCard, PlanRequest
+    from model.engines.engine import Draw, PlanRequest
+    from model.network.model_card import ModelCard
 
 _BESIDE_REQUESTS: Final = ("scenes", "checkpoint", "limit", "skip", "out", "as_json")
 """What a request does not say itself."""

@@ -138,6 +138,11 @@ class TransformersEngine:
             if writing is not None:
                 writing.cancel()
 
+    def prompt_tokens(self, request: PlanRequest) -> int:
+        """See `Engine.prompt_tokens`."""
+        scene, format, attempt = request.scene, request.format, request.attempt
+        return len(self._loaded.inputs.prompt_for(scene, format, attempt, request.controls.camera).ids)
+
     def paint(self, codes: Sequence[int]) -> Frame:
         """An imagined picture; see `Engine.paint`."""
         return painted(self._loaded.visual_codes, codes)

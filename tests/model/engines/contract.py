@@ -78,6 +78,14 @@ async def the_branch_is_the_callers(engine: Engine, scene: Scene) -> None:
         assert draw.looked_twice == looked
 
 
+async def the_prompt_is_counted(engine: Engine, scene: Scene) -> None:
+    request = asked("counted", scene, n=1)
+    assert 0 < engine.prompt_tokens(replace(request, scene=replace(scene, route=None)))
+    assert engine.prompt_tokens(replace(request, scene=replace(scene, route=None))) <= engine.prompt_tokens(
+        request
+    )
+
+
 async def a_given_plan_is_kept(engine: Engine, scene: Scene) -> None:
     [draw] = await plan(engine, asked("given", scene, n=1, prefill=GIVEN, thinking="never"))
     assert draw.plan == GIVEN
@@ -160,6 +168,7 @@ CONTRACT: Final[tuple[Check, ...]] = (
     who_leaves_early_frees_the_engine,
     cancelling_tells_who_waits,
     bad_requests_fail_alone,
+    the_prompt_is_counted,
     who_stops_is_told_and_may_start_again,
 )
 """All of it; the last one starts the engine anew."""
