@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 from typing import Final, TypeVar
 
-from model.driving.images import check_image, decoding_while
+from model.driving.images import ImageError, check_image, decoding_while
 from model.engines.engine import EngineError
 
 _Result = TypeVar("_Result")
@@ -42,7 +42,7 @@ class PictureThreads:
 
         Raises:
             ImageError: one of the pictures is none.
-            EngineError: it was dropped by `close`.
+            EngineError: it was dropped, or ended, by `close`.
         """
         if await self._run(lambda: _pixels(pictures) > LARGE_PIXELS, large=False):
             return await self._run(work, large=True)
@@ -73,6 +73,11 @@ class PictureThreads:
         except asyncio.CancelledError:
             left.set()
             if future.cancelled() and self._pools.get(large) is not pool:
+                raise EngineError("the engine was stopped") from None
+            raise
+        except ImageError:
+            # Nobody but `close` ends what is still waited for.
+            if left.is_set():
                 raise EngineError("the engine was stopped") from None
             raise
 

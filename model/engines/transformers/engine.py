@@ -106,7 +106,7 @@ class TransformersEngine:
 
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """Queue a request and iterate over its events; see `Engine.submit`."""
-        if self._thread is None:
+        if (thread := self._thread) is None:
             raise EngineError("the engine is not running")
         if request.request_id in self._running:
             raise RequestError(f"request id {request.request_id} is in use")
@@ -124,7 +124,9 @@ class TransformersEngine:
                 loop.call_soon_threadsafe(events.put_nowait, event)
                 return self._running.get(request.request_id) is running
 
-            writing = self._thread.submit(self._write, request, start, inputs, tell)
+            # Who was cancelled meanwhile has been told so.
+            if self._running.get(request.request_id) is running:
+                writing = thread.submit(self._write, request, start, inputs, tell)
             remaining = request.controls.n
             while remaining:
                 event = await events.get()
