@@ -36,6 +36,8 @@ from model.training.vision_cache import VisionCache
 
 Batch = dict[str, Tensor]
 
+_PLAIN_AN_ATTEMPT: Final = 4
+"""So many plain examples take as long, and as much memory, as one with a draft and five sections on it."""
 _CHANCES: Final = ("tracks", "mirror", "blur")
 _ASKED_SHARE: Final = 0.5
 """Of the pictures that are taught: the prompt asks for their camera. Others are of the model's own choice."""
@@ -280,7 +282,8 @@ class TaskSampler(BatchSampler):
 
     Reflections are examples of their own beside all others: the natural mixture of CF-VLA section 6. Those
     on one scene share its prompt, and scenes with about as many share a batch. So are attempts, each with a
-    prompt of its own; their feedback tells of this scene, so they are neither mirrored nor blurred.
+    long prompt of its own: a batch holds fewer of them. Feedback speaks of left and right and of the speeds
+    that were, so they are neither mirrored nor blurred.
 
     Args:
         has_route: bool [m], which examples have one; so many there are.
@@ -330,6 +333,7 @@ class TaskSampler(BatchSampler):
         if len(attempted) and attempting is None:
             raise ValueError("attempts need a format that refines them")
         self._attempted, self._attempting = attempted, attempting or ""
+        self._attempts_a_batch = max(1, batch_size // _PLAIN_AN_ATTEMPT)
         self._pictured = np.ones(len(has_route), np.bool_) if pictured is None else pictured
         self._next_cameras, self._picture_share = next_cameras, picture_share
         self._mirror_reflected = mirror_reflected
@@ -357,16 +361,17 @@ class TaskSampler(BatchSampler):
 
     def __len__(self) -> int:
         plain = len(self._has_route) + len(self._again)
-        own = (plain, len(self._attempted))
         return (
-            sum(count // self._batch_size for count in own) + len(self._reflections) // self._scenes_a_batch
+            plain // self._batch_size
+            + len(self._reflections) // self._scenes_a_batch
+            + len(self._attempted) // self._attempts_a_batch
         )
 
     def __iter__(self) -> Iterator[list[Item]]:  # type: ignore[override]  # items instead of positions
         random = np.random.default_rng((self._seed, self._epoch))
         plain, plain_rest = self._rounds(self._plain(random), self._batch_size)
         reflected, reflected_rest = self._rounds(self._reflected(random), self._scenes_a_batch)
-        tried, tried_rest = self._rounds(self._tries(random), self._batch_size)
+        tried, tried_rest = self._rounds(self._tries(random), self._attempts_a_batch)
         rounds = plain + reflected + tried
         for place in random.permutation(len(rounds)):
             yield from rounds[place]

@@ -127,7 +127,7 @@ def test_every_attempt_is_learned_once_an_epoch_beside_all_examples() -> None:
     def items(attempted: list[int]) -> list[Item]:
         sampler = TaskSampler(
             np.ones(6, np.bool_),
-            2,
+            6,
             {"elf_vla": 1.0},
             0.5,
             0,
@@ -142,6 +142,7 @@ def test_every_attempt_is_learned_once_an_epoch_beside_all_examples() -> None:
 
     found = items([3, 3, 0, 5])
     tried = [item for item in found if item.attempt is not None]
+    # Others come six at a time, and these alone.
     assert sorted((item.attempt, item.index) for item in tried) == [(0, 3), (1, 3), (2, 0), (3, 5)]
     assert {(item.task, item.mirror, item.blur) for item in tried} == {("elf_vla_refine", False, False)}
     # The others are learned as they are without attempts.
