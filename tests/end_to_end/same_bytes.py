@@ -31,6 +31,12 @@ def draws_of(answer: dict[str, Any]) -> list[str]:
     return [json.dumps(draw, sort_keys=True) for draw in answer["draws"]]
 
 
+def told_last(stream: httpx.Response) -> dict[str, Any]:
+    """The data of the event that ends a stream."""
+    told: dict[str, Any] = json.loads(stream.text.strip().split("\n\n")[-1].split("data: ", 1)[1])
+    return told
+
+
 def compare(http: httpx.Client, scene: Scene) -> Counter[str]:
     """How many draws of a scene differ from the fresh ones, by how they were asked for."""
 
@@ -40,13 +46,11 @@ def compare(http: httpx.Client, scene: Scene) -> Counter[str]:
         return answer
 
     fresh = draws_of(ask().json())
-    told = ask(stream=True).text.strip().split("\n\n")[-1]
-    streamed = json.loads(told.split("data: ", 1)[1])
     batch = {"requests": [body(scene, n=FEW, seed=9), body(scene, n=DRAWS, seed=1)]}
     batched = http.post("/v1/plan/batch", json=batch).json()["results"][1]["response"]
     found = {
         "repeated": draws_of(ask().json()),
-        "streamed": draws_of(streamed),
+        "streamed": draws_of(told_last(ask(stream=True))),
         "batched": draws_of(batched),
         f"n = {FEW} of {DRAWS}": draws_of(ask(n=FEW).json()),
     }
