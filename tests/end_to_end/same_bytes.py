@@ -37,16 +37,21 @@ def told_last(stream: httpx.Response) -> dict[str, Any]:
     return told
 
 
+def asked(scene: Scene, n: int) -> dict[str, Any]:
+    """A request whose answer tells all that is worked out, log-probabilities too."""
+    return body(scene, n=n, seed=1, logprobs=True)
+
+
 def compare(http: httpx.Client, scene: Scene) -> Counter[str]:
     """How many draws of a scene differ from the fresh ones, by how they were asked for."""
 
     def ask(n: int = DRAWS, **more: Any) -> httpx.Response:
-        answer = http.post("/v1/plan", json=body(scene, n=n, seed=1) | more)
+        answer = http.post("/v1/plan", json=asked(scene, n) | more)
         assert answer.status_code == 200, answer.text
         return answer
 
     fresh = draws_of(ask().json())
-    batch = {"requests": [body(scene, n=FEW, seed=9), body(scene, n=DRAWS, seed=1)]}
+    batch = {"requests": [body(scene, n=FEW, seed=9), asked(scene, DRAWS)]}
     batched = http.post("/v1/plan/batch", json=batch).json()["results"][1]["response"]
     found = {
         "repeated": draws_of(ask().json()),

@@ -22,7 +22,7 @@ def test_the_same_request_gives_the_same_bytes() -> None:
 def test_so_do_reflections_and_chats() -> None:
     scene = next(read_scenes(SCENES, dense=False)).scene
     plan = body(scene, n=3)
-    reflect = plan | {"plan": str(KEEP_ON)}
+    reflect = body(scene, n=3, logprobs=True) | {"plan": str(KEEP_ON)}
     images = [image for clip in scene.clips for image in clip.images]
     urls = ["data:image/jpeg;base64," + base64.b64encode(image).decode() for image in images]
     content = [{"type": "image_url", "image_url": {"url": url}} for url in urls]

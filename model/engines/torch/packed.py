@@ -7,7 +7,7 @@ arithmetic when a step feeds a handful of tokens, and more in padding when it fe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -40,14 +40,26 @@ class Rotation(NamedTuple):
         return turned.addcmul_(x, self.cosines)
 
 
+_ALIKE: Final = 16
+"""Rows of a call where none may depend on how many there are: a tile of the matrix units."""
+_ONE_SUM: Final = 256
+"""So many numbers oneDNN adds up in one order, whatever stands beside them; longer sums by how many rows
+there are (sums of 768, on AMX)."""
+
+
 class _Product:
     """``x @ weight.T + bias``, the weight laid out once as products read it, and not in every call.
 
     In bfloat16 on most CPUs that is as their matrix units do (oneDNN's own layout, as `torch.compile` does
     when it freezes weights); else turned over, which takes half of the time where tokens are few.
+
+    Args:
+        weight: [n, m].
+        bias: [n].
+        repeatable: each row's numbers are the same to the last bit, however many rows there are.
     """
 
-    def __init__(self, weight: Tensor, bias: Tensor | None = None) -> None:
+    def __init__(self, weight: Tensor, bias: Tensor | None = None, *, repeatable: bool = False) -> None:
         self.width = weight.shape[1]
         self._bias = bias
         self._by_onednn = (
@@ -56,14 +68,19 @@ class _Product:
         self._weight = (
             torch.ops.mkldnn._reorder_linear_weight(weight) if self._by_onednn else weight.t().contiguous()
         )
+        self._in_parts = repeatable and self._by_onednn and self.width > _ONE_SUM
 
     def __call__(self, x: Tensor) -> Tensor:
+        if self._in_parts:
+            padded = functional.pad(x, (0, 0, 0, -len(x) % _ALIKE))
+            return torch.cat([self._onednn(part) for part in padded.split(_ALIKE)])[: len(x)]
         if self._by_onednn:
-            made: Tensor = torch.ops.mkldnn._linear_pointwise.default(
-                x, self._weight, self._bias, "none", [], ""
-            )
-            return made
+            return self._onednn(x)
         return torch.mm(x, self._weight) if self._bias is None else torch.addmm(self._bias, x, self._weight)
+
+    def _onednn(self, x: Tensor) -> Tensor:
+        made: Tensor = torch.ops.mkldnn._linear_pointwise.default(x, self._weight, self._bias, "none", [], "")
+        return made
 
 
 class _Layer(NamedTuple):
@@ -80,9 +97,12 @@ class PackedDecoder:
         text_model: `Qwen2_5_VLTextModel` with full attention in all layers.
         products: what matrix products and all between them are worked out in, where it is not the weights'
             type; sums over layers, and norms, stay in that.
+        repeatable: a token's numbers do not depend on how many there are in a pass.
     """
 
-    def __init__(self, text_model: Any, products: torch.dtype | None = None) -> None:
+    def __init__(
+        self, text_model: Any, products: torch.dtype | None = None, *, repeatable: bool = False
+    ) -> None:
         config = text_model.config
         if set(config.layer_types) != {"full_attention"}:
             raise ValueError("the torch engine runs decoders with full attention in every layer only")
@@ -92,7 +112,9 @@ class PackedDecoder:
         self._final_norm = text_model.norm.weight.detach()
         self._epsilon = self._final_norm.new_tensor(config.rms_norm_eps)
         self._products = products or self._final_norm.dtype
-        self._layers = [_joined(layer, self._head_dim**-0.5, self._products) for layer in text_model.layers]
+        self._layers = [
+            _joined(layer, self._head_dim**-0.5, self._products, repeatable) for layer in text_model.layers
+        ]
 
     def warm_up(self, sizes: Sequence[int]) -> None:
         """Multiply matrices of passes of so many tokens once: libraries keep the kernels that they make."""
@@ -139,7 +161,12 @@ class PackedDecoder:
         return x * torch.addcmul(self._epsilon, length, length, value=1 / x.shape[-1]).rsqrt_()
 
 
-def _joined(layer: Any, query_scale: float, products: torch.dtype) -> _Layer:
+def _joined(layer: Any, query_scale: float, products: torch.dtype, repeatable: bool) -> _Layer:
+    def product(weight: Tensor, bias: Tensor | None = None) -> _Product:
+        return _Product(
+            weight.to(products), None if bias is None else bias.to(products), repeatable=repeatable
+        )
+
     attention, mlp = layer.self_attn, layer.mlp
     projections = (attention.q_proj, attention.k_proj, attention.v_proj)
     scales = (query_scale, 1.0, 1.0)
@@ -148,8 +175,8 @@ def _joined(layer: Any, query_scale: float, products: torch.dtype) -> _Layer:
     norm_in, norm_mlp = layer.input_layernorm.weight.detach(), layer.post_attention_layernorm.weight.detach()
     gate_up = torch.cat([mlp.gate_proj.weight.detach(), mlp.up_proj.weight.detach()])
     return _Layer(
-        qkv=_Product((torch.cat(weights) * norm_in).to(products), torch.cat(biases).to(products)),
-        out=_Product(attention.o_proj.weight.detach().to(products)),
-        gate_up=_Product((gate_up * norm_mlp).to(products)),
-        down=_Product(mlp.down_proj.weight.detach().to(products)),
+        qkv=product(torch.cat(weights) * norm_in, torch.cat(biases)),
+        out=product(attention.o_proj.weight.detach()),
+        gate_up=product(gate_up * norm_mlp),
+        down=product(mlp.down_proj.weight.detach()),
     )

@@ -153,7 +153,7 @@ class Runner:
         model: Any = loaded.model
         text = model.config.text_config
         self._products = products
-        self._decoder = PackedDecoder(model.model.language_model, products)
+        self._decoder = PackedDecoder(model.model.language_model, products, repeatable=reproducible)
         self._head = AllowedHead(model.lm_head.weight)
         self._reproducible = reproducible
         self._pass_size = repeatable_bucket if reproducible else bucket

@@ -21,11 +21,11 @@ from model.network.precision import bfloat16_is_fast, fast_dtype
 _SCENES = [labelled.scene for labelled in read_scenes(SCENES)][:6]
 _IDS = count()
 
-Bytes = tuple[str, float | None, bytes]
+Bytes = tuple[str, float | None, tuple[float | None, ...], bytes]
 
 
 def bytes_of(draw: Draw) -> Bytes:
-    return draw.text, draw.think_probability, draw.trajectory.tobytes()
+    return draw.text, draw.think_probability, draw.logprobs, draw.trajectory.tobytes()
 
 
 @pytest.fixture(scope="module", params=["as it is by default", "without products in bfloat16"])
@@ -40,7 +40,8 @@ def settings(request: pytest.FixtureRequest) -> Iterator[TorchSettings]:
 
 
 async def draws(engine: TorchEngine, number: int, n: int) -> list[Bytes]:
-    asked = PlanRequest(f"{next(_IDS)}", _SCENES[number], "cf_vla", controls=Controls(n=n, seed=number))
+    controls = Controls(n=n, seed=number, logprobs=True)
+    asked = PlanRequest(f"{next(_IDS)}", _SCENES[number], "cf_vla", controls)
     told = [event.draw async for event in engine.submit(asked) if isinstance(event, DrawFinished)]
     return [bytes_of(draw) for draw in sorted(told, key=lambda draw: draw.index)]
 
@@ -71,14 +72,24 @@ def test_a_draw_is_the_same_fresh_repeated_alone_and_in_a_crowd(settings: TorchS
     asyncio.run(asyncio.wait_for(test(), 300))
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("width", [256, 768])
 @pytest.mark.parametrize("products", sorted({torch.float32, fast_dtype()}, key=str), ids=str)
-def test_a_token_gets_the_same_in_a_pass_of_any_size(products: torch.dtype) -> None:
+def test_a_token_gets_the_same_in_a_pass_of_any_size(products: torch.dtype, width: int, threads: int) -> None:
+    """Wherever it stands; the widths are those of the bundled model's products."""
     generator = torch.Generator().manual_seed(1)
-    product = _Product(torch.randn(768, 384, generator=generator).to(products))
-    states = torch.randn(512, 384, generator=generator).to(products)
-    alone = product(states[: repeatable_bucket(1)])[0]
-    for size in sorted({repeatable_bucket(tokens) for tokens in range(1, 513)}):
-        assert torch.equal(product(states[:size])[0], alone), size
+    product = _Product(torch.randn(256, width, generator=generator).to(products), repeatable=True)
+    states = torch.randn(512, width, generator=generator).to(products)
+    least = repeatable_bucket(1)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        alone = torch.cat([product(states[place : place + least]) for place in range(0, 512, least)])
+        for size in sorted({repeatable_bucket(tokens) for tokens in range(1, 513)}):
+            assert torch.equal(product(states[:size]), alone[:size]), size
+            assert torch.equal(product(states[3 : 3 + size]), alone[3 : 3 + size]), size
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_only_on_a_cpu_is_that_so_by_default() -> None:
