@@ -73,7 +73,7 @@ class _Product:
     def __call__(self, x: Tensor) -> Tensor:
         if self._in_parts:
             padded = functional.pad(x, (0, 0, 0, -len(x) % _ALIKE))
-            return torch.cat([self._onednn(part) for part in padded.split(_ALIKE)])[: len(x)]
+            return torch.cat([self._onednn(part) for part in torch.split(padded, _ALIKE)])[: len(x)]
         if self._by_onednn:
             return self._onednn(x)
         return torch.mm(x, self._weight) if self._bias is None else torch.addmm(self._bias, x, self._weight)
