@@ -19,7 +19,7 @@ export function showDraw(draw) {
   if (draw.revised_plan) {
     parts.push(element("h3", { textContent: "Revised plan" }), tracks(draw.revised_plan, draw.plan));
   }
-  for (const section of draw.sections) {
+  for (const section of draw.sections ?? []) {
     const said = section.values.map((value) => typeof value === "string" ? value : JSON.stringify(value)).join(" ");
     parts.push(
       element("h3", { textContent: section.name.replaceAll("_", " ") }),

@@ -42,13 +42,19 @@ def url() -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def rolled(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A build whose scenes are rolled out and all kept."""
-    folder = tmp_path_factory.mktemp("build")
+def unlabelled(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A build whose scenes are rolled out and all kept; not to be changed."""
+    folder = tmp_path_factory.mktemp("build") / "unlabelled"
     done = told("rollout", folder, SCENES, "--service", url, "--n", 2, "--json")
     assert (done["done"], done["dead"]) == (COUNT, 0)
     assert told("filter", folder, "--everything", "--json")["kept"] == COUNT
     return folder
+
+
+@pytest.fixture(scope="module")
+def rolled(unlabelled: Path) -> Path:
+    """The same, for tests that go on where others ended."""
+    return Path(shutil.copytree(unlabelled, unlabelled.with_name("rolled")))
 
 
 def test_rolled_out_once_and_for_all(rolled: Path, url: str) -> None:
@@ -148,9 +154,9 @@ def stopped_by_a_full_disk(limit_bytes: int, *arguments: object) -> str:
     return last
 
 
-def test_a_full_disk_stops_labels_with_a_message_and_loses_none(rolled: Path, tmp_path: Path) -> None:
+def test_a_full_disk_stops_labels_with_a_message_and_loses_none(unlabelled: Path, tmp_path: Path) -> None:
     build = tmp_path / "build"
-    shutil.copytree(rolled, build)
+    shutil.copytree(unlabelled, build)
     # Full after a few labels.
     stopped_by_a_full_disk(40_000, "label", build, SCENES, "--seed", 7)
     done = told("label", build, SCENES, "--seed", 7, "--json")
@@ -167,9 +173,9 @@ def test_a_full_disk_stops_a_rollout_with_a_message_and_loses_nothing(url: str, 
     assert done["done"] > 0
 
 
-def test_a_full_disk_stops_a_filter_with_a_message(rolled: Path, tmp_path: Path) -> None:
+def test_a_full_disk_stops_a_filter_with_a_message(unlabelled: Path, tmp_path: Path) -> None:
     build = tmp_path / "build"
-    shutil.copytree(rolled, build)
+    shutil.copytree(unlabelled, build)
     stopped_by_a_full_disk(100, "filter", build)
     picture = build / "filter.png"
     picture.unlink()
@@ -181,12 +187,12 @@ def test_a_full_disk_stops_a_filter_with_a_message(rolled: Path, tmp_path: Path)
 
 @pytest.mark.parametrize("form", ["parquet", "messages", "openai-batch"])
 def test_a_full_disk_stops_an_export_with_a_message(
-    rolled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
+    unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
 ) -> None:
     for name, value in {"KIND": "openai", "MODEL": "batched"}.items():
         monkeypatch.setenv(f"LOOKTWICE_TEACHER_{name}", value)
     build, folder = tmp_path / "build", tmp_path / "made"
-    shutil.copytree(rolled, build)
+    shutil.copytree(unlabelled, build)
     with monkeypatch.context() as built_in:
         built_in.setenv("LOOKTWICE_TEACHER_KIND", "rules")
         assert told("label", build, SCENES, "--seed", 8, "--json")["done"] > 0
