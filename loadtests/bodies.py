@@ -15,7 +15,7 @@ from clients import wire
 from clients.planner import imagine_request, label_request, plan_request, reflect_request
 from clients.wire_imagine import ImagineControls
 from loadtests.call import Call
-from loadtests.mix import BATCH_SCENES, Kind, Mix, Payload, Work
+from loadtests.mix import BATCH_SCENES, Kind, Payload, Work
 from model.driving.images import media_type
 from model.driving.labeller import expert_plan
 from model.driving.plan import Plan, parse_plan
@@ -41,8 +41,8 @@ PROPOSED: Final[Plan] = parse_plan(
 """What reflections and labels are asked about: to go straight on."""
 
 
-def make_calls(scenes: Sequence[LabelledScene], mix: Mix, count: int, seed: int) -> list[Call]:
-    """So many calls of a mix, each with pictures that no other one has: no cache of the service helps.
+def make_calls(scenes: Sequence[LabelledScene], kinds: Sequence[Kind], seed: int) -> list[Call]:
+    """A call of each kind, with pictures that no other one has: no cache of the service helps.
 
     Raises:
         ValueError: there are no scenes.
@@ -58,7 +58,7 @@ def make_calls(scenes: Sequence[LabelledScene], mix: Mix, count: int, seed: int)
 
     return [
         make_call(kind, [unseen() for _ in range(BATCH_SCENES if kind.work == "batch" else 1)], place)
-        for place, kind in enumerate(mix.kinds(count, seed))
+        for place, kind in enumerate(kinds)
     ]
 
 

@@ -59,7 +59,7 @@ def measure(
     for payload in PAYLOADS:
         mix = parse_mix("plan", str(n), payload, "none", 0)
         spent: list[tuple[float, float, float]] = []
-        calls = make_calls(scenes, mix, requests + 3, seed)
+        calls = make_calls(scenes, mix.kinds(requests + 3, seed), seed)
         for call in calls:
             began_s = time.perf_counter()
             answer = http.post(call.path, content=call.body, headers=dict(call.headers))

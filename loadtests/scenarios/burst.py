@@ -18,7 +18,7 @@ def burst(setup: Setup, factor: float, burst_s: float) -> Result:
         Phase(BURST, burst_s, factor * setup.rate_rps),
         Phase(AFTER, setup.seconds, setup.rate_rps),
     ]
-    calls = tuple(make_calls(setup.scenes, setup.mix, needed(phases, setup), setup.seed))
+    calls = tuple(make_calls(setup.scenes, setup.mix.kinds(needed(phases, setup), setup.seed), setup.seed))
     ran = run(OpenLoop(poisson_arrivals(phases, setup.seed), calls), phases, setup)
     parts = {name: ran.summary(setup.goal_s, name) for name in (UNLOADED, BURST, AFTER)}
     overall = ran.summary(setup.goal_s, UNLOADED, AFTER)

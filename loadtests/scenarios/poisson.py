@@ -20,7 +20,7 @@ def poisson(setup: Setup) -> Result:
 def run_steady(setup: Setup) -> Ran:
     """Warm up and measure at one rate."""
     phases = steady_phases(setup)
-    calls = tuple(make_calls(setup.scenes, setup.mix, needed(phases, setup), setup.seed))
+    calls = tuple(make_calls(setup.scenes, setup.mix.kinds(needed(phases, setup), setup.seed), setup.seed))
     return run(OpenLoop(poisson_arrivals(phases, setup.seed), calls), phases, setup)
 
 

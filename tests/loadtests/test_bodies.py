@@ -56,7 +56,7 @@ def test_streams_are_asked_for_at_the_top() -> None:
 
 def test_no_two_calls_share_a_picture() -> None:
     mix = Mix(payloads={"msgpack": 1}, works={"plan": 3, "batch": 1})
-    calls, again = (make_calls(labelled_scenes()[:2], mix, 12, seed=7) for _ in range(2))
+    calls, again = (make_calls(labelled_scenes()[:2], mix.kinds(12, seed=7), seed=7) for _ in range(2))
     assert [call.body for call in calls] == [call.body for call in again]
     pictures = [
         picture
@@ -71,4 +71,4 @@ def test_no_two_calls_share_a_picture() -> None:
 
 def test_without_scenes_there_is_nothing_to_send() -> None:
     with pytest.raises(ValueError, match="scenes"):
-        make_calls([], Mix(), 3, 0)
+        make_calls([], Mix().kinds(3, 0), 0)

@@ -22,7 +22,7 @@ from tests.loadtests.scenes import labelled_scenes
 from tests.loadtests.stand_in import StandIn, standing_in
 from tests.waiting import until
 
-CALLS = tuple(make_calls(labelled_scenes(), Mix(draws={1: 1}), 10, seed=0))
+CALLS = tuple(make_calls(labelled_scenes(), Mix(draws={1: 1}).kinds(10, seed=0), seed=0))
 GOAL_S = 0.2
 
 

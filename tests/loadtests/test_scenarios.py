@@ -119,9 +119,18 @@ def test_failures_in_a_burst_are_not_how_a_service_refuses() -> None:
 def test_polite_clients_are_measured_while_others_are_hostile() -> None:
     service = StandIn(service_s=0.1)
     with standing_in(service) as url:
-        used = setup(url, ONE_DRAW, rate_rps=10, seconds=1.5)
+        used = setup(url, Mix(draws={1: 1, 2: 1}), rate_rps=10, seconds=1.5)
         result = hostile(used, Hostility(leaving=2, never_reading=2, slow_bodies=3))
     assert result.valid, result.faults
+    asked = [
+        [
+            (each.kind, round(each.due_s - part.window.start_s, 6))
+            for each in sorted(part.exchanges, key=lambda each: each.due_s)
+        ]
+        for part in result.phases.values()
+    ]
+    assert asked[0] == asked[1] == asked[2], "the same is asked before, meanwhile and after"
+    assert len({kind for kind, _ in asked[0]}) == 2
     ends = result.extra["hostile"]["clients"]
     assert ends["leaving"]["left"] > 5
     assert ends["never_reading"] == {"200": 2}
