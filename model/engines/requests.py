@@ -6,14 +6,24 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from model.driving.images import ImageError
 from model.driving.plan import Plan
+from model.driving.scene import Scene
 from model.driving.trajectory import GeometryError, check_trajectory
-from model.engines.engine import Draw, PlanRequest, RequestError
+from model.engines.engine import (
+    CodesWritten,
+    Draw,
+    Event,
+    PlanRequest,
+    RequestError,
+    SectionFinished,
+    TextWritten,
+)
 from model.engines.reason_mask import ReasonMask
-from model.engines.response import Response
-from model.families.family import Branch, Family
+from model.engines.response import Response, SectionText
+from model.families.family import Attempt, Branch, Family
 from model.formats.cursor import CompiledFormat, Cursor
-from model.formats.pieces import FormatError
+from model.formats.pieces import NOTHING, FormatError
 from model.formats.text import parse
 from model.network.codec import TrajectoryCodec
 from model.network.model_card import ModelCard
@@ -21,6 +31,7 @@ from model.network.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
     # Scheduling imports this module, and needs no torch.
+    from model.network.inputs import InputBuilder, ModelInputs
     from model.network.visual_codes import Frame, VisualCodes
 
 
@@ -87,6 +98,53 @@ def given_plans(request: PlanRequest, family: Family) -> dict[str, Plan]:
 def leads_to_reflection(branch: Branch, cursor: Cursor, token: int) -> bool:
     """At the branch: whether ``token`` leads to a second look."""
     return branch.reflecting in cursor.option_texts(token)
+
+
+def told(
+    request: PlanRequest,
+    family: Family,
+    response: Response,
+    finished: Sequence[SectionText],
+    draws: Iterable[int],
+    vocabulary: Vocabulary,
+) -> list[Event]:
+    """What draws have to tell when their response has grown: all of them have written it alike.
+
+    Args:
+        request, family: what is asked, and of whom.
+        response: as it is now.
+        finished: the sections that were finished since they told last.
+        draws: their indices.
+        vocabulary: of the checkpoint.
+    """
+    said, indices = NOTHING, list(draws)
+    if request.live and finished:
+        said = response.values(vocabulary, given_plans(request, family))
+    events: list[Event] = [
+        SectionFinished(index, *section, said.all(section.name)) for section in finished for index in indices
+    ]
+    if request.live and (new := response.new_text(vocabulary)):
+        events += [TextWritten(index, *new) for index in indices]
+    if request.live and (codes := response.cursor.codes_written):
+        events += [CodesWritten(index, response.cursor.section, codes) for index in indices]
+    return events
+
+
+def inputs_of(
+    builder: InputBuilder, scene: Scene, format: str, attempt: Attempt | None, camera: str | None
+) -> ModelInputs:
+    """A scene as the network takes it.
+
+    Raises:
+        RequestError: it cannot be made into inputs (a missing camera).
+        ImageError: a picture is damaged.
+    """
+    try:
+        return builder.build(scene, format, attempt, camera)
+    except ImageError:
+        raise
+    except ValueError as error:
+        raise RequestError(str(error)) from error
 
 
 def read(

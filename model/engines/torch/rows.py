@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.engine import CodesWritten, Event, SectionFinished, TextWritten
+from model.engines.engine import Event
 from model.engines.least_error import least_error
-from model.engines.requests import given_plans, leads_to_reflection
+from model.engines.requests import leads_to_reflection, told
 from model.engines.response import Response, SectionText
 from model.engines.sampling import choose, probabilities, uniforms
 from model.engines.torch.deadlines import TimeFor
 from model.formats.cursor import Allowed
-from model.formats.pieces import NOTHING
 from model.network.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
@@ -115,20 +114,7 @@ class Row(Response):
         self.pending += [token.id for token in self.tokens[written:]]
         if self.draft:
             return []
-        plan_request = self.request.plan_request
-        said = NOTHING
-        if plan_request.live and finished:
-            said = self.values(vocabulary, given_plans(plan_request, self.request.family))
-        events: list[Event] = [
-            SectionFinished(index, *section, said.all(section.name))
-            for section in finished
-            for index in self.draws
-        ]
-        if plan_request.live and (new := self.new_text(vocabulary)):
-            events += [TextWritten(index, *new) for index in self.draws]
-        if plan_request.live and (codes := self.cursor.codes_written):
-            events += [CodesWritten(index, self.cursor.section, codes) for index in self.draws]
-        return events
+        return told(self.request.plan_request, self.request.family, self, finished, self.draws, vocabulary)
 
     def _controlled(
         self, allowed: Allowed, logits: npt.NDArray[np.float64], time_for: TimeFor

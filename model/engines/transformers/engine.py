@@ -11,26 +11,21 @@ from pathlib import Path
 
 import torch
 
-from model.driving.images import ImageError
 from model.engines.engine import (
-    CodesWritten,
     DrawFinished,
     EngineError,
     Event,
     Load,
     PlanRequest,
     RequestError,
-    SectionFinished,
     Started,
-    TextWritten,
 )
 from model.engines.pictures import PictureThreads
-from model.engines.requests import begin, given_plans, painted, read
-from model.engines.transformers.decoding import Asked, Decoding, Step
+from model.engines.requests import begin, inputs_of, painted, read, told
+from model.engines.transformers.decoding import Asked, Decoding
 from model.engines.warm_up import warm_up
 from model.families.registry import families_of
 from model.formats.cursor import CompiledFormat, Cursor
-from model.formats.pieces import NOTHING
 from model.network.checkpoint import load
 from model.network.inputs import ModelInputs
 from model.network.model_card import ModelCard
@@ -160,12 +155,7 @@ class TransformersEngine:
 
     def _inputs(self, request: PlanRequest) -> ModelInputs:
         scene, format, camera = request.scene, request.format, request.controls.camera
-        try:
-            return self._loaded.inputs.build(scene, format, request.attempt, camera)
-        except ImageError:
-            raise
-        except ValueError as error:
-            raise RequestError(str(error)) from error
+        return inputs_of(self._loaded.inputs, scene, format, request.attempt, camera)
 
     def _write(self, request: PlanRequest, start: Cursor, inputs: ModelInputs, tell: _Tell) -> None:
         """Write all draws, in the thread; ends where nobody waits for them any more."""
@@ -183,7 +173,9 @@ class TransformersEngine:
         passes = 0
         for step in self._decoding.write(asked, index):
             passes += 1
-            yield from self._events(asked, step, index)
+            yield from told(
+                asked.request, asked.family, step.response, step.finished, (index,), self._loaded.vocabulary
+            )
         yield DrawFinished(
             *read(
                 asked.request,
@@ -196,15 +188,3 @@ class TransformersEngine:
                 asked.reason_mask,
             )
         )
-
-    def _events(self, asked: Asked, step: Step, index: int) -> Iterator[Event]:
-        response, vocabulary, live = step.response, self._loaded.vocabulary, asked.request.live
-        said = NOTHING
-        if live and step.finished:
-            said = response.values(vocabulary, given_plans(asked.request, asked.family))
-        for section in step.finished:
-            yield SectionFinished(index, *section, said.all(section.name))
-        if live and (new := response.new_text(vocabulary)):
-            yield TextWritten(index, *new)
-        if live and (codes := response.cursor.codes_written):
-            yield CodesWritten(index, response.cursor.section, codes)

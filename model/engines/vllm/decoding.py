@@ -14,23 +14,19 @@ import numpy.typing as npt
 
 from model.engines.engine import (
     MAX_DRAWS,
-    CodesWritten,
     DrawFinished,
     EngineError,
     Event,
     PlanRequest,
-    SectionFinished,
     Started,
-    TextWritten,
 )
 from model.engines.least_error import Expected, LeastError, least_error
 from model.engines.logprobs import reported
 from model.engines.reason_mask import ReasonMask
-from model.engines.requests import given_plans, leads_to_reflection, read
+from model.engines.requests import leads_to_reflection, read, told
 from model.engines.response import Response, SectionText
 from model.families.family import Branch, Family
 from model.formats.cursor import Allowed, Cursor
-from model.formats.pieces import NOTHING
 from model.network.checkpoint import Parts
 
 IntArray = npt.NDArray[np.int64]
@@ -248,10 +244,6 @@ class Decoding:
             fits = wanted in self._left(draw)
             if fits:
                 self._tell(draw, draw.append(wanted, self._parts.vocabulary, logprob))
-                if self._request.live and (new := draw.new_text(self._parts.vocabulary)):
-                    self._happened.put_nowait(TextWritten(draw.index, *new))
-                if self._request.live and (codes := draw.cursor.codes_written):
-                    self._happened.put_nowait(CodesWritten(draw.index, draw.cursor.section, codes))
             if not alone and fits and wanted == token and not draw.cursor.ending:
                 continue
             self._tell(draw, draw.append_forced(self._parts.vocabulary))
@@ -286,12 +278,10 @@ class Decoding:
         ):
             self._happened.put_nowait(DrawFinished(finished))
 
-    def _tell(self, draw: _Walk, sections: Iterable[SectionText]) -> None:
-        finished, said = list(sections), NOTHING
-        if finished and self._request.live:
-            said = draw.values(self._parts.vocabulary, given_plans(self._request, self._family))
-        for section in finished:
-            self._happened.put_nowait(SectionFinished(draw.index, *section, said.all(section.name)))
+    def _tell(self, draw: _Walk, finished: Sequence[SectionText]) -> None:
+        vocabulary = self._parts.vocabulary
+        for event in told(self._request, self._family, draw, finished, (draw.index,), vocabulary):
+            self._happened.put_nowait(event)
 
 
 def _alike(draws: Iterable[_Walk]) -> Iterable[list[_Walk]]:

@@ -14,13 +14,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from model.driving.images import ImageError
 from model.driving.scene import Scene
 from model.engines.engine import EngineError, Event, Load, PlanRequest, RequestError
 from model.engines.least_error import LeastError
 from model.engines.pictures import PictureThreads
 from model.engines.reason_mask import reason_mask_of
-from model.engines.requests import begin, painted
+from model.engines.requests import begin, inputs_of, painted
 from model.engines.vllm.decoding import Decoding, VllmPrompt
 from model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
 from model.engines.warm_up import warm_up
@@ -192,12 +191,7 @@ class VllmEngine:
             RequestError: the scene cannot be made into inputs (a missing camera).
             ImageError: a picture is damaged.
         """
-        try:
-            inputs = self._parts.inputs.build(scene, format, attempt, camera)
-        except ImageError:
-            raise
-        except ValueError as error:
-            raise RequestError(str(error)) from error
+        inputs = inputs_of(self._parts.inputs, scene, format, attempt, camera)
         ids, items = inputs.prompt.ids, items_of(inputs, self._parts.settings)
         # vLLM wants one placeholder an item and repeats it by itself.
         repeated = np.isin(ids, [self._parts.vocabulary.id_of(PLACEHOLDERS[kind]) for kind in items])
