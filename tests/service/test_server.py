@@ -38,7 +38,6 @@ from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, Scripte
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem
 from tests.sockets import free_port, listening
-from tests.waiting import until
 
 WAIT_S = 120
 
@@ -430,29 +429,6 @@ def test_a_log_that_nobody_reads_holds_up_nobody_and_dear_requests_are_refused()
         assert float(lost.split()[1]) > 0
         started.send_signal(signal.SIGTERM)
         assert started.wait(WAIT_S) == 0
-
-
-def test_sigterm_while_pictures_are_decoded_ends_it() -> None:
-    """Scenes of the dearest pictures that are taken, several of them, and no time to finish them in."""
-    polite = make_call(Kind("direct", 1), [labelled_scene(8.0, pictures=1)], seed=1)
-    call = costly_calls(polite)[2]
-    with process(LOOKTWICE_DRAIN_NOTICE_S="0", LOOKTWICE_DRAIN_S="0.1") as (started, url):
-        answers: list[int] = []
-
-        def ask() -> None:
-            answer = httpx.post(url + call.path, content=call.body, headers=dict(call.headers), timeout=60)
-            answers.append(answer.status_code)
-
-        threads = [threading.Thread(target=ask) for _ in range(6)]
-        for thread in threads:
-            thread.start()
-        until(lambda: "looktwice_plans_in_flight 6.0" in httpx.get(f"{url}/metrics").text)
-        started.send_signal(signal.SIGTERM)
-        assert started.wait(WAIT_S) == 0
-        for thread in threads:
-            thread.join()
-        assert len(answers) == 6
-        assert set(answers) <= {200, 503}
 
 
 def test_a_damaged_picture_is_told_as_one() -> None:
