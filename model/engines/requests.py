@@ -147,6 +147,12 @@ def inputs_of(
         raise RequestError(str(error)) from error
 
 
+def prompt_tokens(builder: InputBuilder, request: PlanRequest) -> int:
+    """See `Engine.prompt_tokens`."""
+    camera = request.controls.camera
+    return len(builder.prompt_for(request.scene, request.format, request.attempt, camera).ids)
+
+
 def read(
     request: PlanRequest,
     family: Family,

@@ -16,7 +16,7 @@ import torch
 from model.engines.binding import Binding, binding_of
 from model.engines.engine import DrawFinished, EngineError, Event, Load, PlanRequest, RequestError
 from model.engines.pictures import PictureThreads
-from model.engines.requests import painted
+from model.engines.requests import painted, prompt_tokens
 from model.engines.torch.decoder import Counts, Decoder, Failed
 from model.engines.torch.expected_picture import expected_picture
 from model.engines.torch.frames import Frames
@@ -174,8 +174,7 @@ class TorchEngine:
 
     def prompt_tokens(self, request: PlanRequest) -> int:
         """See `Engine.prompt_tokens`."""
-        scene, format, attempt = request.scene, request.format, request.attempt
-        return len(self._loaded.inputs.prompt_for(scene, format, attempt, request.controls.camera).ids)
+        return prompt_tokens(self._loaded.inputs, request)
 
     def paint(self, codes: Sequence[int]) -> Frame:
         """An imagined picture; see `Engine.paint`."""

@@ -21,7 +21,7 @@ from model.engines.engine import (
     Started,
 )
 from model.engines.pictures import PictureThreads
-from model.engines.requests import begin, inputs_of, painted, read, told
+from model.engines.requests import begin, inputs_of, painted, prompt_tokens, read, told
 from model.engines.transformers.decoding import Asked, Decoding
 from model.engines.warm_up import warm_up
 from model.families.registry import families_of
@@ -137,8 +137,7 @@ class TransformersEngine:
 
     def prompt_tokens(self, request: PlanRequest) -> int:
         """See `Engine.prompt_tokens`."""
-        scene, format, attempt = request.scene, request.format, request.attempt
-        return len(self._loaded.inputs.prompt_for(scene, format, attempt, request.controls.camera).ids)
+        return prompt_tokens(self._loaded.inputs, request)
 
     def paint(self, codes: Sequence[int]) -> Frame:
         """An imagined picture; see `Engine.paint`."""

@@ -19,7 +19,7 @@ from model.engines.engine import EngineError, Event, Load, PlanRequest, RequestE
 from model.engines.least_error import LeastError
 from model.engines.pictures import PictureThreads
 from model.engines.reason_mask import reason_mask_of
-from model.engines.requests import begin, inputs_of, painted
+from model.engines.requests import begin, inputs_of, painted, prompt_tokens
 from model.engines.vllm.decoding import Decoding, VllmPrompt
 from model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
 from model.engines.warm_up import warm_up
@@ -170,8 +170,7 @@ class VllmEngine:
 
     def prompt_tokens(self, request: PlanRequest) -> int:
         """See `Engine.prompt_tokens`."""
-        scene, format, attempt = request.scene, request.format, request.attempt
-        return len(self._parts.inputs.prompt_for(scene, format, attempt, request.controls.camera).ids)
+        return prompt_tokens(self._parts.inputs, request)
 
     def paint(self, codes: Sequence[int]) -> Frame:
         """An imagined picture; see `Engine.paint`."""
