@@ -46,6 +46,10 @@ _SECOND_RANK_WEIGHT: Final = 0.5
 _NEAR: Final = 0.05
 """Errors below count by their square, above by their size."""
 _PLAN_WEIGHT: Final = 0.3
+_RARE: Final = [FACTS.index(name) for name in ("walker_0_present", "own_obstacle_present")]
+RARE_TIMES: Final = 3
+"""How often a scene with a walker or an obstacle ahead is looked at while others are looked at once: one in
+seven has either, and cars that plan from pictures mostly collide with these."""
 _ROUTE_SHARE: Final = 0.75
 _MIRROR_SHARE: Final = 0.5
 _MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
@@ -127,6 +131,13 @@ def _mirror(sample: GroundingSample) -> GroundingSample:
         route=sample.route * _MIRROR[:2],
         futures=sample.futures * _MIRROR,
     )
+
+
+def looked_at(examples: Examples) -> list[int]:
+    """Places of the examples with pictures, once an epoch each; rare ones `RARE_TIMES`."""
+    pictured = np.flatnonzero(examples.pictured)
+    rare = pictured[(examples.facts[pictured][:, _RARE] == 1).any(axis=1)]
+    return [*pictured.tolist(), *(rare.tolist() * (RARE_TIMES - 1))]
 
 
 def collate_grounding(samples: list[GroundingSample]) -> dict[str, Tensor]:

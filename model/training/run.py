@@ -33,7 +33,7 @@ from model.training.attempts import AttemptsOn, attempts_on
 from model.training.batches import ResponseDataset, TaskSampler, collate
 from model.training.dense import DENSE_SHAPE
 from model.training.examples import Examples, load_examples
-from model.training.grounding import GroundingDataset, GroundingLearner, collate_grounding
+from model.training.grounding import GroundingDataset, GroundingLearner, collate_grounding, looked_at
 from model.training.intents import (
     IntentDataset,
     IntentLearner,
@@ -283,11 +283,10 @@ def _prepare(
     tried: AttemptsOn | None,
     settings: RunSettings,
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
-    pictured = np.flatnonzero(examples.pictured).tolist()
     if recipe.goal == "ground":
         grounding = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE)
-        looked_at = GroundingDataset(examples, loaded.inputs, recipe.seed)
-        return grounding, Subset(looked_at, pictured), None, collate_grounding
+        looks = GroundingDataset(examples, loaded.inputs, recipe.seed)
+        return grounding, Subset(looks, looked_at(examples)), None, collate_grounding
     vision = None
     if recipe.pictures and recipe.vision_rate == 0:
         vision = open_vision(
@@ -351,7 +350,7 @@ def _prepare(
             route_share=recipe.route_share,
             tracks_share=recipe.tracks_share if loaded.settings.with_tracks else 0.0,
         )
-        return judging, ScenePlaces(pictured), None, collate_places
+        return judging, ScenePlaces(np.flatnonzero(examples.pictured).tolist()), None, collate_places
     has_route = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
     sampler = TaskSampler(
         has_route,

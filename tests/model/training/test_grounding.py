@@ -17,6 +17,7 @@ from model.training.grounding import (
     Look,
     collate_grounding,
     fact_loss,
+    looked_at,
 )
 from tests.model.training.scenes import training_scene
 
@@ -46,6 +47,17 @@ def test_a_route_is_given_only_where_there_is_one(data: GroundingDataset) -> Non
     assert not data.look(Look(0)).has_route
     assert data.look(Look(1)).has_route
     assert not data.look(Look(1, route=False)).has_route
+
+
+def test_scenes_with_a_walker_or_an_obstacle_are_looked_at_more_often() -> None:
+    examples = Examples.from_scenes([training_scene(number) for number in range(4)], (FRONT_WIDE,))
+    for fact in ("walker_0_present", "own_obstacle_present"):
+        examples.facts[:, FACTS.index(fact)] = 0
+    examples.facts[1, FACTS.index("walker_0_present")] = 1
+    examples.facts[2] = np.nan
+    examples.facts[3, [FACTS.index("walker_0_present"), FACTS.index("own_obstacle_present")]] = 1
+    examples.pictured[3] = False
+    assert sorted(looked_at(examples)) == [0, 1, 1, 1, 2]
 
 
 def test_facts_that_do_not_apply_cost_nothing() -> None:
