@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 import service.cli.bench as bench
+import service.cli.blend as blend
 import service.cli.build as build
 import service.cli.describe as describe
 import service.cli.drive as drive
@@ -53,6 +54,7 @@ app.command("score")(score.score)
 app.command("failures")(failures.failures)
 app.command("feedback")(feedback.feedback)
 app.command("evaluate")(evaluate.evaluate)
+app.command("blend")(blend.blend)
 app.command("describe")(describe.describe)
 app.command("drive")(drive.drive)
 app.command("loadtest")(loadtest.loadtest)

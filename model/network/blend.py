@@ -1,0 +1,54 @@
+"""Weights between two checkpoints: what a stage taught, without all that it made forgotten.
+
+A network that is trained further on fewer scenes than before learns them by heart, too. The weights between
+those before and those after keep much of both (WiSE-FT, https://arxiv.org/abs/2109.01903).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from model.network.checkpoint import CheckpointError, Loaded
+
+
+def blend(before: Loaded, after: Loaded, share: float) -> Loaded:
+    """``after`` with the weights of its decoder and small planners moved back towards those of ``before``.
+
+    What sees (the vision tower, what gathers its tokens and reads facts from them) stays as it is in
+    ``after``: between two readings of pictures lies none.
+
+    Args:
+        before, after: checkpoints of one architecture, the second trained from the first.
+        share: of ``after``; 1 is ``after`` itself.
+
+    Raises:
+        CheckpointError: they differ in more than weights.
+        ValueError: a share beyond 0 to 1.
+    """
+    if not 0 <= share <= 1:
+        raise ValueError(f"share is {share}, not between 0 and 1")
+    old, new = before.model.state_dict(), after.model.state_dict()
+    if before.settings != after.settings or {name: value.shape for name, value in old.items()} != {
+        name: value.shape for name, value in new.items()
+    }:
+        raise CheckpointError(f"{before.card.name} and {after.card.name} differ in more than their weights")
+    with torch.no_grad():
+        after.model.load_state_dict(
+            {name: value if _sees(name) else _between(old[name], value, share) for name, value in new.items()}
+        )
+    stages = [
+        *after.card.details.get("stages", []),
+        {"name": "blend", "share": share, "with": before.card.revision},
+    ]
+    return replace(after, card=replace(after.card, details={**after.card.details, "stages": stages}))
+
+
+def _sees(name: str) -> bool:
+    return name.startswith("model.visual.") or (name.startswith("resampler.") and ".intent." not in name)
+
+
+def _between(old: Tensor, new: Tensor, share: float) -> Tensor:
+    return torch.lerp(old.float(), new.float(), share).to(new.dtype) if new.is_floating_point() else new

@@ -1,0 +1,36 @@
+"""`looktwice blend`: a checkpoint between two others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.options import told
+
+
+def blend(
+    before: Annotated[Path, typer.Argument(help="Checkpoint folder that training began with.")],
+    after: Annotated[Path, typer.Argument(help="Checkpoint folder that came of it.")],
+    to: Annotated[Path, typer.Option(help="Folder for the checkpoint between them.")],
+    share: Annotated[float, typer.Option(min=0, max=1, help="Of the second checkpoint.")] = 0.5,
+) -> None:
+    """Mix the decoders and small planners of two checkpoints; what sees is that of the second."""
+    with told():
+        import torch
+
+        from model.network.blend import blend as blend_of
+        from model.network.checkpoint import load, save
+
+        blended = blend_of(load(before), load(after), share)
+        save(
+            to,
+            blended.model,
+            blended.vocabulary,
+            blended.codec,
+            dtype=torch.bfloat16,
+            details=blended.card.details,
+            visual_codes=blended.visual_codes,
+        )
+        typer.echo(str(to))

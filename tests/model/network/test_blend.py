@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from model.network.blend import blend
+from model.network.checkpoint import CheckpointError, Loaded, load, save
+from service.cli.commands import app
+
+EYES = ("model.visual.", "resampler.facts.", "resampler.layers.", "resampler.queries")
+
+
+@pytest.fixture
+def before(resampling_checkpoint: Path) -> Loaded:
+    return load(resampling_checkpoint)
+
+
+@pytest.fixture
+def after(resampling_checkpoint: Path) -> Loaded:
+    """As `before`, with every weight one more."""
+    loaded = load(resampling_checkpoint)
+    with torch.no_grad():
+        for parameter in loaded.model.parameters():
+            parameter.add_(1.0)
+    return loaded
+
+
+def test_decoder_and_planners_go_back_and_what_sees_stays(before: Loaded, after: Loaded) -> None:
+    old = {name: value.clone() for name, value in before.model.named_parameters()}
+    blended = blend(before, after, 0.25)
+    for name, value in blended.model.named_parameters():
+        moved = 1.0 if name.startswith(EYES) else 0.25
+        if name.startswith(("model.language_model.", "resampler.intent.", "track_reader.", *EYES)):
+            torch.testing.assert_close(value, old[name] + moved, atol=1e-5, rtol=0)
+    assert blended.card.details["stages"][-1] == {
+        "name": "blend",
+        "share": 0.25,
+        "with": before.card.revision,
+    }
+
+
+def test_of_checkpoints_that_differ_in_more_than_weights_there_is_no_blend(
+    before: Loaded, untrained_checkpoint: Path
+) -> None:
+    with pytest.raises(CheckpointError, match="differ in more than their weights"):
+        blend(before, load(untrained_checkpoint), 0.5)
+    with pytest.raises(ValueError, match="not between 0 and 1"):
+        blend(before, replace(before), 1.5)
+
+
+def test_the_command_writes_a_checkpoint(tmp_path: Path, resampling_checkpoint: Path, after: Loaded) -> None:
+    save(tmp_path / "after", after.model, after.vocabulary, after.codec, dtype=torch.bfloat16)
+    to = ["--to", str(tmp_path / "between"), "--share", "0.5"]
+    told = CliRunner().invoke(app, ["blend", str(resampling_checkpoint), str(tmp_path / "after"), *to])
+    assert told.exit_code == 0, told.output
+    between = load(tmp_path / "between")
+    assert between.card.details["stages"][-1]["share"] == 0.5
+    assert between.card.revision not in (
+        load(resampling_checkpoint).card.revision,
+        load(tmp_path / "after").card.revision,
+    )
