@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from model.driving.pdm.judging import Said, judged_in_scene
+from model.driving.pdm.judging import Said, SceneJudge
 from model.driving.pdm.rule_teacher import critique
 from model.driving.scene import LabelledScene
 from model.engines.engine import Controls, Draw, PlanRequest
@@ -98,10 +98,12 @@ class OutcomeLearner(nn.Module):
         """The loss of one step from scenes int64 [b], and its parts without gradients."""
         items = [self._item(place) for place in places.tolist()]
         draws = self._drawn_by([self._request(number, item) for number, item in enumerate(items)])
-        judged = [self._judged(item, found) for item, found in zip(items, draws, strict=True)]
-        refined = self._refined(items, draws, judged)
+        judges = [SceneJudge(self._scenes[item.index]) for item in items]
+        judged = [self._judged(judge, found) for judge, found in zip(judges, draws, strict=True)]
+        refined = self._refined(items, judges, draws, judged)
         again = [
-            self._judged(item, found) if found else None for item, found in zip(items, refined, strict=True)
+            self._judged(judge, found) if found else None
+            for judge, found in zip(judges, refined, strict=True)
         ]
         worth = []
         for own, other in zip(judged, again, strict=True):
@@ -139,8 +141,8 @@ class OutcomeLearner(nn.Module):
             tracks=chance[1] < self._tracks_share,
         )
 
-    def _judged(self, item: Item, draws: Sequence[Draw]) -> Rewards:
-        return rewards(self._scenes[item.index], draws, self._settings.rewards, self._settings.version)
+    def _judged(self, judge: SceneJudge, draws: Sequence[Draw]) -> Rewards:
+        return rewards(judge, draws, self._settings.rewards, self._settings.version)
 
     def _request(self, number: int, item: Item) -> PlanRequest:
         """A scene's draws, all with random numbers of the step."""
@@ -172,7 +174,11 @@ class OutcomeLearner(nn.Module):
         return list(found.values())
 
     def _refined(
-        self, items: Sequence[Item], draws: Sequence[Sequence[Draw]], judged: Sequence[Rewards]
+        self,
+        items: Sequence[Item],
+        judges: Sequence[SceneJudge],
+        draws: Sequence[Sequence[Draw]],
+        judged: Sequence[Rewards],
     ) -> list[list[Draw]]:
         """Refinements of each scene's best draw, none where it is good enough."""
         refining, found = self._settings.refining, [list[Draw]() for _ in items]
@@ -187,22 +193,18 @@ class OutcomeLearner(nn.Module):
                     asked,
                     format=refining.format,
                     controls=replace(asked.controls, n=refining.count),
-                    attempt=self._attempt(items[place], draws[place][int(judged[place].outcome.argmax())]),
+                    attempt=self._attempt(judges[place], draws[place][int(judged[place].outcome.argmax())]),
                 )
             )
         for place, refinements in zip(failed, self._drawn_by(requests) if requests else (), strict=True):
             found[place] = refinements
         return found
 
-    def _attempt(self, item: Item, draft: Draw) -> Attempt:
+    def _attempt(self, judge: SceneJudge, draft: Draw) -> Attempt:
         """A draft with the built-in teacher's feedback, measured against the expert."""
         plan = None if draft.plan is None else str(draft.plan)
-        [judged] = judged_in_scene(
-            self._scenes[item.index],
-            scored_poses(draft)[None],
-            self._settings.version,
-            said=[Said(plan, draft.thinking)],
-        )
+        said = [Said(plan, draft.thinking)]
+        [judged] = judge.judged(scored_poses(draft)[None], self._settings.version, said=said)
         return Attempt(draft.trajectory, str(critique(judged)))
 
     def _policy(

@@ -145,6 +145,17 @@ _NANO: Final = Recipe(
     head_weight=0.25,
 )
 
+_OUTCOME: Final = replace(
+    _NANO,
+    goal="outcome",
+    steps=400,
+    learning_rate=2e-5,
+    warmup_steps=10,
+    mirror_share=0.0,
+    blur_share=0.0,
+    head_weight=0.0,
+)
+
 VISUAL_CODES: Final = Recipe(
     "visual-codes", "code", steps=6000, batch_size=16, learning_rate=1e-3, warmup_steps=200
 )
@@ -210,36 +221,22 @@ NANO: Final[Mapping[str, Recipe]] = (
     }
     | {
         "cf-rl": replace(
-            _NANO,
+            _OUTCOME,
             name="cf-rl",
-            goal="outcome",
-            steps=400,
             batch_size=16,
-            learning_rate=2e-5,
-            warmup_steps=10,
             tasks={"cf_vla": 1.0},
             # The expert's words lead to no second look: learned beside, they would end all of them.
             weights=CODE_WEIGHTS,
-            mirror_share=0.0,
-            blur_share=0.0,
-            head_weight=0.0,
             outcome=OutcomeSettings(codes="drawn", imitation=0.05),
         ),
         # Section 9.1 and table 7; parts of the reward count alike, of which the supplement says nothing.
         "elf-rl": replace(
-            _NANO,
+            _OUTCOME,
             name="elf-rl",
-            goal="outcome",
-            steps=400,
             batch_size=8,
-            learning_rate=2e-5,
-            warmup_steps=10,
             tasks={"elf_vla": 1.0},
             weights=elf_vla.WEIGHTS,
-            mirror_share=0.0,
-            blur_share=0.0,
             error_weight=0.0,
-            head_weight=0.0,
             outcome=OutcomeSettings(
                 temperature=1.2,
                 rewards=RewardWeights(

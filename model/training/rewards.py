@@ -14,8 +14,9 @@ import numpy as np
 
 from model.driving.agreement import agreement
 from model.driving.pdm.comfort import Version
-from model.driving.pdm.labelled import plans_of, world_of
-from model.driving.pdm.scoring import COLLISIONS, Others, score
+from model.driving.pdm.judging import SceneJudge
+from model.driving.pdm.labelled import plans_of
+from model.driving.pdm.scoring import COLLISIONS
 from model.driving.pdm.world import Array
 from model.driving.scene import LabelledScene
 from model.driving.trajectory import HALF_SECONDS_S, FloatArray
@@ -65,7 +66,7 @@ class Rewards(NamedTuple):
 
 
 def rewards(
-    labelled: LabelledScene,
+    judge: SceneJudge,
     draws: Sequence[Draw],
     weights: RewardWeights = RewardWeights(),
     version: Version = "v2.2",
@@ -73,7 +74,7 @@ def rewards(
     """What draws of one scene are worth.
 
     Args:
-        labelled: the scene with what really came.
+        judge: of the scene.
         draws: its responses, at least one, with trajectories at 10 Hz up to 6.4 s or at 0.5 s up to 4 s.
         weights: of the parts.
         version: whose rules score them.
@@ -81,10 +82,9 @@ def rewards(
     Raises:
         ScoreError: the scene's agents are not known for as long as the score looks ahead.
     """
+    labelled = judge.labelled
     trajectories = np.stack([draw.at_10_hz for draw in draws])
-    expert = plans_of(labelled.future)
-    plans = np.stack([scored_poses(draw) for draw in draws])
-    scores = score(world_of(labelled), plans, version, Others(expert, "expert"), centre=True)
+    scores = judge.scores(np.stack([scored_poses(draw) for draw in draws]), version)
     outcome = np.nan_to_num(scores.partial_score)
     apart_m = trajectories[..., :2] - labelled.future[: trajectories.shape[1], :2]
     away_m = np.linalg.norm(apart_m, axis=-1).mean(axis=-1)

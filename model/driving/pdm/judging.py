@@ -96,6 +96,44 @@ def judged_plans(
     return judged
 
 
+class SceneJudge:
+    """Judges plans of the box's centre in a labelled scene, measured against its expert.
+
+    The scene's world is made once, for all plans that are judged there.
+
+    Args:
+        labelled: the scene with what really came.
+    """
+
+    def __init__(self, labelled: LabelledScene) -> None:
+        self.labelled = labelled
+        self._world, self._expert = world_of(labelled), plans_of(labelled.future)
+        self._others = Others(self._expert, "expert")
+
+    def scores(self, plans: Array, version: Version) -> Scores:
+        """Of plans [n, 8, 3] or [n, 64, 3]; raises `ScoreError` or `SolveError` as `score` does."""
+        return score(self._world, plans, version, self._others, centre=True)
+
+    def judged(
+        self,
+        plans: Array,
+        version: Version,
+        threshold: float = THRESHOLD,
+        said: Sequence[Said] | None = None,
+    ) -> list[JudgedPlan]:
+        """The same plans with what a teacher is told of each; raises as `judged_plans` does, too."""
+        return judged_plans(
+            self._world,
+            plans,
+            self.scores(plans, version),
+            self._others,
+            threshold=threshold,
+            truth=self._expert,
+            said=said,
+            centre=True,
+        )
+
+
 def judged_in_scene(
     labelled: LabelledScene,
     plans: Array,
@@ -103,17 +141,8 @@ def judged_in_scene(
     threshold: float = THRESHOLD,
     said: Sequence[Said] | None = None,
 ) -> list[JudgedPlan]:
-    """Plans [n, 8, 3] or [n, 64, 3] of the box's centre in a labelled scene, measured against its expert.
-
-    Raises:
-        ScoreError, SolveError: see `score`.
-    """
-    world, truth = world_of(labelled), plans_of(labelled.future)
-    others = Others(truth, "expert")
-    scores = score(world, plans, version, others, centre=True)
-    return judged_plans(
-        world, plans, scores, others, threshold=threshold, truth=truth, said=said, centre=True
-    )
+    """What `SceneJudge` says of the plans of one scene, judged once."""
+    return SceneJudge(labelled).judged(plans, version, threshold, said)
 
 
 def _waypoints(plan: Array) -> tuple[Waypoint, ...]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from model.driving.pdm.judging import SceneJudge
 from model.driving.plan import parse_plan
 from model.driving.scene_store import write_scenes
 from model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S, FloatArray, at_times, constant_velocity
@@ -36,7 +37,7 @@ ACCELERATES = parse_plan(
 
 def test_who_stops_in_time_is_worth_more_than_who_does_not() -> None:
     straight_on = constant_velocity(BRAKES.scene.history)
-    found, _, parts = rewards(BRAKES, [draw_of(BRAKES.future), draw_of(straight_on)])
+    found, _, parts = rewards(SceneJudge(BRAKES), [draw_of(BRAKES.future), draw_of(straight_on)])
     assert found[0] > found[1] + 0.5
     # Not comfortable, but right.
     assert found[0] > 0.8
@@ -50,7 +51,7 @@ def test_thinking_and_contradictions_cost_what_they_are_said_to() -> None:
         draw_of(BRAKES.future, ACCELERATES),
         draw_of(BRAKES.future, ACCELERATES, revised=ACCELERATES),
     )
-    found, _, parts = rewards(BRAKES, [direct, looked], weights)
+    found, _, parts = rewards(SceneJudge(BRAKES), [direct, looked], weights)
     assert parts["think_rate"] == 0.5
     # The plan says that the car accelerates all the time, and it stops.
     assert found[0] == pytest.approx(-0.25)
@@ -133,8 +134,8 @@ def eight(trajectory: FloatArray) -> Draw:
 def test_eight_poses_are_worth_what_64_are() -> None:
     weights = RewardWeights(outcome=1.0, imitation=0.0, words=0.0, thinking=0.0, goal=1.0, form=1.0)
     straight_on = constant_velocity(BRAKES.scene.history)
-    found = rewards(BRAKES, [eight(BRAKES.future), eight(straight_on)], weights, "v1.1")
-    dense = rewards(BRAKES, [draw_of(BRAKES.future), draw_of(straight_on)], version="v1.1")
+    found = rewards(SceneJudge(BRAKES), [eight(BRAKES.future), eight(straight_on)], weights, "v1.1")
+    dense = rewards(SceneJudge(BRAKES), [draw_of(BRAKES.future), draw_of(straight_on)], version="v1.1")
     np.testing.assert_allclose(found.outcome, dense.outcome, atol=0.05)
     assert found.total[0] == pytest.approx(found.outcome[0] + 2.0)
     # It collides, and ends 30 m behind where the expert stops.
@@ -204,7 +205,7 @@ def test_failed_drafts_are_refined_by_feedback_and_learned_as_first_answers(
         assert refined.attempt is not None
         assert "Meta action analysis" in refined.attempt.feedback
         labelled = next(each for each in scenes if each.scene.scene_id == refined.scene.scene_id)
-        best = int(rewards(labelled, drafts, version="v1.1").outcome.argmax())
+        best = int(rewards(SceneJudge(labelled), drafts, version="v1.1").outcome.argmax())
         np.testing.assert_array_equal(refined.attempt.trajectory, drafts[best].trajectory)
     # What is learned stands behind the prompt without feedback.
     loaded = load(refining_checkpoint)
@@ -238,7 +239,9 @@ def test_an_answer_that_only_feedback_leads_to_becomes_likelier(
     """Nothing but the expert's end counts, which untrained drafts miss by far."""
     likely: list[float] = []
 
-    def refined(self: OutcomeLearner, items: list[Item], draws: list[list[Draw]], judged: Any) -> Any:
+    def refined(
+        self: OutcomeLearner, items: list[Item], judges: Any, draws: list[list[Draw]], judged: Any
+    ) -> Any:
         found = []
         for item, own in zip(items, draws, strict=True):
             sample = self._data[item]
