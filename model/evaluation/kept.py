@@ -30,8 +30,8 @@ class KeptDraws:
     """An `Engine` in front of another, which is asked only what it has not answered before.
 
     The draws of a request are kept when the last of them has come; told by the model's revision, the scene
-    with all that is in it, format and controls, not by the request's name. What is answered from the file has
-    no events but `Started` and its draws.
+    with all that is in it, format, controls and the attempt that is refined, not by the request's name. What
+    is answered from the file has no events but `Started` and its draws.
 
     Args:
         engine: that is asked.
@@ -114,8 +114,12 @@ class KeptDraws:
 def _key(card: ModelCard, request: PlanRequest) -> str:
     prefill = request.controls.prefill
     controls = asdict(request.controls) | {"prefill": None if prefill is None else str(prefill)}
-    scene = scene_hash(request.scene)
-    return hash_of(_SCHEMA_VERSION, card.name, card.revision, card.engine, request.format, controls, scene)
+    scene, attempt = scene_hash(request.scene), request.attempt
+    # No attempt, no part: what was kept before attempts counted is found again.
+    tried = () if attempt is None else (attempt.trajectory.tobytes(), attempt.feedback)
+    return hash_of(
+        _SCHEMA_VERSION, card.name, card.revision, card.engine, request.format, controls, scene, *tried
+    )
 
 
 def _packed(draws: Iterable[Draw]) -> bytes:

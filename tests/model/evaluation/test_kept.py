@@ -12,13 +12,14 @@ from model.driving.perceived import Perceived, PerceivedAgent
 from model.driving.plan import parse_plan
 from model.engines.engine import Controls, Draw, DrawFinished, Engine, EngineError, Event, PlanRequest
 from model.evaluation.kept import KeptDraws
-from model.families.family import Foreseen, NextPicture
+from model.families.family import Attempt, Foreseen, NextPicture
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import FakeEngine, draw_of
 
 SCENE = labelled_scene().scene
 PLAN = parse_plan("- longitudinal\n  - 0.0s-3.2s: Wait\n  - 3.2s-6.4s: Accelerate\n")
 PERCEIVED = Perceived((PerceivedAgent("vehicle", 9.0, 1.0, 4.5, 2.0, None),), 1.5, 4.0)
+DRAFT = np.zeros((8, 4), np.float32)
 ASKED = PlanRequest("a", SCENE, "cf_vla", Controls(n=3, prefill=PLAN))
 
 
@@ -75,6 +76,9 @@ def test_anything_else_is_asked(tmp_path: Path) -> None:
     engine, other_pictures = FakeEngine(), replace(SCENE.clips[0], images=SCENE.clips[0].images[::-1])
     others = [
         replace(ASKED, format="traj_only"),
+        replace(ASKED, attempt=Attempt(DRAFT, "Brake.")),
+        replace(ASKED, attempt=Attempt(DRAFT, "Brake earlier.")),
+        replace(ASKED, attempt=Attempt(DRAFT + 1, "Brake.")),
         replace(ASKED, controls=replace(ASKED.controls, prefill=None)),
         replace(ASKED, controls=replace(ASKED.controls, seed=1)),
         replace(ASKED, scene=replace(SCENE, clips=(other_pictures, *SCENE.clips[1:]))),
