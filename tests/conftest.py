@@ -33,6 +33,18 @@ def resampling_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_untrained(folder, settings=NANO_SETTINGS)
 
 
+@pytest.fixture(scope="session")
+def refining_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Untrained, thinks and refines: its only formats are those of ELF-VLA."""
+    from dataclasses import replace
+
+    from model.network.settings import NANO_SETTINGS
+    from tests.checkpoints import write_untrained
+
+    folder = tmp_path_factory.mktemp("checkpoint") / "refining"
+    return write_untrained(folder, settings=replace(NANO_SETTINGS, formats=("elf_vla", "elf_vla_refine")))
+
+
 @pytest.fixture(scope="module")
 def toy_family(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """The family `toy` is there, as an installed package declares it."""

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from model.driving.plan import Plan
 from model.driving.scene import CAMERAS, Scene
-from model.driving.trajectory import TEN_HZ_S, FloatArray, at_10_hz
+from model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S, FloatArray, at_10_hz
 from model.families.family import Attempt, Foreseen
 from model.formats.pieces import Plain, Value
 from model.network.model_card import ModelCard
@@ -209,6 +209,11 @@ class Draw:
     def at_10_hz(self) -> FloatArray:
         """The trajectory at 10 Hz, up to its last pose or to 6.4 s: float32 [k, 4]."""
         return at_10_hz(self.trajectory, self.times_s)
+
+    @property
+    def scored(self) -> FloatArray:
+        """The trajectory as NAVSIM's scores take it: as it is at 0.5 s, or at 10 Hz; float32 [8 or 64, 4]."""
+        return self.trajectory if self.times_s == HALF_SECONDS_S else self.at_10_hz
 
     @property
     def looked_twice(self) -> bool:

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from model.driving.pdm.judging import Said, SceneJudge
+from model.driving.pdm.labelled import plans_of
 from model.driving.pdm.rule_teacher import critique
 from model.driving.scene import LabelledScene
 from model.engines.engine import Controls, Draw, PlanRequest
@@ -34,7 +35,7 @@ from model.training.batches import Item, ResponseDataset, Sample, collate
 from model.training.learner import ResponseLearner
 from model.training.policy import advantages, policy_loss
 from model.training.recipes import OutcomeSettings
-from model.training.rewards import Rewards, rewards, scored_poses
+from model.training.rewards import Rewards, rewards
 from model.training.rollouts import with_draws
 
 _MAX_SEED = 2**31
@@ -204,7 +205,7 @@ class OutcomeLearner(nn.Module):
         """A draft with the built-in teacher's feedback, measured against the expert."""
         plan = None if draft.plan is None else str(draft.plan)
         said = [Said(plan, draft.thinking)]
-        [judged] = judge.judged(scored_poses(draft)[None], self._settings.version, said=said)
+        [judged] = judge.judged(plans_of(draft.scored[None]), self._settings.version, said=said)
         return Attempt(draft.trajectory, str(critique(judged)))
 
     def _policy(

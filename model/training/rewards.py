@@ -19,7 +19,7 @@ from model.driving.pdm.labelled import plans_of
 from model.driving.pdm.scoring import COLLISIONS
 from model.driving.pdm.world import Array
 from model.driving.scene import LabelledScene
-from model.driving.trajectory import HALF_SECONDS_S, FloatArray
+from model.driving.trajectory import FloatArray
 from model.engines.engine import Draw
 
 _FAR_M = 10.0
@@ -84,7 +84,7 @@ def rewards(
     """
     labelled = judge.labelled
     trajectories = np.stack([draw.at_10_hz for draw in draws])
-    scores = judge.scores(np.stack([scored_poses(draw) for draw in draws]), version)
+    scores = judge.scores(plans_of(np.stack([draw.scored for draw in draws])), version)
     outcome = np.nan_to_num(scores.partial_score)
     apart_m = trajectories[..., :2] - labelled.future[: trajectories.shape[1], :2]
     away_m = np.linalg.norm(apart_m, axis=-1).mean(axis=-1)
@@ -111,11 +111,6 @@ def rewards(
         "form": float(form.mean()),
     }
     return Rewards(total.astype(np.float32), outcome.astype(np.float32), parts)
-
-
-def scored_poses(draw: Draw) -> Array:
-    """A draw's trajectory as it is scored: [8, 3] where it has such poses, else at 10 Hz."""
-    return plans_of(draw.trajectory if draw.times_s == HALF_SECONDS_S else draw.at_10_hz)
 
 
 def goal_reward(away_m: FloatArray) -> Array:

@@ -75,7 +75,7 @@ def _agreed_draws(
     route: bool,
     quiet: bool,
 ) -> dict[str, FloatArray]:
-    """The trajectory of the draw to drive at 10 Hz, [64, 4] or as far as it goes, by scene id."""
+    """The trajectory of the draw to drive, [8 or 64, 4] as scores take it, by scene id."""
     from functools import partial
 
     import numpy as np
@@ -88,7 +88,7 @@ def _agreed_draws(
 
     def keep(_: Variant, labelled: LabelledScene, draws: Sequence[Draw]) -> None:
         trajectories = np.stack([draw.at_10_hz for draw in draws])
-        found[labelled.scene.scene_id] = trajectories[agreed(trajectories)]
+        found[labelled.scene.scene_id] = draws[agreed(trajectories)].scored
 
     variants = [Variant(engine.card.name, engine.card.formats[0], controls, route=route)]
     evaluate = partial(evaluate_variants, on_draws=keep)

@@ -98,7 +98,7 @@ def moment_before(labelled: LabelledScene, seconds: float) -> tuple[FloatArray, 
 
 
 def plans_of(trajectories: FloatArray) -> Array:
-    """Trajectories [n, 64, 4] as plans [n, 64, 3] of the box's centre."""
+    """Trajectories [..., 4] as plans [..., 3] of the box's centre."""
     return trajectories[..., [0, 1, 3]].astype(np.float64)
 
 

@@ -16,13 +16,11 @@ from model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S, FloatArray, at_ti
 from model.engines.engine import Draw, PlanRequest
 from model.formats.replay import decisions
 from model.network.checkpoint import load
-from model.network.settings import NANO_SETTINGS
 from model.training.batches import Item, collate
 from model.training.outcomes import OutcomeLearner
 from model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_below
 from model.training.rewards import RewardWeights, form_reward, goal_reward, rewards
 from model.training.run import RunSettings, run
-from tests.checkpoints import write_untrained
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
 from tests.model.evaluation.fakes import draw_of
 from tests.model.training.scenes import training_scene
@@ -151,13 +149,6 @@ def test_form_is_a_half_for_thoughts_and_a_half_for_poses() -> None:
 
 
 ELF = ("elf_vla", "elf_vla_refine")
-
-
-@pytest.fixture(scope="module")
-def refining_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Untrained, thinks and refines."""
-    folder = tmp_path_factory.mktemp("refining") / "checkpoint"
-    return write_untrained(folder, settings=replace(NANO_SETTINGS, formats=ELF))
 
 
 def elf_recipe(**outcome: Any) -> Recipe:

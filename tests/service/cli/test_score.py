@@ -54,6 +54,14 @@ def test_a_scene_file_is_scored_planner_by_planner(tmp_path: Path, untrained_che
     }
 
 
+def test_a_checkpoint_of_eight_poses_is_scored_too(refining_checkpoint: Path) -> None:
+    asked = ["score", str(SCENES), "--limit", "2", "--checkpoint", str(refining_checkpoint), "--n", "2"]
+    result = RUNNER.invoke(app, [*asked, "--json"])
+    assert result.exit_code == 0, result.output
+    *_, checkpoint = json.loads(result.stdout.splitlines()[-1])["pdms"]
+    assert (checkpoint["scenes"], checkpoint["missing"]) == (2, {})
+
+
 def test_a_folder_without_scenes_is_one_line(tmp_path: Path) -> None:
     result = RUNNER.invoke(app, ["score", str(tmp_path)])
     assert result.exit_code == 2
