@@ -32,7 +32,7 @@ from model.driving.pdm.failures import Fact
 from model.driving.pdm.feedback import Feedback, FeedbackError, RuleFeedback, parse_feedback
 from model.driving.pdm.judged import JudgedPlan, Number
 from model.driving.pdm.judging import Said, judged_plans
-from model.driving.pdm.rule_teacher import NAME, REVISION, critique
+from model.driving.pdm.rule_teacher import NAME, REVISION, feedback_on
 from model.driving.pdm.world import ScoreError
 from service.metrics import Metrics
 from service.problems import (
@@ -120,7 +120,7 @@ def feedback_given(asked: wire_feedback.FeedbackRequest, bundled: BundledScenes,
     for row, plan in enumerate(judged):
         plan_id = plan_id_of(asked.trajectories[row])
         written = said[row].written
-        feedback, writer = by_rule(plan, asked.mode), NAME
+        feedback, writer = _by_rule(plan, asked.mode), NAME
         if written is not None:
             feedback, writer = _checked(written, plan, plan_id, f"/said/{row}/written"), CALLER
         told.append(
@@ -222,11 +222,8 @@ async def _asked(
     return written.feedback, written.attempts
 
 
-def by_rule(plan: JudgedPlan, mode: wire_feedback.FeedbackMode) -> Feedback | RuleFeedback:
-    """ELF-VLA section 7.2: sections of what is wrong, the verdict of what is correct."""
-    if plan.correct or mode == "rule":
-        return RuleFeedback(plan.score, plan.correct)
-    return critique(plan)
+def _by_rule(plan: JudgedPlan, mode: wire_feedback.FeedbackMode) -> Feedback | RuleFeedback:
+    return RuleFeedback(plan.score, plan.correct) if mode == "rule" else feedback_on(plan)
 
 
 def _checked(

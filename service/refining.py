@@ -18,7 +18,7 @@ from model.driving.pdm.foresight import CONSTANT_VELOCITY, world_ahead
 from model.driving.pdm.judging import judged_plans
 from model.driving.pdm.labelled import plans_of
 from model.driving.pdm.profiles import SolveError
-from model.driving.pdm.rule_teacher import NAME
+from model.driving.pdm.rule_teacher import NAME, feedback_on
 from model.driving.pdm.scoring import Others, Scores, score
 from model.driving.pdm.world import STEP_S, STEPS, ScoreError, World
 from model.driving.trajectory import (
@@ -34,7 +34,7 @@ from model.engines.engine import Draw
 from model.families.registry import family_named
 from model.network.model_card import ModelCard
 from service.answers import plan_answer
-from service.feedback import CALLER, by_rule
+from service.feedback import CALLER
 from service.intake import Geometry, geometry_of
 from service.planning import Arrival, Begun, Planned
 from service.planning import Told as Happened
@@ -225,9 +225,7 @@ def _feedback(
     (judged,) = judged_plans(
         world, plans_of(draft[None]), before, Others(), threshold=asked.threshold, centre=True
     )
-    return wire_refine.DraftFeedback(
-        text=str(by_rule(judged, "teacher")), written_by=NAME, correct=judged.correct
-    )
+    return wire_refine.DraftFeedback(text=str(feedback_on(judged)), written_by=NAME, correct=judged.correct)
 
 
 def _after(world: World, draws: tuple[Draw, ...], request_id: str) -> list[TrajectoryScore | None]:

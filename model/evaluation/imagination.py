@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 
-from model.driving.intervals import Interval
 from model.driving.scene import LabelledScene
 from model.driving.trajectory import TEN_HZ_S
 from model.engines.engine import Controls, Draw, Engine
-from model.evaluation.bootstrap import Comparison, Measured, compare, mean_interval
+from model.evaluation.bootstrap import Comparison, compare
+from model.evaluation.figures import Columns, FigureRow, figure_table
 from model.evaluation.next_frames import (
     Painter,
     Pictures,
@@ -104,41 +104,6 @@ class ResponseResult:
 
 
 @dataclass(frozen=True)
-class FigureRow:
-    """Means of some results over scenes, with 95 % intervals over episodes.
-
-    Attributes:
-        name: of the row.
-        scenes, episodes: how many.
-        values, intervals: by measure; None where no scene has it.
-    """
-
-    name: str
-    scenes: int
-    episodes: int
-    values: Mapping[str, float | None]
-    intervals: Mapping[str, Interval | None]
-
-    @classmethod
-    def of(cls, name: str, results: Sequence[Measured], measures: Sequence[str]) -> Self:
-        """The row of some results."""
-        means = {measure: mean_interval(results, measure) for measure in measures}
-        return cls(
-            name,
-            len(results),
-            len({result.episode_id for result in results}),
-            {measure: mean for measure, (mean, _) in means.items()},
-            {measure: interval for measure, (_, interval) in means.items()},
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """The row with its measures as keys of their own, intervals below ``intervals``."""
-        intervals = {name: list(each) for name, each in self.intervals.items() if each is not None}
-        about = {"name": self.name, "scenes": self.scenes, "episodes": self.episodes}
-        return about | dict(self.values) | {"intervals": intervals}
-
-
-@dataclass(frozen=True)
 class ImaginationReport:
     """All tables of one evaluation.
 
@@ -174,14 +139,14 @@ class ImaginationReport:
 
     def _tables(self) -> Iterator[list[list[str]]]:
         for protocol, rows in self.waypoints.items():
-            yield _table(f"waypoints, {protocol}", rows, _WAYPOINT_COLUMNS)
-        yield _table("responses", self.responses, _RESPONSE_COLUMNS)
+            yield figure_table(f"waypoints, {protocol}", rows, _WAYPOINT_COLUMNS, _INTERVALS)
+        yield figure_table("responses", self.responses, _RESPONSE_COLUMNS, _INTERVALS)
         words = [score.action for score in next(iter(self.actions.values()))] if self.actions else []
         yield [["actions, F1", *words]] + [
             [name, *("-" if score.f1 is None else f"{score.f1:.1%}" for score in of)]
             for name, of in self.actions.items()
         ]
-        yield _table(f"pictures, by the {self.extractor}", self.pictures, _PICTURE_COLUMNS)
+        yield figure_table(f"pictures, by the {self.extractor}", self.pictures, _PICTURE_COLUMNS, _INTERVALS)
         yield [comparison_cells(comparison) for comparison in self.comparisons]
 
 
@@ -312,12 +277,10 @@ def _comparisons(
             yield compare(f"{one} : {other}", pictures[one].results, pictures[other].results, measure)
 
 
-_Columns = Mapping[str, tuple[str, str]]
-"""Title and pattern, by measure."""
 _INTERVALS: Final = frozenset({"l2_m", "collision_rate", "passes", *_PICTURE_MEASURES, "frechet"})
 """Measures whose intervals the text shows; JSON has all."""
 _TIMES: Final = ("1 s", "2 s", "3 s", "mean")
-_WAYPOINT_COLUMNS: Final[_Columns] = dict(
+_WAYPOINT_COLUMNS: Final[Columns] = dict(
     zip(
         WAYPOINT_MEASURES,
         (
@@ -327,28 +290,12 @@ _WAYPOINT_COLUMNS: Final[_Columns] = dict(
         strict=True,
     )
 )
-_RESPONSE_COLUMNS: Final[_Columns] = {
+_RESPONSE_COLUMNS: Final[Columns] = {
     "imagine_rate": ("imagines", "{:.1%}"),
     "passes": ("passes", "{:.1f}"),
 }
-_PICTURE_COLUMNS: Final[_Columns] = {
+_PICTURE_COLUMNS: Final[Columns] = {
     "psnr_db": ("PSNR, dB", "{:.2f}"),
     "feature_distance": ("features apart", "{:.3f}"),
     "frechet": ("frechet", "{:.3f}"),
 }
-
-
-def _table(title: str, rows: Sequence[FigureRow], columns: _Columns) -> list[list[str]]:
-    header = [title, "scenes"]
-    lines = [header]
-    for measure, (name, _) in columns.items():
-        header += [name, "95 %"] if measure in _INTERVALS else [name]
-    for row in rows:
-        cells = [row.name, str(row.scenes)]
-        for measure, (_, pattern) in columns.items():
-            value, interval = row.values[measure], row.intervals[measure]
-            cells.append("-" if value is None else pattern.format(value))
-            if measure in _INTERVALS:
-                cells.append("" if interval is None else "..".join(map(pattern.format, interval)))
-        lines.append(cells)
-    return lines

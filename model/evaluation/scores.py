@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
 from model.driving.intervals import Interval, ratio_interval
 from model.driving.pdm.comfort import Version
-from model.driving.pdm.labelled import moment_before, plans_of, states_of, world_of
+from model.driving.pdm.judging import SceneJudge
+from model.driving.pdm.labelled import moment_before, plans_of, states_of
 from model.driving.pdm.scoring import (
     COLLISIONS,
     COMFORT,
@@ -24,8 +25,6 @@ from model.driving.pdm.scoring import (
     PROGRESS,
     TIME_TO_COLLISION,
     WEIGHTS,
-    Others,
-    score,
 )
 from model.driving.pdm.world import Array
 from model.driving.scene import LabelledScene
@@ -55,16 +54,35 @@ class SceneScore:
     """What one trajectory is worth in one scene, by the rules of one version.
 
     Attributes:
-        episode_id: of the scene.
+        scene_id, episode_id: the scene's own.
         sub_scores: by name; None where what it needs is not known.
         score: None where a sub-score is.
         partial_score: of the sub-scores that are there; None where none is.
     """
 
+    scene_id: str
     episode_id: str
     sub_scores: Mapping[str, float | None]
     score: float | None
     partial_score: float | None
+
+    @classmethod
+    def mean(cls, scores: Sequence[Self]) -> Self:
+        """The mean of several trajectories of one scene; what is not known of one, is not known."""
+        first = scores[0]
+        return cls(
+            first.scene_id,
+            first.episode_id,
+            {name: mean_of([each.sub_scores[name] for each in scores]) for name in first.sub_scores},
+            mean_of([each.score for each in scores]),
+            mean_of([each.partial_score for each in scores]),
+        )
+
+
+def mean_of(values: Sequence[float | None]) -> float | None:
+    """Their mean; None where one of them is not known, or there are none."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None
 
 
 @dataclass(frozen=True)
@@ -178,7 +196,7 @@ class ScoreTable:
 
 
 Planner = Callable[[LabelledScene], tuple[FloatArray, Array | None]]
-"""A trajectory [64, 4], and the simulated states [41, 11] of the one made `BEFORE_S` earlier, where known."""
+"""A trajectory [8 or 64, 4], and simulated states [41, 11] of the one made `BEFORE_S` before, if known."""
 
 
 def expert_way(labelled: LabelledScene) -> tuple[FloatArray, Array | None]:
@@ -198,7 +216,7 @@ def by_rule(baseline: Callable[[FloatArray], FloatArray]) -> Planner:
 
 
 def by_scene(scenes: Sequence[LabelledScene], trajectories: Mapping[str, FloatArray]) -> Planner:
-    """A planner whose trajectories [64, 4] are known by scene id.
+    """A planner whose trajectories [8 or 64, 4] are known by scene id.
 
     What it planned before is its trajectory of the scene that lies `BEFORE_S` back in the same episode, told
     by the step in generated scenes' names.
@@ -229,39 +247,50 @@ def score_table(
         ValueError: no scenes.
         ScoreError, SolveError: see `model.driving.pdm.scoring.score`.
     """
-    baselines = {name: by_rule(baseline) for name, baseline in BASELINES.items()}
-    every: dict[str, Planner] = {EXPERT: expert_way, **baselines, **planners}
-    found: dict[Version, dict[str, list[SceneScore]]] = {
-        version: {name: [] for name in every} for version in VERSIONS
-    }
-    for labelled in scenes:
-        for name, planner in every.items():
-            for version, result in _scored(labelled, planner, forgive=forgive):
-                found[version][name].append(result)
+    judges = [SceneJudge(each) for each in scenes]
+    every = {**baseline_planners(), **planners}
+    found = {name: scene_scores(judges, planner, forgive=forgive) for name, planner in every.items()}
+    return table_of(judges, found, forgiven=forgive)
+
+
+def baseline_planners() -> dict[str, Planner]:
+    """The expert and the kinematic baselines."""
+    return {EXPERT: expert_way} | {name: by_rule(baseline) for name, baseline in BASELINES.items()}
+
+
+def scene_scores(
+    judges: Sequence[SceneJudge], planner: Planner, *, forgive: bool = False
+) -> dict[Version, list[SceneScore]]:
+    """What a planner is worth in every scene, by both versions' rules; see `score_table`."""
+    found: dict[Version, list[SceneScore]] = {version: [] for version in VERSIONS}
+    for judge in judges:
+        trajectory, before = planner(judge.labelled)
+        plan = plans_of(trajectory)[None]
+        for version, results in found.items():
+            scores = judge.scores(plan, version, previous=before, forgive=forgive)
+            subs = {
+                name: None if values is None else _known(values[0])
+                for name, values in scores.sub_scores.items()
+            }
+            whole, partial = _known(scores.score[0]), _known(scores.partial_score[0])
+            about = judge.labelled.scene.scene_id, judge.labelled.episode_id
+            results.append(SceneScore(*about, subs, whole, partial))
+    return found
+
+
+def table_of(
+    judges: Sequence[SceneJudge],
+    found: Mapping[str, Mapping[Version, Sequence[SceneScore]]],
+    *,
+    forgiven: bool = False,
+) -> ScoreTable:
+    """The table of planners' scores in the scenes of ``judges``; raises ValueError without scenes."""
     rows = {
-        version: tuple(ScoreRow.of(name, version, scores) for name, scores in of.items())
-        for version, of in found.items()
+        version: tuple(ScoreRow.of(name, version, of[version]) for name, of in found.items())
+        for version in VERSIONS
     }
-    known = [each.lane_map for each in scenes if each.lane_map is not None]
-    return ScoreTable(rows, forgive, sum(not lane_map.has_lights for lane_map in known))
-
-
-def _scored(
-    labelled: LabelledScene, planner: Planner, *, forgive: bool
-) -> Iterator[tuple[Version, SceneScore]]:
-    world, expert = world_of(labelled), plans_of(labelled.future)
-    trajectory, before = planner(labelled)
-    plan = plans_of(trajectory)[None]
-    for version in VERSIONS:
-        others = Others(expert, EXPERT, before, BEFORE_S, expert if forgive else None)
-        scores = score(world, plan, version, others, centre=True)
-        subs = {
-            name: None if values is None else _known(values[0]) for name, values in scores.sub_scores.items()
-        }
-        yield (
-            version,
-            SceneScore(labelled.episode_id, subs, _known(scores.score[0]), _known(scores.partial_score[0])),
-        )
+    known = [lane_map for judge in judges if (lane_map := judge.labelled.lane_map) is not None]
+    return ScoreTable(rows, forgiven, sum(not lane_map.has_lights for lane_map in known))
 
 
 def _known(value: float) -> float | None:

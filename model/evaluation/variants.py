@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,9 @@ from model.engines.engine import (
 )
 from model.evaluation.open_loop import SceneResult, evaluate_draws
 from model.families.registry import family_named
+
+_Scene = TypeVar("_Scene")
+_Found = TypeVar("_Found")
 
 SPEED_FACTORS: Final = (0.5, 1.5)
 """A planner that copies its speed goes as much slower or faster as its history; the expert does not."""
@@ -114,37 +117,53 @@ async def evaluate_engine(
         EngineError, RequestError: the engine's.
         ValueError: a variant that the scenes do not allow.
     """
-    source = iter(with_shuffled_images(scenes) if variant.shuffled_images else scenes)
-    numbered = enumerate(source)
-    one_reader = asyncio.Lock()
-    results: dict[int, SceneResult] = {}
 
-    async def work() -> None:
+    async def work(labelled: LabelledScene) -> SceneResult:
+        draws = await planned(engine, request_for(labelled, variant))
+        greedy = await planned(engine, greedy_request(labelled, variant)) if variant.greedy else [None]
+        result = evaluate_draws(labelled, draws, greedy[0])
+        if on_draws is not None:
+            on_draws(labelled, draws)
+        if on_result is not None:
+            on_result(result)
+        return result
+
+    source = with_shuffled_images(scenes) if variant.shuffled_images else scenes
+    return await over_scenes(source, work, concurrency)
+
+
+async def over_scenes(
+    scenes: Iterable[_Scene], work: Callable[[_Scene], Awaitable[_Found]], concurrency: int
+) -> list[_Found]:
+    """What ``work`` makes of each scene, in their order, so many under way at once.
+
+    Scenes are taken one by one. What ``work`` raises ends all.
+    """
+    numbered = enumerate(scenes)
+    one_reader = asyncio.Lock()
+    results: dict[int, _Found] = {}
+
+    async def take() -> None:
         while True:
             async with one_reader:
                 # Reading and decompressing takes a while; the engine shares this event loop.
                 item = await asyncio.to_thread(next, numbered, None)
             if item is None:
                 return
-            index, labelled = item
-            draws = await _plan(engine, request_for(labelled, variant))
-            greedy = await _plan(engine, greedy_request(labelled, variant)) if variant.greedy else [None]
-            results[index] = evaluate_draws(labelled, draws, greedy[0])
-            if on_draws is not None:
-                on_draws(labelled, draws)
-            if on_result is not None:
-                on_result(results[index])
+            index, scene = item
+            results[index] = await work(scene)
 
     try:
         async with asyncio.TaskGroup() as group:
             for _ in range(concurrency):
-                group.create_task(work())
+                group.create_task(take())
     except ExceptionGroup as failures:
         raise failures.exceptions[0] from None
     return [results[index] for index in range(len(results))]
 
 
-async def _plan(engine: Engine, request: PlanRequest) -> list[Draw]:
+async def planned(engine: Engine, request: PlanRequest) -> list[Draw]:
+    """The draws of a request in order; raises `EngineError` where some are missing."""
     draws = [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
     if len(draws) != request.controls.n:
         raise EngineError(f"{request.request_id}: {len(draws)} draws came for {request.controls.n}")

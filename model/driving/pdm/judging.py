@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -110,9 +110,22 @@ class SceneJudge:
         self._world, self._expert = world_of(labelled), plans_of(labelled.future)
         self._others = Others(self._expert, "expert")
 
-    def scores(self, plans: Array, version: Version) -> Scores:
-        """Of plans [n, 8, 3] or [n, 64, 3]; raises `ScoreError` or `SolveError` as `score` does."""
-        return score(self._world, plans, version, self._others, centre=True)
+    def scores(
+        self, plans: Array, version: Version, *, previous: Array | None = None, forgive: bool = False
+    ) -> Scores:
+        """Of plans [n, 8, 3] or [n, 64, 3].
+
+        Args:
+            plans: to be scored.
+            version: whose rules.
+            previous: [41, 11], simulated states of the plan made half a second earlier, where it is known.
+            forgive: what the expert fails at too (v2.2).
+
+        Raises:
+            ScoreError, SolveError: see `score`.
+        """
+        others = replace(self._others, previous=previous, human=self._expert if forgive else None)
+        return score(self._world, plans, version, others, centre=True)
 
     def judged(
         self,

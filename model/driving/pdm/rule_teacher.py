@@ -11,7 +11,7 @@ from typing import Final
 
 from model.driving.pdm.course import Course
 from model.driving.pdm.failures import Fact, Other
-from model.driving.pdm.feedback import BEGIN, END, Feedback
+from model.driving.pdm.feedback import BEGIN, END, Feedback, RuleFeedback
 from model.driving.pdm.judged import HORIZON_S, JudgedPlan, called
 from model.driving.pdm.scoring import (
     COLLISIONS,
@@ -70,6 +70,11 @@ _BOUNDS: Final = {
     "rad_s2": "rad/s\u00b2",
     "rad_s": "rad/s",
 }
+
+
+def feedback_on(judged: JudgedPlan) -> Feedback | RuleFeedback:
+    """ELF-VLA section 7.2: sections on what is wrong, the verdict on what is correct."""
+    return RuleFeedback(judged.score, correct=True) if judged.correct else critique(judged)
 
 
 def critique(judged: JudgedPlan) -> Feedback:

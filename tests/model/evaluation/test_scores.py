@@ -118,7 +118,10 @@ def test_the_experts_earlier_plan_is_what_it_drove() -> None:
 def test_rows_are_means_over_scenes_and_need_some() -> None:
     names = dict.fromkeys(("no_at_fault_collisions", "drivable_area_compliance"), 1.0)
     subs = {**names, PROGRESS: 0.5, "time_to_collision": 1.0, "comfort": None}
-    scores = [SceneScore("a", subs, None, 0.75), SceneScore("b", {**subs, "comfort": 1.0}, 0.8, 0.8)]
+    scores = [
+        SceneScore("1", "a", subs, None, 0.75),
+        SceneScore("2", "b", {**subs, "comfort": 1.0}, 0.8, 0.8),
+    ]
     row = ScoreRow.of("x", "v1.1", scores)
     assert row.score is None
     assert row.partial_score == pytest.approx(0.775)
