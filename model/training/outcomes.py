@@ -6,8 +6,8 @@ over the tokens that the format allows, at the temperature of the draws. The exp
 beside it, against drivers who find a gap in the score.
 
 Where all draws of a scene fail, nothing says what would be better. There the network refines its best draw by
-the built-in teacher's feedback, which knows what the expert did. The refinement joins the scene's draws as an
-answer to the first prompt: so the first answer learns what feedback led to (ELF-VLA section 9).
+feedback, of the built-in teacher or by rule, which knows what the expert did. The refinement joins the draws
+as an answer to the first prompt: so the first answer learns what feedback led to (ELF-VLA section 9).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch.utils.data import Dataset
 
 from model.driving.pdm.judging import Said, SceneJudge
 from model.driving.pdm.labelled import plans_of
-from model.driving.pdm.rule_teacher import critique
+from model.driving.pdm.rule_teacher import critique, verdict_with_truth
 from model.driving.scene import LabelledScene
 from model.engines.engine import Controls, Draw, PlanRequest
 from model.engines.torch.offline import draws_of
@@ -34,7 +34,7 @@ from model.network.checkpoint import Loaded
 from model.training.batches import Item, ResponseDataset, Sample, collate
 from model.training.learner import ResponseLearner
 from model.training.policy import advantages, policy_loss
-from model.training.recipes import OutcomeSettings
+from model.training.recipes import FeedbackWriter, OutcomeSettings
 from model.training.rewards import Rewards, rewards
 from model.training.rollouts import with_draws
 
@@ -194,19 +194,24 @@ class OutcomeLearner(nn.Module):
                     asked,
                     format=refining.format,
                     controls=replace(asked.controls, n=refining.count),
-                    attempt=self._attempt(judges[place], draws[place][int(judged[place].outcome.argmax())]),
+                    attempt=self._attempt(
+                        judges[place],
+                        draws[place][int(judged[place].outcome.argmax())],
+                        refining.feedback,
+                    ),
                 )
             )
         for place, refinements in zip(failed, self._drawn_by(requests) if requests else (), strict=True):
             found[place] = refinements
         return found
 
-    def _attempt(self, judge: SceneJudge, draft: Draw) -> Attempt:
-        """A draft with the built-in teacher's feedback, measured against the expert."""
+    def _attempt(self, judge: SceneJudge, draft: Draw, writer: FeedbackWriter) -> Attempt:
+        """A draft with feedback, measured against the expert."""
         plan = None if draft.plan is None else str(draft.plan)
         said = [Said(plan, draft.thinking)]
         [judged] = judge.judged(plans_of(draft.scored[None]), self._settings.version, said=said)
-        return Attempt(draft.trajectory, str(critique(judged)))
+        feedback = str(critique(judged)) if writer == "teacher" else verdict_with_truth(judged)
+        return Attempt(draft.trajectory, feedback)
 
     def _policy(
         self,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from model.driving.pdm.comfort import Version
 from model.driving.pdm.judged import THRESHOLD
@@ -21,6 +21,7 @@ from model.training.rewards import RewardWeights
 from model.training.targets import SectionWeights
 
 Goal = Literal["ground", "read", "respond", "outcome", "code"]
+FeedbackWriter = Literal["teacher", "rule"]
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,15 @@ class RefineSettings:
     Attributes:
         format: that it refines in; what it writes there must be an answer in the format of its draws.
         threshold: scenes are refined whose best draw scores less.
+        feedback: the ``teacher``'s five sections, or the verdict by ``rule`` with what the expert did, which
+            ELF-VLA compares with as Rule-GRPO (section 9.1).
         count: refinements of a scene.
         gamma: of the weight that their decisions have, see `policy_loss`.
     """
 
     format: str
     threshold: float = THRESHOLD
+    feedback: FeedbackWriter = "teacher"
     count: int = 1
     gamma: float = 0.1
 
@@ -252,8 +256,8 @@ NANO: Final[Mapping[str, Recipe]] = (
 ELF-VLA, the first two of VLA-World, and outcome training."""
 
 
-def refining_below(recipe: Recipe, threshold: float) -> Recipe:
-    """A recipe that refines scenes whose best draw scores below ``threshold``; 0 refines none.
+def refining_with(recipe: Recipe, **changes: Any) -> Recipe:
+    """A recipe with other `RefineSettings`, such as a ``threshold`` of 0, below which nothing is refined.
 
     Raises:
         ValueError: it refines nothing.
@@ -261,7 +265,7 @@ def refining_below(recipe: Recipe, threshold: float) -> Recipe:
     outcome = recipe.outcome
     if outcome is None or outcome.refining is None:
         raise ValueError(f"recipe {recipe.name} refines no draws")
-    refining = replace(outcome.refining, threshold=threshold)
+    refining = replace(outcome.refining, **changes)
     return replace(recipe, outcome=replace(outcome, refining=refining))
 
 

@@ -225,7 +225,9 @@ def run(
 def _check_refining(recipe: Recipe, loaded: Loaded) -> None:
     """Raise ValueError unless a checkpoint can refine what a recipe has it refine."""
     refining = None if recipe.outcome is None else recipe.outcome.refining
-    if refining is not None and refining.format not in loaded.settings.formats:
+    if refining is None or refining.threshold == 0:
+        return
+    if refining.format not in loaded.settings.formats:
         raise ValueError(
             f"recipe {recipe.name} refines what fails, and {loaded.card.name} does not write "
             f"{refining.format}: `looktwice train elf-sft --failures` teaches it"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -66,6 +66,13 @@ def train(
             max=1,
         ),
     ] = None,
+    refine_by: Annotated[
+        Literal["teacher", "rule"] | None,
+        typer.Option(
+            help="elf-rl: by the teacher's sections, as the recipe says, or by the verdict with what the "
+            "expert did."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of order and initialisation.")] = 0,
     threads: Annotated[int | None, typer.Option(help="CPU threads.", min=1)] = None,
     bf16: Annotated[
@@ -98,7 +105,7 @@ def train(
     from model.network.allocator import keep_freed_memory
     from model.network.precision import bfloat16_is_fast
     from model.network.small_planner import DRIVING_KINDS
-    from model.training.recipes import NANO, PAPER, VISUAL_CODES, refining_below
+    from model.training.recipes import NANO, PAPER, VISUAL_CODES, refining_with
     from model.training.run import RunSettings, create, run
     from model.training.small import SmallSettings
     from model.training.trainer import LOG_FILE
@@ -166,7 +173,9 @@ def train(
             seed=seed,
         )
         if refine_below is not None:
-            chosen = refining_below(chosen, refine_below)
+            chosen = refining_with(chosen, threshold=refine_below)
+        if refine_by is not None:
+            chosen = refining_with(chosen, feedback=refine_by)
         held_out = []
         if validation is not None:
             every = max(1, count_scenes(validation) // validation_scenes)

@@ -77,6 +77,15 @@ def feedback_on(judged: JudgedPlan) -> Feedback | RuleFeedback:
     return RuleFeedback(judged.score, correct=True) if judged.correct else critique(judged)
 
 
+def verdict_with_truth(judged: JudgedPlan) -> str:
+    """The verdict by rule, and behind it what the human did, where that is known (section 9.1, Rule-GRPO)."""
+    verdict = str(RuleFeedback(judged.score, judged.correct))
+    if not judged.true_waypoints:
+        return verdict
+    truth = ", ".join(f"[{x:.2f}, {y:.2f}]" for _, x, y in judged.true_waypoints)
+    return f"{verdict} The correct trajectory is {truth}."
+
+
 def critique(judged: JudgedPlan) -> Feedback:
     """The sections on a plan; the same for the same facts."""
     return Feedback(

@@ -18,7 +18,7 @@ from model.formats.replay import decisions
 from model.network.checkpoint import load
 from model.training.batches import Item, collate
 from model.training.outcomes import OutcomeLearner
-from model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_below
+from model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_with
 from model.training.rewards import RewardWeights, form_reward, goal_reward, rewards
 from model.training.run import RunSettings, run
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
@@ -206,13 +206,40 @@ def test_failed_drafts_are_refined_by_feedback_and_learned_as_first_answers(
     assert stage["outcome"]["refining"]["gamma"] == 0.1
 
 
-def test_below_no_threshold_nothing_is_refined(
-    refining_checkpoint: Path, two_scenes: Path, tmp_path: Path
+def test_below_no_threshold_nothing_is_refined_and_nobody_needs_to_refine(
+    resampling_checkpoint: Path, two_scenes: Path, tmp_path: Path
 ) -> None:
-    recipe = refining_below(elf_recipe(), 0.0)
-    assert noted("refined_rate", recipe, two_scenes, refining_checkpoint, tmp_path) == [0.0, 0.0]
+    recipe = refining_with(elf_recipe(), threshold=0.0)
+    assert noted("refined_rate", recipe, two_scenes, resampling_checkpoint, tmp_path) == [0.0, 0.0]
+    assert ELF[1] not in load(tmp_path / "rl").card.formats
     with pytest.raises(ValueError, match="recipe cf-rl refines no draws"):
-        refining_below(NANO["cf-rl"], 0.5)
+        refining_with(NANO["cf-rl"], threshold=0.5)
+
+
+def test_feedback_by_rule_is_the_verdict_and_what_the_expert_did(
+    refining_checkpoint: Path, two_scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: dict[str, str] = {}
+    plain = OutcomeLearner._drawn_by
+
+    def drawing(self: OutcomeLearner, requests: list[PlanRequest]) -> list[list[Draw]]:
+        told.update((each.scene.scene_id, each.attempt.feedback) for each in requests if each.attempt)
+        return plain(self, requests)
+
+    monkeypatch.setattr(OutcomeLearner, "_drawn_by", drawing)
+    recipe = refining_with(
+        replace(elf_recipe(refining=RefineSettings(ELF[1], threshold=1.1)), steps=1), feedback="rule"
+    )
+    noted("refined_rate", recipe, two_scenes, refining_checkpoint, tmp_path)
+    assert len(told) == 2
+    for scene in (training_scene(index) for index in (1, 2)):
+        text = told[scene.scene.scene_id]
+        end = scene.future[39]
+        assert text.startswith("The driving score is ")
+        assert "Meta action" not in text
+        assert text.endswith(f"[{end[0]:.2f}, {end[1]:.2f}].")
+    [stage] = load(tmp_path / "rl").card.details["stages"]
+    assert stage["outcome"]["refining"]["feedback"] == "rule"
 
 
 def test_who_cannot_refine_is_refused(resampling_checkpoint: Path, two_scenes: Path, tmp_path: Path) -> None:
