@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from model.driving.scene import LabelledScene
     from model.driving.trajectory import FloatArray
     from model.engines.engine import Controls, Draw, Engine
+    from model.evaluation.failures import FailuresReport
     from model.evaluation.imagination import ImaginationReport
     from model.evaluation.ladder import LadderReport
     from model.evaluation.open_loop import SceneResult
@@ -61,15 +62,24 @@ def evaluate(
     device: Device = "cpu",
     vllm_arguments: VllmArguments = "{}",
     preset: Annotated[
-        Literal["standard", "ladder", "imagination"],
+        Literal["standard", "ladder", "imagination", "failures"],
         typer.Option(
             help="ladder: what thinking brings, checkpoint by checkpoint. imagination: waypoints with and "
-            "without a picture of the next half second, and how good the pictures are."
+            "without a picture of the next half second, and how good the pictures are. failures: scores of "
+            "each --stage, and what refining by feedback brings."
         ),
     ] = "standard",
     ladder: Annotated[
         Path | None, typer.Option(help="Folder of the ladder's checkpoints; --checkpoint counts among them.")
     ] = None,
+    stage: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="failures: NAME=FOLDER of a checkpoint, or FOLDER; one for each stage, in the order of "
+            "learning. --checkpoint alone if not given."
+        ),
+    ] = None,
+    seeds: Annotated[int, typer.Option(help="failures: plan each scene with so many seeds.", min=1)] = 1,
     sweep: Annotated[
         int, typer.Option(help="Scenes for the ladder's temperatures, evenly chosen.", min=1)
     ] = 240,
@@ -144,7 +154,7 @@ def evaluate(
             typer.echo(json.dumps(told_as) if as_json else text)
             return
 
-        report: Report | LadderReport | ImaginationReport
+        report: Report | LadderReport | ImaginationReport | FailuresReport
         if preset == "ladder":
             report = _ladder(
                 labelled,
@@ -160,6 +170,11 @@ def evaluate(
             )
         elif preset == "imagination":
             report = _imagination(labelled, engine_of(checkpoint), checkpoint, controls, rows, quiet=as_json)
+        elif preset == "failures":
+            from service.cli.evaluate_failures import evaluate_stages, stages_named
+
+            stages = stages_named(stage or [str(checkpoint)])
+            report = evaluate_stages(labelled, engine_of, stages, controls, seeds, rows, quiet=as_json)
         else:
             from model.evaluation.report import evaluate_checkpoint
             from model.evaluation.variants import standard_variants
