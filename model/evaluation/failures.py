@@ -296,7 +296,7 @@ def _result(
 def _over_seeds(results: Sequence[StageResult]) -> StageResult:
     """The mean of a scene's results, of each measure over the seeds that have it."""
     first = results[0]
-    means = {
+    means: dict[str, Any] = {
         measure: mean_of([value for each in results if (value := getattr(each, measure)) is not None])
         for measure in MEASURES
     }
