@@ -83,7 +83,7 @@ def stage_variants(name: str, card: ModelCard, controls: Controls, seeds: int) -
 class StageResult:
     """What a stage's answers to one scene are worth: means over the seeds.
 
-    The answer is the draw that the others of its seed agree with most.
+    The answer is the agreed draw of its seed.
 
     Attributes:
         scene_id, episode_id: the scene's own.
@@ -217,7 +217,7 @@ async def evaluate_stage(
 
 
 def _answer(judge: SceneJudge, draws: Sequence[Draw]) -> _Answer:
-    """The draw that the others agree with most, and what automatic feedback goes by."""
+    """The agreed draw, and what automatic feedback goes by."""
     chosen = agreed(np.stack([draw.at_10_hz for draw in draws]))
     worth = judge.scores(plans_of(np.stack([draw.scored for draw in draws])), VERSION).partial_score
     known = judge.labelled.given(route=True, tracks=True)
