@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from model.driving.scene import LabelledScene
     from model.driving.trajectory import FloatArray
     from model.engines.engine import Controls, Draw, Engine
-    from model.evaluation.failures import FailuresReport
+    from model.evaluation.failures_report import FailuresReport
     from model.evaluation.imagination import ImaginationReport
     from model.evaluation.ladder import LadderReport
     from model.evaluation.open_loop import SceneResult

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from model.driving.scene import LabelledScene
     from model.engines.engine import Controls, Engine
-    from model.evaluation.failures import FailuresReport
+    from model.evaluation.failures_report import FailuresReport
 
 
 def stages_named(given: Sequence[str]) -> dict[str, Path]:
@@ -44,7 +44,8 @@ def evaluate_stages(
 ) -> FailuresReport:
     """Evaluate stages one after the other on the same scenes."""
     from model.driving.pdm.judging import SceneJudge
-    from model.evaluation.failures import evaluate_stage, failures_report, stage_variants
+    from model.evaluation.failures import evaluate_stage, stage_variants
+    from model.evaluation.failures_report import failures_report
     from service.cli.evaluate import run_started
 
     judges = [SceneJudge(each) for each in scenes]
