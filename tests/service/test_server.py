@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import itertools
 import json
 import os
 import re
+import resource
 import signal
 import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,9 +26,10 @@ import pytest
 from clients.labelling.checks import FailedCheck
 from clients.labelling.teachers.teacher import Answer, Question
 from loadtests.bodies import make_call
-from loadtests.costly import costly_calls
+from loadtests.costly import costly_calls, scans
 from loadtests.mix import Kind
 from model.bundled import CHECKPOINT
+from model.driving.images import decode_image
 from model.engines.engine import EngineError
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from service.app import create_app
@@ -38,6 +42,7 @@ from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, Scripte
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem
 from tests.sockets import free_port, listening
+from tests.waiting import until
 
 WAIT_S = 120
 
@@ -429,6 +434,61 @@ def test_a_log_that_nobody_reads_holds_up_nobody_and_dear_requests_are_refused()
         assert float(lost.split()[1]) > 0
         started.send_signal(signal.SIGTERM)
         assert started.wait(WAIT_S) == 0
+
+
+def test_sigterm_while_pictures_are_decoded_ends_it() -> None:
+    """Half a minute of decoding waits when the signal comes, and a tenth of a second is left for it.
+
+    Every picture differs, as those that were seen before are not decoded again. What is left undone shows in
+    the time of processors, which a busy machine does not change.
+    """
+    scenes, dear, numbers = 40, scans(20), itertools.count()
+    timeouts = {"LOOKTWICE_QUEUE_TIMEOUT_S": "600", "LOOKTWICE_DECODE_TIMEOUT_S": "600"}
+    settings = timeouts | {"LOOKTWICE_MAX_DRAWS": str(scenes), "LOOKTWICE_DRAIN_S": "0.1"}
+    answers: list[int | str] = []
+    began_s = time.thread_time()
+    decode_image(dear)
+    waiting_s = 8 * scenes * (time.thread_time() - began_s)
+
+    def ask(http: httpx.Client) -> None:
+        document = body(n=1)
+        for clip in document["scene"]["clips"]:
+            # Bytes behind the end of a picture are not read.
+            pictures = [dear + next(numbers).to_bytes(4, "big") for _ in clip["images"]]
+            clip["images"] = [base64.b64encode(picture).decode() for picture in pictures]
+        try:
+            answers.append(http.post("/v1/plan", json=document).status_code)
+        except httpx.TransportError as error:
+            answers.append(repr(error))
+
+    ended_before_s = _processors_s()
+    with (
+        process(subprocess.DEVNULL, LOOKTWICE_DRAIN_NOTICE_S="0", **settings) as (started, url),
+        httpx.Client(base_url=url, timeout=600) as http,
+    ):
+
+        def metric(name: str) -> float:
+            [value] = re.findall(rf"^{name} (.+)$", http.get("/metrics").text, re.M)
+            return float(value)
+
+        threads = [threading.Thread(target=ask, args=(http,)) for _ in range(scenes)]
+        for thread in threads:
+            thread.start()
+        until(lambda: metric("looktwice_plans_in_flight") + len(answers) == scenes, WAIT_S, every_s=0.1)
+        signalled_s = metric("process_cpu_seconds_total")
+        started.send_signal(signal.SIGTERM)
+        assert started.wait(WAIT_S) == 0
+        for thread in threads:
+            thread.join()
+    assert set(answers) <= {200, 503}
+    assert 503 in answers, "nothing was left to decode"
+    assert _processors_s() - ended_before_s - signalled_s < waiting_s / 2
+
+
+def _processors_s() -> float:
+    """Time of processors that children took which have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def test_a_damaged_picture_is_told_as_one() -> None:
