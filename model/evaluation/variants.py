@@ -93,6 +93,21 @@ def standard_variants(
     return variants
 
 
+def check_variants(scenes: Sequence[LabelledScene], variants: Iterable[Variant]) -> None:
+    """Refuse what scenes do not allow, before anything is planned.
+
+    Raises:
+        ValueError: no scenes; a variant that they do not allow.
+    """
+    if not scenes:
+        raise ValueError("there are no scenes to evaluate on")
+    for variant in variants:
+        if variant.shuffled_images:
+            _longest([labelled.episode_id for labelled in scenes])
+        for labelled in scenes:
+            _check_scene(labelled, variant)
+
+
 async def evaluate_engine(
     engine: Engine,
     scenes: Iterable[LabelledScene],
@@ -172,9 +187,8 @@ async def planned(engine: Engine, request: PlanRequest) -> list[Draw]:
 
 def request_for(labelled: LabelledScene, variant: Variant) -> PlanRequest:
     """What the engine is asked for a scene (with shuffled images: one that has them already)."""
+    _check_scene(labelled, variant)
     scene = labelled.scene
-    if variant.route and scene.route is None:
-        raise ValueError(f"{variant.name}: scene {scene.scene_id} has no route")
     # A draw's random numbers depend on the seed alone: one seed for all scenes would give all the same
     # luck. A seed from the scene's name does not, and variants still meet the same luck in the same scene.
     seed = variant.controls.seed ^ zlib.crc32(scene.scene_id.encode())
@@ -192,6 +206,13 @@ def request_for(labelled: LabelledScene, variant: Variant) -> PlanRequest:
             camera=next_camera(labelled) if variant.next_camera else variant.controls.camera,
         ),
     )
+
+
+def _check_scene(labelled: LabelledScene, variant: Variant) -> None:
+    if variant.route and labelled.scene.route is None:
+        raise ValueError(f"{variant.name}: scene {labelled.scene.scene_id} has no route")
+    if variant.next_camera:
+        next_camera(labelled)
 
 
 def next_camera(labelled: LabelledScene) -> str:
@@ -243,10 +264,19 @@ def _donors(episodes: Sequence[str], seed: int) -> list[int]:
     random = np.random.default_rng(seed)
     rank = {episode: position for position, episode in enumerate(random.permutation(sorted(set(episodes))))}
     order = sorted(random.permutation(len(episodes)).tolist(), key=lambda index: rank[episodes[index]])
-    longest = max(Counter(episodes).values(), default=0)
-    if 2 * longest > len(episodes):
-        raise ValueError("shuffling needs scenes of several episodes, none with more than half of the scenes")
+    longest = _longest(episodes)
     donors = [0] * len(order)
     for position, index in enumerate(order):
         donors[index] = order[(position + longest) % len(order)]
     return donors
+
+
+def _longest(episodes: Sequence[str]) -> int:
+    """How many scenes the longest episode has; raises ValueError where that is more than all others have."""
+    longest = max(Counter(episodes).values(), default=0)
+    if 2 * longest > len(episodes):
+        raise ValueError(
+            "shuffled images come from other episodes, so no episode may have more than half of the scenes; "
+            f"of these {len(episodes)} one has {longest}: take more scenes, or others"
+        )
+    return longest

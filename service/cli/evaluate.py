@@ -344,7 +344,15 @@ async def run_started(
     *,
     quiet: bool,
 ) -> _Found:
-    """What ``evaluate`` makes of an engine that runs meanwhile."""
+    """What ``evaluate`` makes of an engine that runs meanwhile.
+
+    Raises:
+        EngineError, RequestError: the engine's.
+        ValueError: the scenes do not allow a variant, told before the engine starts.
+    """
+    from model.evaluation.variants import check_variants
+
+    check_variants(scenes, variants)
     await engine.start()
     try:
         with _progress(quiet) as progress:

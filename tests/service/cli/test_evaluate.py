@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import AsyncGenerator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from model.bundled import SCENES
-from model.driving.scene_store import read_scenes
+from model.driving.scene_store import read_scenes, write_scenes
 from model.engines.engine import Event, PlanRequest
 from model.engines.torch.engine import TorchEngine
 from service.cli.commands import app
@@ -62,6 +63,26 @@ def test_a_ladder_is_climbed_once_and_told_again(
     monkeypatch.setattr(TorchEngine, "submit", planning)
     assert ladder(untrained_checkpoint, tmp_path, "--ladder", str(rungs)) == told
     assert not planned & {each.scene.scene_id for each in read_scenes(SCENES)}, "all draws are kept"
+
+
+def test_scenes_that_a_row_does_not_allow_are_refused_before_the_engine_starts(
+    untrained_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = list[TorchEngine]()
+    monkeypatch.setattr(TorchEngine, "start", started.append)
+
+    def refusal(*more: str) -> str:
+        result = CliRunner().invoke(app, ["evaluate", "--checkpoint", str(untrained_checkpoint), *more])
+        assert result.exit_code == 2, result.output
+        return result.output
+
+    assert "of these 1 one has 1: take more scenes" in refusal("--limit", "1")
+    routeless = [replace(each, scene=replace(each.scene, route=None)) for each in read_scenes(SCENES)]
+    write_scenes(tmp_path / "routeless.parquet", routeless)
+    assert "has no route" in refusal("--scenes", str(tmp_path / "routeless.parquet"))
+    write_scenes(tmp_path / "none.parquet", [])
+    assert "no scenes to evaluate on" in refusal("--scenes", str(tmp_path / "none.parquet"))
+    assert not started
 
 
 def test_perception_needs_a_resampler_and_tells_facts_and_gate(
