@@ -110,7 +110,7 @@ class Newcomer:
         self, folder: Path, port: int = PORT, left_out: Mapping[str, str] = ELSEWHERE, *, network: bool = True
     ) -> None:
         self.folder, self.port, self.left_out, self.network = folder, port, left_out, network
-        self.activated = False
+        self.activated, self.longest_s = False, _LONGEST_S
 
     def environment(self) -> dict[str, str]:
         kept = {
@@ -125,22 +125,32 @@ class Newcomer:
         return kept | {"PATH": ":".join(paths), "COLUMNS": str(_COLUMNS)}
 
     def run(self, command: str, *, folder: Path | None = None) -> str:
-        """Run a command to its end and say how long it took; raises `Faulty` where it fails."""
+        """Run a command to its end and say how long it took.
+
+        Raises:
+            Faulty: it fails, or takes too long; with it ends what it started.
+        """
         began = time.monotonic()
-        done = subprocess.run(
+        with subprocess.Popen(
             ["bash", "-c", command],
             cwd=folder or self.folder,
             env=self.environment(),
             text=True,
-            timeout=_LONGEST_S,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            check=False,
-        )
+            start_new_session=True,
+        ) as running:
+            try:
+                told, _ = running.communicate(timeout=self.longest_s)
+            except subprocess.TimeoutExpired:
+                raise Faulty(f"{command}\nis not done within {self.longest_s:.0f} s") from None
+            finally:
+                if running.returncode is None:
+                    os.killpg(running.pid, signal.SIGKILL)
         print(f"{time.monotonic() - began:6.1f} s  {command.splitlines()[0][:110]}", flush=True)
-        if done.returncode:
-            raise Faulty(f"{command}\nended with {done.returncode}:\n{done.stdout[-3000:]}")
-        return done.stdout
+        if running.returncode:
+            raise Faulty(f"{command}\nended with {running.returncode}:\n{told[-3000:]}")
+        return told
 
     @contextmanager
     def service(self) -> Iterator[None]:

@@ -17,6 +17,8 @@ from tests.docs.clean_clone import (
     MINUTE,
     SERVE,
     TRIED,
+    Faulty,
+    Newcomer,
     blocks,
     follow_without_network,
     left_out,
@@ -54,6 +56,13 @@ def test_the_real_minute_is_followed_wherever_its_film_can_be_read() -> None:
     except RecordingError:
         readable = False
     assert (left_out().keys() & set(MINUTE) == set()) is readable
+
+
+def test_a_command_that_takes_too_long_is_told_and_ended(tmp_path: Path) -> None:
+    newcomer = Newcomer(tmp_path)
+    newcomer.longest_s = 0.5
+    with pytest.raises(Faulty, match=r"^sleep 600 \| cat\nis not done within"):
+        newcomer.run("sleep 600 | cat")
 
 
 def test_lines_are_joined_and_comments_left_out() -> None:
