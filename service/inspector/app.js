@@ -97,6 +97,7 @@ async function openFile(file) {
   });
   byId("scene").append(...options);
   byId("scene").value = options[0].value;
+  showLink(null);
   showView(views[0]);
 }
 
@@ -136,11 +137,11 @@ const given = () => ({
   tracks: byId("with-tracks").checked && !byId("with-tracks").disabled ? state.view.tracks : null,
 });
 
-const plan = () => ask("Planning …", (signal) => api.plan(given(), controls(), signal)).then(showLink);
-const lookTwice = () => ask("Looking twice …", (signal) =>
+const plan = () => ask("Planning …", linkTo(LINKED), (signal) => api.plan(given(), controls(), signal));
+const lookTwice = () => ask("Looking twice …", linkTo([...LINKED, "proposal"]), (signal) =>
   api.reflect(given(), byId("proposal").value, controls(), signal));
 
-async function ask(doing, request) {
+async function ask(doing, link, request) {
   if (!state.view) return;
   state.running?.abort();
   const running = state.running = new AbortController();
@@ -151,6 +152,7 @@ async function ask(doing, request) {
   try {
     const body = await request(running.signal);
     showDraws(body);
+    showLink(link);
     const { total_ms: total, engine_ms: engine } = body.timing;
     const deadline = body.deadline ? `, deadline ${body.deadline.met ? "met" : "missed"}` : "";
     say(`${body.draws.length} draws in ${total.toFixed(0)} ms (engine ${engine.toFixed(0)} ms, `
@@ -167,18 +169,22 @@ async function ask(doing, request) {
 const LINKED = ["scene", "thinking", "n", "temperature", "seed", "deadline"];
 const LINKED_CHOICES = ["with-route", "with-tracks"];
 
-function showLink() {
-  const shared = Boolean(state.view) && !state.opened.has(byId("scene").value);
-  byId("link").hidden = !shared;
-  if (!shared) return;
-  const values = new URLSearchParams(LINKED.map((id) => [id, byId(id).value]));
+// What is asked for now; null for a scene of a file, which others do not have.
+function linkTo(ids) {
+  if (state.opened.has(byId("scene").value)) return null;
+  const values = new URLSearchParams(ids.map((id) => [id, byId(id).value]));
   for (const id of LINKED_CHOICES) values.set(id, byId(id).checked);
   if (usesThreshold()) values.set("threshold", byId("threshold").value);
-  history.replaceState(null, "", `#${values}`);
+  return values;
+}
+
+function showLink(values) {
+  byId("link").hidden = values === null;
+  history.replaceState(null, "", values === null ? location.pathname : `#${values}`);
   byId("link").href = location.href;
 }
 
-// Show the scene that the address names, and plan as it says; without a link, the scene that is chosen.
+// Show the scene that the address names, and plan or look twice as it says; without a link, the scene that is chosen.
 async function followLink() {
   const values = new URLSearchParams(location.hash.slice(1));
   const linked = values.get("scene");
@@ -186,13 +192,13 @@ async function followLink() {
     if (!state.view) await chooseScene();
     throw new Error("The link names a scene that is not here.");
   }
-  for (const id of LINKED) if (values.has(id)) byId(id).value = values.get(id);
+  for (const id of [...LINKED, "proposal"]) if (values.has(id)) byId(id).value = values.get(id);
   for (const id of LINKED_CHOICES) if (values.has(id)) byId(id).checked = values.get(id) === "true";
   if (linked !== null) byId("with-threshold").checked = values.has("threshold");
   if (values.has("threshold")) byId("threshold").value = values.get("threshold");
   showThreshold();
   if (linked !== null || !state.view) await chooseScene();
-  if (linked !== null) await plan();
+  if (linked !== null) await (values.has("proposal") ? lookTwice() : plan());
 }
 
 // Where the first plan would have led: under a deadline the service keeps that, otherwise it is asked for.
@@ -271,7 +277,10 @@ function choose(index) {
 }
 
 function listen() {
-  byId("scene").addEventListener("change", () => attempt(chooseScene));
+  byId("scene").addEventListener("change", () => {
+    showLink(null);
+    attempt(chooseScene);
+  });
   byId("controls").addEventListener("submit", (event) => {
     event.preventDefault();
     attempt(plan);

@@ -20,7 +20,7 @@ from model.engines.engine import EngineError
 from service.keys import new_line
 from service.settings import Settings
 from tests.service.scenes import labelled
-from tests.service.scripted_engine import KEEP_ON, REASONING, ScriptedEngine
+from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body, serve
 
 CHOSEN_RGB = (29, 95, 209)  # --chosen of the light theme
@@ -434,6 +434,50 @@ def test_a_link_says_whether_route_and_tracks_are_given(
         assert again.scene.tracks
     finally:
         engine.card_shown = plain
+
+
+def test_a_link_leads_to_the_second_look_that_is_shown(inspector: Page, engine: ScriptedEngine) -> None:
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+    first = link_to_this_plan(inspector)
+    inspector.get_by_label("A plan to look at twice").fill(str(SLOW_DOWN))
+    inspector.get_by_label("Thinking", exact=True).select_option("always")
+    inspector.get_by_role("spinbutton", name="Draws").fill("3")
+    inspector.get_by_role("button", name="Look twice").click()
+    expect(inspector.locator("#draws tbody tr")).to_have_count(3)
+    link = link_to_this_plan(inspector)
+    assert inspector.url == link != first
+    engine.submitted.clear()
+    inspector.goto("about:blank")
+    inspector.goto(link)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(3)
+    again = engine.submitted[0].controls
+    assert (again.prefill, again.thinking, again.n) == (SLOW_DOWN, "always", 3)
+    engine.failure = EngineError("broke")
+    plan(inspector)
+    expect(inspector.get_by_role("alert")).to_be_visible()
+    engine.failure = None
+    assert link_to_this_plan(inspector) == inspector.url == link, "the second look is still what is shown"
+
+
+def test_there_is_no_link_where_another_scene_is_shown(
+    inspector: Page, served: Served, tmp_path: Path
+) -> None:
+    plan(inspector)
+    expect(inspector.locator("#link")).to_be_visible()
+    inspector.get_by_label("Scene", exact=True).select_option("second/scene")
+    expect(inspector.get_by_role("status")).to_contain_text("second/scene")
+    expect(inspector.locator("#link")).to_be_hidden()
+    assert inspector.url == f"{served.url}/"
+    plan(inspector)
+    expect(inspector.locator("#link")).to_be_visible()
+    write_scenes(tmp_path / "mine.parquet", [labelled("mine")])
+    inspector.get_by_label("Open a scene file").set_input_files(tmp_path / "mine.parquet")
+    expect(inspector.get_by_role("status")).to_contain_text("mine")
+    plan(inspector)
+    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
+    expect(inspector.locator("#link")).to_be_hidden()
+    assert inspector.url == f"{served.url}/"
 
 
 def test_a_link_is_followed_on_the_page_that_is_open(inspector: Page, engine: ScriptedEngine) -> None:
