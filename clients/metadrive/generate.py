@@ -33,9 +33,8 @@ from clients.metadrive.rig import Rig
 from clients.metadrive.windows import labelled_scenes, window_steps
 from model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS
 from model.driving.scene import LabelledScene, split_of_seed
-from model.driving.scene_store import SCENE_VERSION, write_scenes
+from model.driving.scene_store import MANIFEST, SCENE_VERSION, write_scenes
 
-MANIFEST: Final = "manifest.json"
 GENERATOR_VERSION: Final = "1"
 _EPISODES_KEY: Final = "looktwice.episodes"
 _TRIES_PER_BLOCK: Final = 3

@@ -19,11 +19,12 @@ import shapely
 from clients.metadrive import simulator
 from clients.metadrive.episode import World, worlds_of_episode
 from clients.metadrive.fork import fork_expert
-from clients.metadrive.generate import GENERATOR_VERSION, MANIFEST, GenerateConfig
+from clients.metadrive.generate import GENERATOR_VERSION, GenerateConfig
 from clients.metadrive.maps import MapError
 from clients.metadrive.outcomes import MomentOutcomes, outcomes_at
 from clients.metadrive.windows import history_at
 from model.driving.scene import LabelledScene
+from model.driving.scene_store import MANIFEST
 from model.driving.trajectory import FloatArray
 
 TOLERANCE_M: Final = 0.01

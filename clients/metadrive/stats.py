@@ -10,13 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from clients.metadrive.generate import MANIFEST
 from model.driving.labeller import expert_plan
 from model.driving.lead import LEAD_WITHIN_M, lead_within
 from model.driving.metrics import collides, leaves_road
 from model.driving.plan import GROUPS, TICKS, WORDS, Plan
 from model.driving.scene import TAGS, LabelledScene
-from model.driving.scene_store import SceneFileError, read_scenes
+from model.driving.scene_store import MANIFEST, SceneFileError, read_scenes
 from model.driving.trajectory import HORIZON_S, STEP_S
 
 _ALL_WORDS: Final = tuple(word for group in GROUPS for word in WORDS[group])

@@ -37,6 +37,8 @@ from model.driving.trajectory import FloatArray, GeometryError
 SCENE_VERSION: Final = "2"
 _VERSION_KEY: Final = b"looktwice.scene_version"
 ROW_GROUP: Final = 128
+MANIFEST: Final = "manifest.json"
+"""Beside the files of a folder that was generated: how, and how its episodes ended."""
 
 _RANGE_FAR_M: Final = 400.0
 """Ranges of dense targets are stored as 8-bit logarithms of 1 + range: off by at most 1.2 %, up to 400 m."""

@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import sys
+from typing import Final
+
+_OURS: Final = frozenset({"clients", "deploy", "loadtests", "model", "service"})
+_MORE: Final = (
+    "This command needs more: the simulator (`make sim`), or an extra such as "
+    "pip install 'looktwice[load]' for load tests, [train], [video], [ray] or [alpasim]"
+)
 
 
 def main() -> None:
-    """Run the command line; says what to install where only the planner client is there."""
+    """Run the command line; says what to install where a package is missing."""
     try:
         from service.cli.commands import app
     except ImportError as error:
         sys.exit(f"looktwice: {error}. The command line needs more: pip install 'looktwice[serve]'")
-    app()
+    try:
+        app()
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] in _OURS:
+            raise
+        sys.exit(f"looktwice: {error}. {_MORE}")

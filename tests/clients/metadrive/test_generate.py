@@ -16,7 +16,6 @@ from PIL import Image
 
 from clients.metadrive import simulator
 from clients.metadrive.generate import (
-    MANIFEST,
     GenerateConfig,
     GenerationError,
     block_file,
@@ -27,7 +26,7 @@ from clients.metadrive.sheet import contact_sheet
 from clients.metadrive.stats import scene_stats
 from model.driving.labeller import expert_plan
 from model.driving.scene import TAGS, LabelledScene, SceneError
-from model.driving.scene_store import SceneFileError, read_scenes, write_scenes
+from model.driving.scene_store import MANIFEST, SceneFileError, read_scenes, write_scenes
 from tests.clients.metadrive.conftest import Filmed
 
 CONFIG = GenerateConfig(stride_s=2.0, duration_s=10.0, block=1)

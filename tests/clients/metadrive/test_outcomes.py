@@ -12,7 +12,7 @@ import pytest
 
 from clients.metadrive.episode import World
 from clients.metadrive.fork import Forked, fork_expert
-from clients.metadrive.generate import GENERATOR_VERSION, MANIFEST, GenerateConfig
+from clients.metadrive.generate import GENERATOR_VERSION, GenerateConfig
 from clients.metadrive.outcomes import judged, outcomes_at
 from clients.metadrive.replay import (
     EpisodeSetting,
@@ -24,6 +24,7 @@ from clients.metadrive.replay import (
 )
 from clients.metadrive.simulator import described
 from model.driving.outcome import FailureName, Outcome
+from model.driving.scene_store import MANIFEST
 from model.driving.trajectory import FUTURE_STEPS, FloatArray, constant_velocity
 from tests.clients.metadrive.conftest import DURATION_S, SEED, Filmed
 from tests.clients.metadrive.test_fork import driven

@@ -15,9 +15,9 @@ import pytest
 
 from clients.labelling.ledger import FILE, Ledger
 from clients.labelling.outcomes import Followed
-from clients.metadrive.generate import MANIFEST
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.reflection_store import read_reflections
+from model.driving.scene_store import MANIFEST
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from service.settings import Settings
 from tests.service.cli.builds import ran, told

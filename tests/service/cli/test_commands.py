@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from service.cli.commands import app
 from service.settings import Settings, TeacherSettings
 from tests.service.serving import body, serve
 
+ROOT: Final = Path(__file__).parents[3]
 PLAN: Final = """\
 - longitudinal
   - 0.0s-6.4s: Keep Speed
@@ -139,3 +141,32 @@ def test_help_needs_neither_torch_nor_the_service() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def ran_bare(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """A command where only `looktwice[serve]` is installed: neither the simulator nor other extras."""
+    extras = ("accelerate", "cv2", "gltf", "hdrh", "metadrive", "panda3d", "psutil", "ray", "shapely")
+    code = f"import sys; sys.modules.update(dict.fromkeys({extras!r})); from service.cli import main; main()"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(
+        command, capture_output=True, text=True, cwd=folder, env=environment, check=False, timeout=300
+    )
+
+
+@pytest.mark.parametrize("command", [("scenes", "stats"), ("scenes", "show", "--limit", "1")])
+def test_scenes_are_counted_and_shown_without_the_simulator(command: tuple[str, ...], tmp_path: Path) -> None:
+    done = ran_bare(*command, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("drive",), ("scenes", "generate", "out", "--first-seed", "0", "--episodes", "1"), ("loadtest",)],
+)
+def test_a_command_that_needs_more_says_what_to_install(command: tuple[str, ...], tmp_path: Path) -> None:
+    done = ran_bare(*command, folder=tmp_path)
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1
+    assert "`make sim`" in done.stderr
+    assert "looktwice[load]" in done.stderr
