@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 import sys
 import textwrap
 from functools import partial
@@ -54,6 +55,7 @@ def serve(
     sys.setswitchinterval(_TURN_S)
     with told():
         settings = Settings()
+        _check_free(host, port)
         load = partial(
             make_engine,
             rows=rows,
@@ -71,6 +73,18 @@ def serve(
         else:
             app = create_app(load(checkpoint), settings, teacher=teacher, load=load)
         make_server(app, settings, host, port, announce=_announce).run()
+
+
+def _check_free(host: str, port: int) -> None:
+    """Raise `ValueError` where nothing can listen, before a model is loaded for nothing."""
+    try:
+        (family, *_, address), *_ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            # As servers do: only who listens now is in the way, not who did a moment ago.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        raise ValueError(f"cannot listen at {host}, port {port}: {error.strerror}") from error
 
 
 def _announce(url: str) -> None:

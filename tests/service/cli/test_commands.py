@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,14 @@ def test_what_cannot_be_listened_on_is_refused() -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is one")
+def test_a_port_that_is_taken_is_told_before_anything_is_loaded(tmp_path: Path) -> None:
+    (tmp_path / "looktwice.json").write_text("{")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        told = ran("serve", "--port", str(port), "--checkpoint", str(tmp_path), code=2)
+    assert told == f"looktwice: cannot listen at 127.0.0.1, port {port}: Address already in use\n"
+
+
 def test_a_missing_gpu_is_told_in_a_line() -> None:
     told = ran("serve", "--device", "cuda", code=2)
     assert told.startswith("looktwice: there is no CUDA device")
