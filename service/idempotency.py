@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Final
@@ -47,7 +46,8 @@ class Idempotency:
 
     def __init__(self, kept_s: float, clock: Callable[[], float]) -> None:
         self._kept_s, self._clock = kept_s, clock
-        self._made: OrderedDict[tuple[str, str], _Made] = OrderedDict()
+        # No cachetools here: what is being made has no size yet, and must not go.
+        self._made: dict[tuple[str, str], _Made] = {}
 
     def knows(self, owner: str, key: str) -> bool:
         """Whether an answer was made, or is being made, for ``owner``'s ``key``."""

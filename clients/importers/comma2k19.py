@@ -8,13 +8,13 @@ that frame. A pose is the camera's; it is taken for the car's, but for the angle
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from cachetools import FIFOCache
 
 from clients.importers.recording import Array, Recording, RecordingError
 from clients.importers.rotations import matrices
@@ -43,7 +43,7 @@ class Film:
 
     path: Path
     times_s: Array
-    _remembered: OrderedDict[int, View] = field(default_factory=OrderedDict)
+    _remembered: FIFOCache[int, View] = field(default_factory=lambda: FIFOCache(_REMEMBERED))
     _reader: Iterator[View] | None = None
     _next: int = 0
 
@@ -55,8 +55,6 @@ class Film:
             for picture in self._reader:
                 self._remembered[self._next] = picture
                 self._next += 1
-                if len(self._remembered) > _REMEMBERED:
-                    self._remembered.popitem(last=False)
                 if self._next > number:
                     break
         if number not in self._remembered:

@@ -18,6 +18,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from cachetools import FIFOCache
 
 from model.engines.sampling import uniform
 from model.engines.torch.rows import Row
@@ -159,15 +160,11 @@ class _Responses:
     """
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[bytes, dict[int, tuple[int, ...]]] = OrderedDict()
+        self._kept: FIFOCache[bytes, dict[int, tuple[int, ...]]] = FIFOCache(_MAX_RESPONSES)
 
     def keep(self, shown: bytes, draws: Sequence[int], tokens: Sequence[int]) -> None:
         """``draws`` of a scene with the pictures ``shown`` have written ``tokens``."""
-        response = self._kept.setdefault(shown, {})
-        response |= dict.fromkeys(draws, tuple(tokens))
-        self._kept.move_to_end(shown)
-        if len(self._kept) > _MAX_RESPONSES:
-            self._kept.popitem(last=False)
+        self._kept[shown] = self._kept.get(shown, {}) | dict.fromkeys(draws, tuple(tokens))
 
     def last(self, shown: bytes, draw: int) -> tuple[int, ...]:
         """What ``draw`` wrote the last time; nothing where that is not known."""
@@ -178,6 +175,7 @@ class _Ngrams:
     """For the latest contexts: which tokens followed, and how often."""
 
     def __init__(self) -> None:
+        # No cachetools here: it takes 1.4 instead of 0.3 µs, for up to four contexts of every guess.
         self._followed: OrderedDict[tuple[int, ...], dict[int, int]] = OrderedDict()
 
     def count(self, context: Sequence[int], token: int, times: int) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from contextlib import suppress
 from hashlib import blake2b
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from cachetools import LRUCache
 
 from model.driving.scene import Scene, SceneError
 from model.network.inputs import InputBuilder
@@ -31,9 +31,8 @@ class Frames:
     """
 
     def __init__(self, inputs: InputBuilder, max_bytes: int = MAX_BYTES) -> None:
-        self._inputs, self._max_bytes = inputs, max_bytes
-        self._kept: OrderedDict[bytes, Frame] = OrderedDict()
-        self._bytes = 0
+        self._inputs = inputs
+        self._kept: LRUCache[bytes, Frame] = LRUCache(max_bytes, getsizeof=lambda frame: frame.nbytes)
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -57,13 +56,8 @@ class Frames:
         key = blake2b(picture, digest_size=16).digest()
         with self._lock:
             if (kept := self._kept.get(key)) is not None:
-                self._kept.move_to_end(key)
                 return kept
         frame = self._inputs.frame(picture)
-        with self._lock:
-            if key not in self._kept:
-                self._kept[key] = frame
-                self._bytes += frame.nbytes
-            while self._bytes > self._max_bytes:
-                self._bytes -= self._kept.popitem(last=False)[1].nbytes
+        with self._lock, suppress(ValueError):  # larger than all that is kept
+            self._kept[key] = frame
         return frame

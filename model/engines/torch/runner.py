@@ -363,7 +363,7 @@ class Runner:
         That is all up to the end of its pictures where these were seen lately, or else the ``count`` tokens
         that all prompts of a format begin with.
         """
-        kept = self._pictures.find(prompt.pictures)
+        kept = self._pictures.get(prompt.pictures)
         if kept is None:
             kept = self._heads.get(format)
         if kept is None:

@@ -86,7 +86,7 @@ class VisionEncoder:
         try:
             slices = self._loaded.inputs.slices(scene)
             keys = [digest(pictures) for pictures in slices]
-            kept = {key: tokens for key in keys if (tokens := self._clips.find(key)) is not None}
+            kept = {key: tokens for key in keys if (tokens := self._clips.get(key)) is not None}
             patches = {
                 key: self._frames.patches(pictures)
                 for key, pictures in zip(keys, slices, strict=True)

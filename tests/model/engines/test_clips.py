@@ -64,9 +64,9 @@ def test_the_longest_unseen_is_forgotten_first() -> None:
     cache = ClipCache(2 * 4 * 10)
     for key in (b"a", b"b"):
         cache.keep(key, torch.zeros(10))
-    assert cache.find(b"a") is not None
+    assert cache.get(b"a") is not None
     cache.keep(b"c", torch.zeros(10))
-    assert [cache.find(key) is not None for key in (b"a", b"b", b"c")] == [True, False, True]
+    assert [cache.get(key) is not None for key in (b"a", b"b", b"c")] == [True, False, True]
     cache.keep(b"larger than all", torch.zeros(21))
-    assert cache.find(b"larger than all") is None
+    assert cache.get(b"larger than all") is None
     assert len(cache) == 2
