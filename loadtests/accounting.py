@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from loadtests.arrivals import Window
-from loadtests.exchange import BRANCHES, Exchange
+from loadtests.exchange import BRANCHES, OUTCOMES, Exchange
 from loadtests.latencies import Latencies
 
 LEAST_ACHIEVED: Final = 0.99
@@ -109,7 +109,7 @@ class Summary:
             "seconds": self.window.seconds,
             "counts": {
                 "offered": len(self.exchanges),
-                **{name: self.count(name) for name in ("answered", "rejected", "failed", "missed")},
+                **{name: self.count(name) for name in OUTCOMES},
             },
             "problems": self.problems(),
             "schedule_lag_s": self.lags().to_json(),

@@ -10,6 +10,7 @@ from loadtests.mix import Kind
 Outcome = Literal["answered", "rejected", "failed", "missed"]
 """``rejected``: the service refused for load (429). ``failed``: everything else without a good answer.
 ``missed``: never sent, since a planner of a closed loop was still waiting when it was due."""
+OUTCOMES: Final[tuple[Outcome, ...]] = get_args(Outcome)
 
 Branch = Literal["direct", "think", "reflect", "label", "batch", "imagine"]
 BRANCHES: Final[tuple[Branch, ...]] = get_args(Branch)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from loadtests.accounting import Summary
-from loadtests.exchange import BRANCHES
-from loadtests.latencies import PERCENTILES
+from loadtests.exchange import BRANCHES, OUTCOMES
+from loadtests.latencies import PERCENTILES, Latencies
 from loadtests.run import Result, Setup
 
 
@@ -66,14 +66,18 @@ def figures(summary: Summary) -> str:
         f"({summary.achieved_share:.1%}), goodput {summary.goodput:.1%} within {summary.goal_s * 1e3:.0f} ms "
         "or their deadline",
         f"{len(summary.exchanges)} requests: "
-        + ", ".join(f"{summary.count(name)} {name}" for name in ("answered", "rejected", "failed", "missed")),
+        + ", ".join(f"{summary.count(name)} {name}" for name in OUTCOMES),
         *(f"  {count} x {problem}" for problem, count in summary.problems().items()),
         f"{'ms':<12}" + "".join(f"{name:>9}" for name in (*PERCENTILES, "count")),
     ]
-    rows = {"all": summary.latencies()} | {branch: summary.latencies(branch) for branch in BRANCHES}
-    rows["sent late"] = summary.lags()
-    for row, latencies in rows.items():
+    for row, latencies in latency_rows(summary).items():
         if len(latencies):
             times = [f"{(latencies.percentile_s(name) or 0) * 1e3:.1f}" for name in PERCENTILES]
             lines.append(f"{row:<12}" + "".join(f"{time:>9}" for time in (*times, len(latencies))))
     return "\n".join(lines)
+
+
+def latency_rows(summary: Summary) -> dict[str, Latencies]:
+    """Of all answers, of each branch, and how late requests were sent."""
+    branches = {branch: summary.latencies(branch) for branch in BRANCHES}
+    return {"all": summary.latencies()} | branches | {"sent late by": summary.lags()}
