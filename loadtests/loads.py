@@ -1,18 +1,79 @@
-"""What a worker does: offer requests when they are due (open loop), or drive planners (closed loop)."""
+"""When requests are due, who sends them (open or closed loop), and the processes that do it."""
 
 from __future__ import annotations
 
 import asyncio
+import gc
 import math
+import multiprocessing
+import os
+import threading
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol, Self
+from multiprocessing.connection import Connection
+from typing import Final, Protocol, Self
 
 import numpy as np
+import numpy.typing as npt
 
-from loadtests.arrivals import Times
-from loadtests.call import Call
-from loadtests.exchange import MISSED, Exchange
-from loadtests.sending import Sender
+from loadtests.exchange import MISSED, Call, Exchange
+from loadtests.sending import Sender, Target, connected
+
+Times = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of a run.
+
+    Attributes:
+        name: as it is called in the report.
+        seconds: how long it lasts.
+        rate_rps: requests offered per second, on average.
+    """
+
+    name: str
+    seconds: float
+    rate_rps: float
+
+    def __post_init__(self) -> None:
+        if self.seconds < 0 or self.rate_rps < 0:
+            raise ValueError(f"phase {self.name}: neither time nor rate can be negative")
+
+
+@dataclass(frozen=True)
+class Window:
+    """A phase on the clock of its run: ``start_s`` <= t < ``end_s``."""
+
+    name: str
+    start_s: float
+    end_s: float
+
+    @property
+    def seconds(self) -> float:
+        """How long it is."""
+        return self.end_s - self.start_s
+
+
+def windows(phases: Sequence[Phase]) -> list[Window]:
+    """Where each phase lies, one behind the other from 0 on."""
+    ends = np.cumsum([phase.seconds for phase in phases]).tolist()
+    return [Window(phase.name, end - phase.seconds, end) for phase, end in zip(phases, ends, strict=True)]
+
+
+def poisson_arrivals(phases: Sequence[Phase], seed: int) -> Times:
+    """Seconds from the run's start at which requests are due: float64 [k], ascending.
+
+    A Poisson process of a constant rate is a Poisson number of times spread evenly at random.
+    """
+    random = np.random.default_rng(seed)
+    due = [
+        window.start_s
+        + np.sort(random.uniform(0, phase.seconds, random.poisson(phase.rate_rps * phase.seconds)))
+        for phase, window in zip(phases, windows(phases), strict=True)
+    ]
+    return np.concatenate(due) if due else np.empty(0)
 
 
 class Load(Protocol):
@@ -112,3 +173,90 @@ def fleet(drives: list[list[Call]], hz: float, seconds: float, seed: int) -> Fle
         tuple(Planner(tuple(calls), 1 / hz, offset) for calls, offset in zip(drives, offsets, strict=True)),
         seconds,
     )
+
+
+_HEAD_START_S: Final = 0.2
+"""From the last worker's word that it is ready until the run begins."""
+
+
+class WorkerDied(RuntimeError):
+    """A process of the generator ended before its load did."""
+
+
+class Crew:
+    """Worker processes for one run.
+
+    ::
+
+        with Crew(load, target, workers=2) as crew:
+            starts_at = crew.begin()   # time.monotonic() of the run's start
+            exchanges = crew.finish()
+    """
+
+    def __init__(self, load: Load, target: Target, workers: int) -> None:
+        # Spawned: a fork would copy whatever threads the caller has.
+        context = multiprocessing.get_context("spawn")
+        self._crew: list[tuple[multiprocessing.process.BaseProcess, Connection[object, object]]] = []
+        for part in load.split(workers):
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_work, args=(part, target, theirs), daemon=True)
+            process.start()
+            theirs.close()
+            self._crew.append((process, ours))
+
+    def __enter__(self) -> Crew:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process, pipe in self._crew:
+            process.terminate()
+            process.join()
+            pipe.close()
+
+    def begin(self) -> float:
+        """Wait until all are ready, start them together, and return when they start; raises `WorkerDied`."""
+        for _, pipe in self._crew:
+            _told(pipe)
+        starts_at = time.monotonic() + _HEAD_START_S
+        for _, pipe in self._crew:
+            pipe.send(starts_at)
+        return starts_at
+
+    def finish(self) -> list[Exchange]:
+        """All exchanges, in the order they were due; raises `WorkerDied`."""
+        exchanges: list[Exchange] = []
+        for _, pipe in self._crew:
+            exchanges += _told(pipe)  # type: ignore[arg-type]
+        return sorted(exchanges, key=lambda each: each.due_s)
+
+
+def _told(pipe: Connection[object, object]) -> object:
+    try:
+        return pipe.recv()
+    except EOFError:
+        raise WorkerDied("a worker process of the load generator died; its own output says why") from None
+
+
+def _end_with_parent() -> None:
+    """A generator that was killed must not go on sending: the next run would share the service with it."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _work(load: Load, target: Target, pipe: Connection[object, object]) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    pipe.send("ready")
+    starts_at = pipe.recv()
+    assert isinstance(starts_at, float)
+    # What was prepared stays until the end: the collector need not look through it again and again.
+    gc.collect()
+    gc.freeze()
+    pipe.send(asyncio.run(run_load(load, target, starts_at)))
+
+
+async def run_load(load: Load, target: Target, starts_at: float) -> list[Exchange]:
+    """Run a load in this process; ``starts_at`` is on `time.monotonic`'s clock."""
+    async with connected(target) as http:
+        return await load.run(Sender(http, target.timeout_s, starts_at))

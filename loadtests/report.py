@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from loadtests.accounting import Summary
+from loadtests.accounting import PERCENTILES, Latencies, Summary
 from loadtests.exchange import BRANCHES, OUTCOMES
-from loadtests.latencies import PERCENTILES, Latencies
 from loadtests.run import Result, Setup
 
 
@@ -17,7 +16,7 @@ class Report:
 
     Attributes:
         began: date and time, ISO 8601.
-        client, service, versions: see `loadtests.about`.
+        client, service, versions: see `loadtests.environment`.
     """
 
     setup: Setup

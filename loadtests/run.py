@@ -7,12 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from loadtests.accounting import Summary, faults, summarise
-from loadtests.arrivals import Phase, Window, windows
 from loadtests.exchange import Exchange
-from loadtests.loads import Load
+from loadtests.loads import Crew, Load, Phase, Window, windows
 from loadtests.mix import Mix
 from loadtests.sending import Target
-from loadtests.workers import Crew
 from model.driving.scene import LabelledScene
 
 WARM_UP = "warm-up"

@@ -13,9 +13,7 @@ from typing import Final
 import httpx
 from httpx_sse import EventSource, SSEError
 
-from loadtests.call import Call
-from loadtests.exchange import Exchange, Verdict
-from loadtests.reading import BAD_ANSWER, read_answer, refusal
+from loadtests.exchange import BAD_ANSWER, Call, Exchange, Verdict, read_answer, refusal
 
 _FIRST: Final = ("plan", "picture")
 """Events that somebody waits for; a stream has one of the two."""

@@ -86,20 +86,15 @@ def loadtest(
 ) -> None:
     """Offer load, measured from when each request was due; exits with 1 where the run is not valid."""
     with told(), ExitStack() as stack:
-        from loadtests.about import about_client, about_service, versions
+        from loadtests.attacks import RUDE
         from loadtests.bad_teacher import bad_teacher
-        from loadtests.hostile import RUDE
-        from loadtests.knee import KneeSearch
+        from loadtests.environment import describe_client, describe_service, versions
         from loadtests.mix import parse_mix
         from loadtests.report import Report
         from loadtests.run import Result, Setup
-        from loadtests.scenarios.burst import burst
-        from loadtests.scenarios.costly import OwnService, costly
-        from loadtests.scenarios.fleet import fleet
-        from loadtests.scenarios.hostile import hostile
-        from loadtests.scenarios.poisson import poisson
-        from loadtests.scenarios.soak import soak
-        from loadtests.scenarios.sweep import sweep
+        from loadtests.scenarios.hostile import OwnService, costly, hostile
+        from loadtests.scenarios.steady import burst, fleet, poisson, soak
+        from loadtests.scenarios.sweep import KneeSearch, sweep
         from loadtests.sending import Target
         from model.driving.scene_store import read_scenes
         from service.cli.serving import served
@@ -145,7 +140,7 @@ def loadtest(
             distinct=distinct,
             tell=lambda line: typer.echo(line, err=True),
         )
-        models, client = about_service(setup.target, setup.mix), about_client()
+        models, client = describe_service(setup.target, setup.mix), describe_client()
         began = datetime.now(UTC).isoformat(timespec="seconds")
         made = Report(setup, run[scenario](), began, client, models, versions())
         if report is not None:

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from loadtests.accounting import Summary, faults, summarise
-from loadtests.arrivals import Window
 from loadtests.exchange import MISSED, Branch, Exchange, Outcome, Verdict
+from loadtests.loads import Window
 from loadtests.mix import Kind
 
 WINDOW = Window("measured", 10, 20)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from loadtests.scenarios.costly import missed_goals
+from loadtests.scenarios.hostile import missed_goals
 
 MET: dict[str, Any] = {
     "polite_p95_ratio": 1.5,

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from loadtests.drives import drive, make_drives
+from loadtests.bodies import drive, make_drives
 from loadtests.mix import Mix
 from tests.loadtests.scenes import labelled_scenes
 

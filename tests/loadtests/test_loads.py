@@ -12,12 +12,10 @@ from itertools import pairwise
 import numpy as np
 
 from loadtests.accounting import Summary, summarise
-from loadtests.arrivals import Phase, Window, poisson_arrivals
 from loadtests.bodies import make_calls
-from loadtests.loads import Fleet, OpenLoop, Planner
+from loadtests.loads import Fleet, OpenLoop, Phase, Planner, Window, poisson_arrivals, run_load
 from loadtests.mix import Mix
 from loadtests.sending import Target
-from loadtests.workers import run_load
 from tests.loadtests.scenes import labelled_scenes
 from tests.loadtests.stand_in import StandIn, standing_in
 from tests.waiting import until

@@ -5,9 +5,8 @@ from typing import Any
 
 import pytest
 
-from loadtests.exchange import Verdict
+from loadtests.exchange import BAD_ANSWER, Verdict, read_answer
 from loadtests.mix import Kind
-from loadtests.reading import BAD_ANSWER, read_answer
 
 
 def read(kind: Kind, status: int, content: Any) -> Verdict:

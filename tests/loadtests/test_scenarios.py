@@ -9,18 +9,14 @@ from html.parser import HTMLParser
 
 import pytest
 
-from loadtests.hostile import Hostility
-from loadtests.knee import KneeSearch
+from loadtests.attacks import Hostility
 from loadtests.mix import Mix
 from loadtests.page import page
 from loadtests.report import Report
 from loadtests.run import Result, Setup
-from loadtests.scenarios.burst import burst
-from loadtests.scenarios.fleet import fleet
 from loadtests.scenarios.hostile import hostile
-from loadtests.scenarios.poisson import poisson
-from loadtests.scenarios.soak import soak
-from loadtests.scenarios.sweep import sweep
+from loadtests.scenarios.steady import burst, fleet, poisson, soak
+from loadtests.scenarios.sweep import KneeSearch, sweep
 from tests.loadtests.scenes import setup
 from tests.loadtests.stand_in import StandIn, standing_in
 

@@ -25,8 +25,8 @@ import pytest
 
 from clients.labelling.checks import FailedCheck
 from clients.labelling.teachers.teacher import Answer, Question
+from loadtests.attacks import costly_calls, scans
 from loadtests.bodies import make_call
-from loadtests.costly import costly_calls, scans
 from loadtests.mix import Kind
 from model.bundled import CHECKPOINT
 from model.driving.images import decode_image

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from loadtests.arrivals import Phase, poisson_arrivals
+from loadtests.loads import Phase, poisson_arrivals
 from service.admission import Admission
 from service.cli.loadtest import loadtest as command
 from service.settings import Settings

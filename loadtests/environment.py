@@ -1,29 +1,31 @@
-"""What a figure depends on besides the service: the client's machine, versions, and who answered."""
+"""What figures depend on: the client's machine, versions, and the service by its models and metrics."""
 
 from __future__ import annotations
 
 import os
 import platform
+import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import httpx
 import psutil
+from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 
 from clients import wire
 from loadtests.mix import Mix
 from loadtests.sending import Target
 
-_PATIENCE_S = 10.0
+_ANSWER_WITHIN_S: Final = 10.0
 
 
 class ServiceAway(RuntimeError):
     """The service to be tested does not answer as a LookTwice service does."""
 
 
-def about_client() -> dict[str, Any]:
+def describe_client() -> dict[str, Any]:
     """The machine that makes the load; its name is nobody's business."""
     return {
         "cpu": _cpu(),
@@ -45,7 +47,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def about_service(target: Target, mix: Mix) -> dict[str, Any]:
+def describe_service(target: Target, mix: Mix) -> dict[str, Any]:
     """The models behind the service.
 
     Raises:
@@ -54,7 +56,7 @@ def about_service(target: Target, mix: Mix) -> dict[str, Any]:
     """
     try:
         answer = httpx.get(
-            f"{target.url}/v1/models", headers=target.headers, timeout=_PATIENCE_S, trust_env=False
+            f"{target.url}/v1/models", headers=target.headers, timeout=_ANSWER_WITHIN_S, trust_env=False
         )
         answer.raise_for_status()
         cards = wire.ModelList.model_validate_json(answer.content).models
@@ -75,3 +77,46 @@ def _cpu() -> str:
         (line.partition(":")[2].strip() for line in lines if line.startswith("model name")),
         platform.machine(),
     )
+
+
+HELD: Final = (
+    "looktwice_plans_in_flight",
+    "looktwice_kv_rows_used",
+    "looktwice_queue_scenes",
+    "looktwice_queue_draws",
+)
+_LOST: Final = "looktwice_log_lines_lost_total"
+_RELEASED_WITHIN_S: Final = 30.0
+_PAUSE_S: Final = 0.2
+
+
+def left_behind(target: Target) -> dict[str, float]:
+    """Gauges that do not go back to 0 within half a minute; those that the service has.
+
+    Raises:
+        ServiceAway: it has no metrics to be read.
+    """
+    until = time.monotonic() + _RELEASED_WITHIN_S
+    while True:
+        held = {name: value for name, value in _samples(target).items() if name in HELD}
+        if not any(held.values()) or time.monotonic() > until:
+            return held
+        time.sleep(_PAUSE_S)
+
+
+def lines_lost(target: Target) -> int:
+    """Lines of the service's log that nobody took; raises `ServiceAway` as `left_behind` does."""
+    return int(_samples(target).get(_LOST, 0))
+
+
+def _samples(target: Target) -> dict[str, float]:
+    try:
+        answer = httpx.get(f"{target.url}/metrics", headers=target.headers, trust_env=False)
+        answer.raise_for_status()
+    except httpx.HTTPError as error:
+        raise ServiceAway(f"{target.url} does not show its metrics: {error}") from error
+    return {
+        sample.name: sample.value
+        for family in text_string_to_metric_families(answer.text)
+        for sample in family.samples
+    }
