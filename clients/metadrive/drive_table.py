@@ -9,23 +9,24 @@ from typing import Any, Final
 import numpy as np
 
 from clients.metadrive.drive import EXPERT, Drive
+from model.driving.columns import Columns, aligned, cells, titles
 from model.driving.intervals import ratio_interval
 
-_COLUMNS: Final = (
-    ("episodes", "{:d}"),
-    ("km", "{:.1f}"),
-    ("route_completion", "{:.1%}"),
-    ("collisions", "{:d}"),
-    ("collisions_per_km", "{:.2f}"),
-    ("off_road", "{:d}"),
-    ("off_road_per_km", "{:.2f}"),
-    ("jerk_ms3", "{:.1f}"),
-    ("lateral_ms2", "{:.1f}"),
-    ("think_rate", "{:.1%}"),
-    ("plans", "{:d}"),
-    ("deadline_misses", "{:d}"),
-    ("plan_ms", "{:.0f}"),
-)
+_COLUMNS: Final[Columns] = {
+    "episodes": ("episodes", "{:d}"),
+    "km": ("km", "{:.1f}"),
+    "route_completion": ("route completion", "{:.1%}"),
+    "collisions": ("collisions", "{:d}"),
+    "collisions_per_km": ("collisions per km", "{:.2f}"),
+    "off_road": ("off road", "{:d}"),
+    "off_road_per_km": ("off road per km", "{:.2f}"),
+    "jerk_ms3": ("jerk ms3", "{:.1f}"),
+    "lateral_ms2": ("lateral ms2", "{:.1f}"),
+    "think_rate": ("think rate", "{:.1%}"),
+    "plans": ("plans", "{:d}"),
+    "deadline_misses": ("deadline misses", "{:d}"),
+    "plan_ms": ("plan ms", "{:.0f}"),
+}
 
 
 @dataclass(frozen=True)
@@ -116,16 +117,6 @@ def to_json(drives: Mapping[str, Sequence[Drive]]) -> dict[str, Any]:
 
 def format_table(rows: Sequence[DriverRow]) -> str:
     """The rows as plain text."""
-    lines = [["", *(name.replace("_", " ") for name, _ in _COLUMNS)]]
-    for row in rows:
-        values = asdict(row)
-        cells = ["-" if values[name] is None else form.format(values[name]) for name, form in _COLUMNS]
-        lines.append([row.name, *cells])
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if column == 0 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    )
+    lines = [["", *titles(_COLUMNS)]]
+    lines += [[row.name, *cells(_COLUMNS, asdict(row))] for row in rows]
+    return "\n".join(aligned(lines))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Final
 
 from model.bench.roofline import Machine, Work
 from model.bench.run import Deadlines, Planner, Row
+from model.driving.columns import aligned, interval_cell
 
 
 @dataclass(frozen=True)
@@ -89,13 +90,17 @@ class BenchReport:
     def __str__(self) -> str:
         parts = [_table(self.rows)]
         if others := self.ratios():
-            lines = [
-                f"{each['engine']:<14}{each['scenes']:>4} x {each['n']}  {each['thinking']:<9}"
-                f"{each['latency_p50']:>9.1f}{each['plans_per_s']:>10.1f}"
+            lines = [["against torch", "", "", "latency", "plans/s"]] + [
+                [
+                    each["engine"],
+                    f"{each['scenes']} x {each['n']}",
+                    each["thinking"],
+                    f"{each['latency_p50']:.1f}",
+                    f"{each['plans_per_s']:.1f}",
+                ]
                 for each in others
             ]
-            head = f"{'against torch':<31}{'latency':>9}{'plans/s':>10}"
-            parts.append("\n".join([head, *lines]))
+            parts.append("\n".join(aligned(lines, left=3)))
         if self.shortcuts:
             parts.append("shortcuts, one after the other\n" + _table(self.shortcuts))
         for planner in self.planners:
@@ -130,17 +135,30 @@ def _rows(row: Row) -> str:
     return f"{row.counts['row_passes'] / fan_out:.2f}" if fan_out else "-"
 
 
+_TITLES: Final = (
+    *("engine", "load", "thinking", "p50 ms", "p95 ms", "plans/s", "spread", "tokens/s", "passes"),
+    *("tokens", "forced", "valid", "rows", "MiB"),
+)
+
+
 def _table(rows: Sequence[Row]) -> str:
-    head = (
-        f"{'engine':<40}{'load':>8}  {'thinking':<9}{'p50 ms':>8}{'p95 ms':>8}{'plans/s':>9}{'spread':>13}"
-        f"{'tokens/s':>10}{'passes':>8}{'tokens':>8}{'forced':>8}{'valid':>7}{'rows':>6}{'MiB':>7}"
-    )
     lines = [
-        f"{row.engine:<40}{f'{row.scenes} x {row.n}':>8}  {row.thinking:<9}{row.latency_p50_s * 1e3:>8.0f}"
-        f"{row.latency_p95_s * 1e3:>8.0f}{row.plans_per_s:>9.2f}"
-        f"{f'{row.plans_per_s_spread[0]:.2f}-{row.plans_per_s_spread[1]:.2f}':>13}{row.tokens_per_s:>10.0f}"
-        f"{row.passes_per_response:>8.1f}{row.tokens_per_response:>8.1f}{row.forced_share:>8.0%}"
-        f"{row.valid_share:>7.0%}{_rows(row):>6}{row.peak_bytes / 2**20:>7.0f}"
+        (
+            row.engine,
+            f"{row.scenes} x {row.n}",
+            row.thinking,
+            f"{row.latency_p50_s * 1e3:.0f}",
+            f"{row.latency_p95_s * 1e3:.0f}",
+            f"{row.plans_per_s:.2f}",
+            interval_cell(row.plans_per_s_spread, "{:.2f}"),
+            f"{row.tokens_per_s:.0f}",
+            f"{row.passes_per_response:.1f}",
+            f"{row.tokens_per_response:.1f}",
+            f"{row.forced_share:.0%}",
+            f"{row.valid_share:.0%}",
+            _rows(row),
+            f"{row.peak_bytes / 2**20:.0f}",
+        )
         for row in rows
     ]
-    return "\n".join([head, *lines])
+    return "\n".join(aligned([_TITLES, *lines], left=3))

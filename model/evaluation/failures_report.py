@@ -6,14 +6,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
+from model.driving.columns import Columns, aligned
 from model.driving.pdm.comfort import Version
 from model.driving.pdm.judged import THRESHOLD
 from model.driving.pdm.judging import SceneJudge
 from model.evaluation.bootstrap import Comparison, compare
 from model.evaluation.failures import MEASURES, Stage
-from model.evaluation.figures import Columns, FigureRow, figure_table
+from model.evaluation.figures import FigureRow, figure_table
 from model.evaluation.scores import SceneScore, ScoreTable, baseline_planners, scene_scores, table_of
-from model.evaluation.table import aligned, comparison_cells
+from model.evaluation.table import comparison_cells
 
 
 @dataclass(frozen=True)

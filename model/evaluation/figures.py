@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Self
 
+from model.driving.columns import Columns, cells, titles
 from model.driving.intervals import Interval
 from model.evaluation.bootstrap import Measured, mean_interval
-
-Columns = Mapping[str, tuple[str, str]]
-"""Title and pattern, by measure."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +28,10 @@ class FigureRow:
     intervals: Mapping[str, Interval | None]
 
     @classmethod
-    def of(cls, name: str, results: Sequence[Measured], measures: Sequence[str]) -> Self:
-        """The row of some results."""
+    def of(cls, name: str, results: Sequence[Measured], measures: Sequence[str], **about: Any) -> Self:
+        """The row of some results, ``about`` its further attributes; raises ValueError without any."""
+        if not results:
+            raise ValueError(f"row {name!r} has no scenes")
         means = {measure: mean_interval(results, measure) for measure in measures}
         return cls(
             name,
@@ -39,12 +39,14 @@ class FigureRow:
             len({result.episode_id for result in results}),
             {measure: mean for measure, (mean, _) in means.items()},
             {measure: interval for measure, (_, interval) in means.items()},
+            **about,
         )
 
     def to_json(self) -> dict[str, Any]:
         """The row with its measures as keys of their own, intervals below ``intervals``."""
         intervals = {name: list(each) for name, each in self.intervals.items() if each is not None}
-        about = {"name": self.name, "scenes": self.scenes, "episodes": self.episodes}
+        about = {each.name: getattr(self, each.name) for each in fields(self)}
+        del about["values"], about["intervals"]
         return about | dict(self.values) | {"intervals": intervals}
 
 
@@ -59,16 +61,6 @@ def figure_table(
         columns: to be shown.
         with_intervals: measures whose intervals are shown; JSON has all.
     """
-    header = [title, "scenes"]
-    lines = [header]
-    for measure, (name, _) in columns.items():
-        header += [name, "95 %"] if measure in with_intervals else [name]
-    for row in rows:
-        cells = [row.name, str(row.scenes)]
-        for measure, (_, pattern) in columns.items():
-            value, interval = row.values[measure], row.intervals[measure]
-            cells.append("-" if value is None else pattern.format(value))
-            if measure in with_intervals:
-                cells.append("" if interval is None else "..".join(map(pattern.format, interval)))
-        lines.append(cells)
-    return lines
+    figures = (cells(columns, row.values, row.intervals, with_intervals) for row in rows)
+    lines = [[row.name, str(row.scenes), *of] for row, of in zip(rows, figures, strict=True)]
+    return [[title, "scenes", *titles(columns, with_intervals)], *lines]

@@ -8,11 +8,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from model.driving.columns import Columns, aligned, cell
 from model.driving.scene import LabelledScene
 from model.driving.trajectory import TEN_HZ_S
 from model.engines.engine import Controls, Draw, Engine
 from model.evaluation.bootstrap import Comparison, compare
-from model.evaluation.figures import Columns, FigureRow, figure_table
+from model.evaluation.figures import FigureRow, figure_table
 from model.evaluation.next_frames import (
     Painter,
     Pictures,
@@ -25,7 +26,7 @@ from model.evaluation.next_frames import (
 from model.evaluation.open_loop import BASELINES, SceneResult
 from model.evaluation.protocols import Protocol
 from model.evaluation.report import evaluate_variants
-from model.evaluation.table import aligned, comparison_cells
+from model.evaluation.table import comparison_cells
 from model.evaluation.variants import Variant, next_camera
 from model.evaluation.waypoints import (
     PROTOCOLS,
@@ -143,8 +144,7 @@ class ImaginationReport:
         yield figure_table("responses", self.responses, _RESPONSE_COLUMNS, _INTERVALS)
         words = [score.action for score in next(iter(self.actions.values()))] if self.actions else []
         yield [["actions, F1", *words]] + [
-            [name, *("-" if score.f1 is None else f"{score.f1:.1%}" for score in of)]
-            for name, of in self.actions.items()
+            [name, *(cell(score.f1, "{:.1%}") for score in of)] for name, of in self.actions.items()
         ]
         yield figure_table(f"pictures, by the {self.extractor}", self.pictures, _PICTURE_COLUMNS, _INTERVALS)
         yield [comparison_cells(comparison) for comparison in self.comparisons]

@@ -13,6 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from model.driving.columns import aligned
 from model.driving.intervals import Array, Interval, episode_weights, interval_of, ratio_interval
 from model.driving.outcome import FailureName, Outcome
 
@@ -98,12 +99,11 @@ class OutcomeTable:
             f"second looks taken: {_told(self.think_rate)}",
             f"  better by outcome: {_told(self.revised_better)}",
             f"  worse by outcome:  {_told(self.revised_worse)}",
-            f"{'share of draws':<16}" + "".join(f"{run:>28}" for run in self.rates),
         ]
+        table = [["share of draws", *self.rates]]
         for name in ("holds", *FAILURES):
-            cells = "".join(f"{_told(of[name]):>28}" for of in self.rates.values())
-            lines.append(f"  {name.replace('_', ' '):<14}{cells}")
-        return "\n".join(lines)
+            table.append(["  " + name.replace("_", " "), *(_told(of[name]) for of in self.rates.values())])
+        return "\n".join([*lines, *aligned(table)])
 
 
 def outcome_table(

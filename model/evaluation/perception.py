@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from model.driving.columns import Columns, aligned, cells, titles
 from model.driving.facts import (
     FACTS,
     LANES,
@@ -186,16 +187,16 @@ def auc(scores: npt.NDArray[np.floating], positive: npt.NDArray[np.bool_]) -> fl
     return float((ranks[positive].sum() - positives * (positives + 1) / 2) / (positives * negatives))
 
 
+_COLUMNS: Final[Columns] = {
+    "scenes": ("scenes", "{:d}"),
+    "auc": ("AUC", "{:.3f}"),
+    "error": ("error", "{:.2f}"),
+    "r2": ("R2", "{:.2f}"),
+}
+
+
 def format_perception(rows: list[dict[str, Any]]) -> str:
     """The rows as plain text."""
-    lines = [f"{'':48} {'scenes':>7} {'AUC':>6} {'error':>7} {'R2':>6}"]
-    for row in rows:
-        cells = [
-            _cell(row.get(name), form) for name, form in (("auc", ".3f"), ("error", ".2f"), ("r2", ".2f"))
-        ]
-        lines.append(f"{row['fact']:48} {row['scenes']:7d} {cells[0]:>6} {cells[1]:>7} {cells[2]:>6}")
-    return "\n".join(lines)
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
+    nothing = dict.fromkeys(_COLUMNS)
+    lines = [[row["fact"], *cells(_COLUMNS, nothing | row)] for row in rows]
+    return "\n".join(aligned([["", *titles(_COLUMNS)], *lines]))

@@ -16,6 +16,7 @@ from model.evaluation.bootstrap import Comparison, compare
 from model.evaluation.open_loop import (
     EXPERT,
     LEAD_WITHIN_S,
+    MEASURES,
     SceneResult,
     evaluate_baselines,
     evaluate_trajectories,
@@ -132,10 +133,10 @@ def variant_rows(variant: Variant, results: Sequence[SceneResult]) -> list[Row]:
 
 def _rows(name: str, results: Sequence[SceneResult], **about: Any) -> list[Row]:
     """A variant's row over all scenes, and those over scenes with a lead vehicle close by or soon met."""
-    rows = [Row.from_results(name, results, **about)]
+    rows = [Row.of(name, results, MEASURES, **about)]
     for subgroup, of in ((LEAD_SUBGROUP, _with_lead(results)), (SOON_SUBGROUP, _soon(results))):
         if of:
-            rows.append(Row.from_results(name, of, subgroup=subgroup, **about))
+            rows.append(Row.of(name, of, MEASURES, subgroup=subgroup, **about))
     return rows
 
 

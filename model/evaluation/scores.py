@@ -9,6 +9,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
+from model.driving.columns import aligned, cell, interval_cell
 from model.driving.intervals import Interval, ratio_interval
 from model.driving.pdm.comfort import Version
 from model.driving.pdm.judging import SceneJudge
@@ -30,7 +31,6 @@ from model.driving.pdm.world import Array
 from model.driving.scene import LabelledScene
 from model.driving.trajectory import FloatArray
 from model.evaluation.open_loop import BASELINES, EXPERT
-from model.evaluation.table import aligned
 
 VERSIONS: Final[Mapping[Version, str]] = {"v1.1": "PDMS", "v2.2": "EPDMS"}
 BEFORE_S: Final = 0.5
@@ -323,17 +323,13 @@ def _value(found: tuple[float, Interval] | None) -> float | None:
 
 
 def _cells(row: ScoreRow, names: Sequence[str]) -> list[str]:
-    shown = "partial_score" if row.score is None else "score"
-    value = row.partial_score if row.score is None else row.score
-    low, high = row.intervals.get(shown, (np.nan, np.nan))
-    marked = "-" if value is None else f"{value:.3f}{'*' if row.score is None else ''}"
-    subs = (row.sub_scores[name] for name in names)
+    shown, mark = ("partial_score", "*") if row.score is None else ("score", "")
     return [
         row.name,
         str(row.scenes),
-        marked,
-        "" if value is None else f"{low:.3f}..{high:.3f}",
-        *("-" if each is None else f"{each:.3f}" for each in subs),
+        cell(getattr(row, shown), "{:.3f}" + mark),
+        interval_cell(row.intervals.get(shown), "{:.3f}"),
+        *(cell(row.sub_scores[name], "{:.3f}") for name in names),
     ]
 
 
