@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -36,7 +36,6 @@ _PAST: Final = (HISTORY_STEPS - 1 - 2 * _ROWS, HISTORY_STEPS - 1 - _ROWS, HISTOR
 """Rows of a history 1.0 s ago, 0.5 s ago and now."""
 
 MissionGoal = Literal["left", "forward", "right"]
-MISSION_GOALS: Final[tuple[MissionGoal, ...]] = get_args(MissionGoal)
 _GOAL_POINT: Final = 4
 """The point of a route that decides on the goal, 20 m ahead."""
 _GOAL_M: Final = 2.0

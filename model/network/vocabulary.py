@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import cached_property, lru_cache
 from types import MappingProxyType
 from typing import Any, Final
@@ -126,10 +126,6 @@ class Vocabulary:
         """Ids of the codes of one stage 0..5."""
         first = self.id_of(code_token(stage, 0))
         return range(first, first + self.codec_size)
-
-    def codes_to_ids(self, codes: Sequence[int] | npt.NDArray[np.integer]) -> tuple[int, ...]:
-        """Token ids of the 6 codes of a trajectory."""
-        return tuple(self.code_ids(stage)[int(code)] for stage, code in enumerate(codes))
 
     @cached_property
     def alphabets(self) -> Mapping[str, tuple[range, ...]]:
