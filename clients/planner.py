@@ -56,13 +56,13 @@ from clients.requests import (
     reflect_request,
 )
 from clients.streams import (
-    ImagineTold,
-    RefineTold,
+    ImagineEvent,
+    PlanEvent,
+    RefineEvent,
     Tell,
-    Told,
-    told,
-    told_of_pictures,
-    told_of_refinements,
+    imagine_event,
+    plan_event,
+    refine_event,
 )
 from clients.wire_values import with_pictures
 from model.driving.outcome import Outcome
@@ -74,9 +74,9 @@ __all__ = [
     "Access",
     "AsyncPlannerClient",
     "BadAnswer",
-    "ImagineTold",
+    "ImagineEvent",
     "LookedAt",
-    "Patience",
+    "RetryPolicy",
     "PlanResult",
     "PlannedDraw",
     "PlannerClient",
@@ -84,12 +84,12 @@ __all__ = [
     "PlannerProblem",
     "PlannerTimeout",
     "PlannerUnreachable",
-    "RefineTold",
+    "RefineEvent",
     "ReflectResult",
     "RequestRefused",
     "ServiceBusy",
     "ServiceFailed",
-    "Told",
+    "PlanEvent",
     "attempt_at",
     "imagine_request",
     "label_request",
@@ -99,11 +99,11 @@ __all__ = [
 ]
 
 
-_Told = TypeVar("_Told")
+_Event = TypeVar("_Event")
 
 
 @dataclass(frozen=True)
-class Patience:
+class RetryPolicy:
     """How long a client tries.
 
     Attributes:
@@ -142,13 +142,13 @@ class PlannerClient:
     def __init__(
         self,
         base_url: str,
-        patience: Patience = Patience(),
+        retries: RetryPolicy = RetryPolicy(),
         transport: httpx.BaseTransport | None = None,
         access: Access = Access(),
     ) -> None:
-        self._patience, self._packed = patience, access.packed
+        self._retries, self._packed = retries, access.packed
         self._http = httpx.Client(
-            base_url=base_url, timeout=patience.timeout_s, transport=transport, headers=_headers(access)
+            base_url=base_url, timeout=retries.timeout_s, transport=transport, headers=_headers(access)
         )
 
     def plan(
@@ -186,7 +186,7 @@ class PlannerClient:
         batch = wire.BatchRequest(requests=list(asked))
         return batch_results(self._ask("/v1/plan/batch", batch))
 
-    def stream(self, asked: wire.PlanRequest | wire.ReflectRequest) -> Iterator[tuple[str, Told]]:
+    def stream(self, asked: wire.PlanRequest | wire.ReflectRequest) -> Iterator[tuple[str, PlanEvent]]:
         """What a draw writes, as it is written: names and data of `clients.wire.EVENTS`, at last ``done``.
 
         Args:
@@ -195,9 +195,9 @@ class PlannerClient:
         Raises:
             PlannerError: before the first event or at the place of the one that failed.
         """
-        return self._stream(_path_of(asked), asked, told)
+        return self._stream(_path_of(asked), asked, plan_event)
 
-    def stream_imagine(self, asked: wire_imagine.ImagineRequest) -> Iterator[tuple[str, ImagineTold]]:
+    def stream_imagine(self, asked: wire_imagine.ImagineRequest) -> Iterator[tuple[str, ImagineEvent]]:
         """Pictures as they are written: names and data of `clients.wire_imagine.EVENTS`, at last ``done``.
 
         Args:
@@ -206,9 +206,9 @@ class PlannerClient:
         Raises:
             PlannerError: as of `stream`.
         """
-        return self._stream("/v1/imagine", asked, told_of_pictures)
+        return self._stream("/v1/imagine", asked, imagine_event)
 
-    def stream_refine(self, asked: wire_refine.RefineRequest) -> Iterator[tuple[str, RefineTold]]:
+    def stream_refine(self, asked: wire_refine.RefineRequest) -> Iterator[tuple[str, RefineEvent]]:
         """Refinements as they are written: names and data of `clients.wire_refine.EVENTS`, at last ``done``.
 
         Args:
@@ -217,7 +217,7 @@ class PlannerClient:
         Raises:
             PlannerError: as of `stream`.
         """
-        return self._stream("/v1/refine", asked, told_of_refinements)
+        return self._stream("/v1/refine", asked, refine_event)
 
     def reflect(
         self,
@@ -316,9 +316,9 @@ class PlannerClient:
             self._http.build_request("POST", path, **self._body(asked, request_id)), deadline_ms
         )
 
-    def _stream(self, path: str, asked: BaseModel, tell: Tell[_Told]) -> Iterator[tuple[str, _Told]]:
+    def _stream(self, path: str, asked: BaseModel, tell: Tell[_Event]) -> Iterator[tuple[str, _Event]]:
         body = self._body(asked.model_copy(update={"stream": True}))
-        with _told_errors(), self._http.stream("POST", path, **body) as response:
+        with _typed_errors(), self._http.stream("POST", path, **body) as response:
             if response.status_code != 200:
                 response.read()
                 raise problem_of(response)
@@ -330,9 +330,9 @@ class PlannerClient:
         return _body(asked, request_id, packed=self._packed)
 
     def _send(self, request: httpx.Request, deadline_ms: int | None = None) -> httpx.Response:
-        attempts = _Attempts(self._patience, deadline_ms)
+        attempts = _Attempts(self._retries, deadline_ms)
         while True:
-            with _told_errors():
+            with _typed_errors():
                 response = self._http.send(request)
             wait_s = attempts.wait_after(response)
             if wait_s is None:
@@ -346,13 +346,13 @@ class AsyncPlannerClient:
     def __init__(
         self,
         base_url: str,
-        patience: Patience = Patience(),
+        retries: RetryPolicy = RetryPolicy(),
         transport: httpx.AsyncBaseTransport | None = None,
         access: Access = Access(),
     ) -> None:
-        self._patience, self._packed = patience, access.packed
+        self._retries, self._packed = retries, access.packed
         self._http = httpx.AsyncClient(
-            base_url=base_url, timeout=patience.timeout_s, transport=transport, headers=_headers(access)
+            base_url=base_url, timeout=retries.timeout_s, transport=transport, headers=_headers(access)
         )
 
     async def plan(
@@ -374,17 +374,17 @@ class AsyncPlannerClient:
         batch = wire.BatchRequest(requests=list(asked))
         return batch_results(await self._ask("/v1/plan/batch", batch))
 
-    def stream(self, asked: wire.PlanRequest | wire.ReflectRequest) -> AsyncGenerator[tuple[str, Told]]:
+    def stream(self, asked: wire.PlanRequest | wire.ReflectRequest) -> AsyncGenerator[tuple[str, PlanEvent]]:
         """What a draw writes, as it is written; see `PlannerClient.stream`."""
-        return self._stream(_path_of(asked), asked, told)
+        return self._stream(_path_of(asked), asked, plan_event)
 
-    def stream_imagine(self, asked: wire_imagine.ImagineRequest) -> AsyncGenerator[tuple[str, ImagineTold]]:
+    def stream_imagine(self, asked: wire_imagine.ImagineRequest) -> AsyncGenerator[tuple[str, ImagineEvent]]:
         """Pictures as they are written; see `PlannerClient.stream_imagine`."""
-        return self._stream("/v1/imagine", asked, told_of_pictures)
+        return self._stream("/v1/imagine", asked, imagine_event)
 
-    def stream_refine(self, asked: wire_refine.RefineRequest) -> AsyncGenerator[tuple[str, RefineTold]]:
+    def stream_refine(self, asked: wire_refine.RefineRequest) -> AsyncGenerator[tuple[str, RefineEvent]]:
         """Refinements as they are written; see `PlannerClient.stream_refine`."""
-        return self._stream("/v1/refine", asked, told_of_refinements)
+        return self._stream("/v1/refine", asked, refine_event)
 
     async def reflect(
         self,
@@ -460,10 +460,10 @@ class AsyncPlannerClient:
         return await self._send(request, deadline_ms)
 
     async def _stream(
-        self, path: str, asked: BaseModel, tell: Tell[_Told]
-    ) -> AsyncGenerator[tuple[str, _Told]]:
+        self, path: str, asked: BaseModel, tell: Tell[_Event]
+    ) -> AsyncGenerator[tuple[str, _Event]]:
         body = self._body(asked.model_copy(update={"stream": True}))
-        with _told_errors():
+        with _typed_errors():
             async with self._http.stream("POST", path, **body) as response:
                 if response.status_code != 200:
                     await response.aread()
@@ -476,9 +476,9 @@ class AsyncPlannerClient:
         return _body(asked, request_id, packed=self._packed)
 
     async def _send(self, request: httpx.Request, deadline_ms: int | None = None) -> httpx.Response:
-        attempts = _Attempts(self._patience, deadline_ms)
+        attempts = _Attempts(self._retries, deadline_ms)
         while True:
-            with _told_errors():
+            with _typed_errors():
                 response = await self._http.send(request)
             wait_s = attempts.wait_after(response)
             if wait_s is None:
@@ -489,9 +489,9 @@ class AsyncPlannerClient:
 class _Attempts:
     """Decides, without waiting itself, whether and when to try again."""
 
-    def __init__(self, patience: Patience, deadline_ms: int | None) -> None:
-        self._left = patience.attempts
-        self._longest_wait_s = patience.longest_wait_s
+    def __init__(self, retries: RetryPolicy, deadline_ms: int | None) -> None:
+        self._left = retries.attempts
+        self._longest_wait_s = retries.longest_wait_s
         self._ends = None if deadline_ms is None else time.monotonic() + deadline_ms / 1000
 
     def wait_after(self, response: httpx.Response) -> float | None:
@@ -533,7 +533,7 @@ def _path_of(asked: wire.PlanRequest | wire.ReflectRequest) -> str:
 
 
 @contextmanager
-def _told_errors() -> Iterator[None]:
+def _typed_errors() -> Iterator[None]:
     try:
         yield
     except httpx.HTTPError as error:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from clients import wire, wire_imagine, wire_refine
 from clients.answers import BadAnswer, PlanResult, ReflectResult, planned, reflected, typed
 
-Told = (
+PlanEvent = (
     wire.PlanWritten
     | wire.BranchTaken
     | wire.ThinkingWritten
@@ -22,7 +22,7 @@ Told = (
     | ReflectResult
 )
 """What a stream of plans or reflections tells; see `clients.wire.EVENTS`."""
-ImagineTold = (
+ImagineEvent = (
     wire_imagine.PerceptionWritten
     | wire_imagine.PredictionWritten
     | wire_imagine.CodesWritten
@@ -30,7 +30,7 @@ ImagineTold = (
     | wire_imagine.ImagineResponse
 )
 """What a stream of pictures tells; see `clients.wire_imagine.EVENTS`."""
-RefineTold = (
+RefineEvent = (
     wire_refine.DraftJudged
     | wire.PlanWritten
     | wire.BranchTaken
@@ -41,12 +41,12 @@ RefineTold = (
 )
 """What a stream of refinements tells; see `clients.wire_refine.EVENTS`."""
 
-_Told = TypeVar("_Told")
-Tell = Callable[[ServerSentEvent, httpx.Response], _Told | None]
+_Event = TypeVar("_Event")
+Tell = Callable[[ServerSentEvent, httpx.Response], _Event | None]
 """Makes of an event of a response what it tells; None for an event of a later version."""
 
 
-def told(event: ServerSentEvent, response: httpx.Response) -> Told | None:
+def plan_event(event: ServerSentEvent, response: httpx.Response) -> PlanEvent | None:
     """What an event of a stream of plans or reflections tells; None for one of a later version.
 
     Args:
@@ -62,22 +62,22 @@ def told(event: ServerSentEvent, response: httpx.Response) -> Told | None:
             return reflected(wire.ReflectResponse.model_validate_json(data), response)
         return planned(wire.PlanResponse.model_validate_json(data), response)
 
-    return cast("Told | None", _told(event, response, wire.EVENTS, done))
+    return cast("PlanEvent | None", _event(event, response, wire.EVENTS, done))
 
 
-def told_of_pictures(event: ServerSentEvent, response: httpx.Response) -> ImagineTold | None:
+def imagine_event(event: ServerSentEvent, response: httpx.Response) -> ImagineEvent | None:
     """The same of a stream of pictures."""
     done = wire_imagine.ImagineResponse.model_validate_json
-    return cast("ImagineTold | None", _told(event, response, wire_imagine.EVENTS, done))
+    return cast("ImagineEvent | None", _event(event, response, wire_imagine.EVENTS, done))
 
 
-def told_of_refinements(event: ServerSentEvent, response: httpx.Response) -> RefineTold | None:
+def refine_event(event: ServerSentEvent, response: httpx.Response) -> RefineEvent | None:
     """The same of a stream of refinements."""
     done = wire_refine.RefineResponse.model_validate_json
-    return cast("RefineTold | None", _told(event, response, wire_refine.EVENTS, done))
+    return cast("RefineEvent | None", _event(event, response, wire_refine.EVENTS, done))
 
 
-def _told(
+def _event(
     event: ServerSentEvent,
     response: httpx.Response,
     events: Mapping[str, type[BaseModel]],

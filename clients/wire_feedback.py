@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import FailFast, Field, model_validator
 
-from clients.wire import Answered, Asked, TeacherName
+from clients.wire import RequestModel, ResponseModel, TeacherName
 from clients.wire_scores import ScoreRequest, ScoreTrajectory, ScoreVersion
 
 MAX_FEEDBACK: Final = 64
@@ -19,7 +19,7 @@ FeedbackMode = Literal["teacher", "rule"]
 PlanId = Annotated[str, Field(pattern="^[0-9a-f]{12}$")]
 
 
-class WrittenFeedback(Asked):
+class WrittenFeedback(RequestModel):
     """Feedback that another teacher wrote, to be checked against the facts of the trajectory."""
 
     text: Annotated[str, Field(min_length=1, max_length=10_000)] = Field(
@@ -30,7 +30,7 @@ class WrittenFeedback(Asked):
     )
 
 
-class PlanSaid(Asked):
+class PlanSaid(RequestModel):
     """What a planner says of one trajectory."""
 
     plan: Annotated[str, Field(max_length=10_000)] | None = Field(default=None, description="In words.")
@@ -78,7 +78,7 @@ class FeedbackRequest(ScoreRequest):
         return self
 
 
-class FailureMeasure(Answered):
+class FailureMeasure(ResponseModel):
     """By how much a plan fails."""
 
     name: str = Field(description="What is measured; it ends in the unit.")
@@ -87,7 +87,7 @@ class FailureMeasure(Answered):
     beyond: float | None = Field(description="How far the value is from the limit.")
 
 
-class FailureOther(Answered):
+class FailureOther(ResponseModel):
     """With whom a plan fails; null where it is not there, or has no place."""
 
     other_id: str
@@ -101,7 +101,7 @@ class FailureOther(Answered):
     speed_mps: float | None = Field(description="Its own then.")
 
 
-class FailureFact(Answered):
+class FailureFact(ResponseModel):
     """One sub-score below its full value."""
 
     sub_score: str
@@ -114,7 +114,7 @@ class FailureFact(Answered):
     measures: list[FailureMeasure]
 
 
-class PlanCourse(Answered):
+class PlanCourse(ResponseModel):
     """How a trajectory goes over the 4 s that are judged."""
 
     speed_mps: float = Field(description="Now.")
@@ -127,7 +127,7 @@ class PlanCourse(Answered):
     lateral: str = Field(description="keep lane, turn left or right, change to left or right lane.")
 
 
-class FeedbackSections(Answered):
+class FeedbackSections(ResponseModel):
     """A teacher's five sections."""
 
     meta_action: str
@@ -137,7 +137,7 @@ class FeedbackSections(Answered):
     correction: str
 
 
-class PlanFeedback(Answered):
+class PlanFeedback(ResponseModel):
     """What is said of one trajectory."""
 
     plan_id: PlanId = Field(description="Stands for the trajectory.")
@@ -157,7 +157,7 @@ class PlanFeedback(Answered):
     attempts: int = Field(description="How often the teacher was asked; 0 where nobody was.")
 
 
-class FeedbackResponse(Answered):
+class FeedbackResponse(ResponseModel):
     """Answer of POST /v1/feedback."""
 
     request_id: str

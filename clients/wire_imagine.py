@@ -12,8 +12,6 @@ from pydantic import Field
 from clients.wire import (
     MAX_SEED,
     AgentKind,
-    Answered,
-    Asked,
     Camera,
     Decision,
     Finite,
@@ -21,6 +19,8 @@ from clients.wire import (
     ModelName,
     Nearby,
     Problem,
+    RequestModel,
+    ResponseModel,
     Scene,
     Temperature,
     Timing,
@@ -35,7 +35,7 @@ ROW_CODES: Final = 14
 Index = Annotated[int, Field(ge=0, description="0..n-1.")]
 
 
-class ImagineControls(Asked):
+class ImagineControls(RequestModel):
     """What the caller decides about decoding."""
 
     n: int = Field(default=1, ge=1, le=64, description="Pictures.")
@@ -54,7 +54,7 @@ class ImagineControls(Asked):
     )
 
 
-class ImagineRequest(Asked):
+class ImagineRequest(RequestModel):
     """Body of POST /v1/imagine."""
 
     scene: Scene
@@ -67,7 +67,7 @@ class ImagineRequest(Asked):
     )
 
 
-class SeenObject(Answered):
+class SeenObject(ResponseModel):
     """One road user or obstacle that the model tells of, now, in the ego frame."""
 
     kind: AgentKind
@@ -85,7 +85,7 @@ class PerceivedObject(SeenObject):
     )
 
 
-class Edges(Answered):
+class Edges(ResponseModel):
     """How far the edges of the road are."""
 
     left_m: float = Field(ge=0, description="From the ego's left side to the edge of the road.")
@@ -104,7 +104,7 @@ class Perception(Edges):
     objects: list[PerceivedObject] = Field(description="The nearest first, at most 8.")
 
 
-class Prediction(Answered):
+class Prediction(ResponseModel):
     """Where the ego will be when the imagined picture is taken, in its frame of now."""
 
     x_m: Finite
@@ -112,7 +112,7 @@ class Prediction(Answered):
     direction: str = Field(description="Left, Forward or Right.")
 
 
-class Picture(Answered):
+class Picture(ResponseModel):
     """One of the n pictures; data of the event `picture`."""
 
     index: Index
@@ -140,7 +140,7 @@ class ImaginedPicture(Picture):
     prediction: Prediction
 
 
-class ImagineResponse(Answered):
+class ImagineResponse(ResponseModel):
     """Answer of POST /v1/imagine."""
 
     request_id: str
@@ -152,21 +152,21 @@ class ImagineResponse(Answered):
     timing: Timing
 
 
-class PerceptionWritten(Answered):
+class PerceptionWritten(ResponseModel):
     """Data of the event `perception`."""
 
     index: Index
     perception: Seen
 
 
-class PredictionWritten(Answered):
+class PredictionWritten(ResponseModel):
     """Data of the event `prediction`."""
 
     index: Index
     prediction: Prediction
 
 
-class CodesWritten(Answered):
+class CodesWritten(ResponseModel):
     """Data of the event `codes`: how far the picture is written."""
 
     index: Index

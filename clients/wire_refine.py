@@ -13,14 +13,14 @@ from pydantic import Discriminator, Field, Tag
 import clients.wire as wire
 from clients.wire import (
     MAX_FEEDBACK_CHARACTERS,
-    Answered,
-    Asked,
     Deadline,
     Draw,
     ModelName,
     Pose,
     Probability,
     ReflectControls,
+    RequestModel,
+    ResponseModel,
     Scene,
     Timing,
 )
@@ -38,7 +38,7 @@ DraftPoses = Annotated[
 _Section = Annotated[str, Field(min_length=1, max_length=MAX_SECTION_CHARACTERS)]
 
 
-class SectionsGiven(Asked):
+class SectionsGiven(RequestModel):
     """A teacher's five sections, a paragraph each; as POST /v1/feedback answers them."""
 
     meta_action: _Section
@@ -59,7 +59,7 @@ FeedbackGiven = Annotated[
 ]
 
 
-class RefineRequest(Asked):
+class RefineRequest(RequestModel):
     """Body of POST /v1/refine."""
 
     scene: Scene = Field(
@@ -81,7 +81,7 @@ class RefineRequest(Asked):
     )
 
 
-class DraftFeedback(Answered):
+class DraftFeedback(ResponseModel):
     """What the model was told of the draft."""
 
     text: str = Field(description="As the model read it.")
@@ -100,7 +100,7 @@ class Refinement(Draw):
     )
 
 
-class DraftJudged(Answered):
+class DraftJudged(ResponseModel):
     """What is known of the draft before it is refined; data of the event `feedback`."""
 
     feedback: DraftFeedback

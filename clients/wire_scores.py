@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import FailFast, Field, SkipValidation, model_validator
 
-from clients.wire import Answered, Asked, Length, Nearby, NearbyPoint, Problem
+from clients.wire import Length, Nearby, NearbyPoint, Problem, RequestModel, ResponseModel
 
 MAX_TRAJECTORIES: Final = 4096
 MAX_SCORED_TOGETHER: Final = 64
@@ -33,7 +33,7 @@ Ring = Annotated[
 Name = Annotated[str, Field(min_length=1, max_length=100)]
 
 
-class VehicleShape(Asked):
+class VehicleShape(RequestModel):
     """The ego's body, from its rear axle; NAVSIM's car where none is given."""
 
     width_m: Length = 2.297
@@ -44,7 +44,7 @@ class VehicleShape(Asked):
     wheelbase_m: Length = 3.089
 
 
-class EgoMotion(Asked):
+class EgoMotion(RequestModel):
     """How the ego moves now; it stands at (0, 0, 0)."""
 
     speed_mps: Annotated[float, Field(ge=-60, le=100, allow_inf_nan=False)]
@@ -56,7 +56,7 @@ class EgoMotion(Asked):
     yaw_acceleration_rad_s2: Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)] = 0.0
 
 
-class PastMotion(Asked):
+class PastMotion(RequestModel):
     """The ego at one moment before now."""
 
     heading_rad: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
@@ -64,7 +64,7 @@ class PastMotion(Asked):
     lateral_acceleration_mps2: Annotated[float, Field(ge=-30, le=30, allow_inf_nan=False)] = 0.0
 
 
-class ScoredAgent(Asked):
+class ScoredAgent(RequestModel):
     """Something that the ego could hit, now and in the future."""
 
     agent_id: Name
@@ -85,7 +85,7 @@ class ScoredAgent(Asked):
     )
 
 
-class ScoredLane(Asked):
+class ScoredLane(RequestModel):
     """A lane, or a lane's way over an intersection."""
 
     lane_id: Name
@@ -93,7 +93,7 @@ class ScoredLane(Asked):
     on_route: bool = Field(description="Whether the ego may go along it; elsewhere it is oncoming traffic.")
 
 
-class ClosedLane(Asked):
+class ClosedLane(RequestModel):
     """A lane behind a red light."""
 
     light_id: Name
@@ -102,7 +102,7 @@ class ClosedLane(Asked):
     until_s: Annotated[float, Field(ge=0, le=4, allow_inf_nan=False)] = 4.0
 
 
-class Labels(Asked):
+class Labels(RequestModel):
     """What is known of a moment and its next seconds.
 
     A layer that is null is not known, and what needs it is not scored. An empty list says that there is none.
@@ -131,7 +131,7 @@ class Labels(Asked):
     )
 
 
-class PreviousPlan(Asked):
+class PreviousPlan(RequestModel):
     """A plan made shortly before, for extended comfort; poses in the ego's frame of then."""
 
     trajectory: ScoreTrajectory
@@ -139,7 +139,7 @@ class PreviousPlan(Asked):
     seconds_ago: Annotated[float, Field(ge=0.1, lt=0.55, allow_inf_nan=False)] = 0.5
 
 
-class ScoreRequest(Asked):
+class ScoreRequest(RequestModel):
     """Body of POST /v1/score."""
 
     labels: Labels | None = Field(default=None, description="Or scene_id.")
@@ -176,14 +176,14 @@ class ScoreRequest(Asked):
         return self
 
 
-class ScoreBatchRequest(Asked):
+class ScoreBatchRequest(RequestModel):
     """Body of POST /v1/score/batch."""
 
     # Each is checked by itself, so that one that breaks the contract fails alone.
     requests: list[SkipValidation[ScoreRequest]] = Field(min_length=1, max_length=MAX_SCORED_TOGETHER)
 
 
-class ScoreFailure(Answered):
+class ScoreFailure(ResponseModel):
     """One sub-score at which a plan fails."""
 
     sub_score: str
@@ -196,7 +196,7 @@ class ScoreFailure(Answered):
     what: str = Field(description="Of comfort, the bound that is broken; empty otherwise.")
 
 
-class TrajectoryScore(Answered):
+class TrajectoryScore(ResponseModel):
     """What one trajectory is worth."""
 
     score: float | None = Field(description="0 to 1; null where a sub-score that counts is missing.")
@@ -208,7 +208,7 @@ class TrajectoryScore(Answered):
     failures: list[ScoreFailure] = Field(description="In the order of time.")
 
 
-class ScoreResponse(Answered):
+class ScoreResponse(ResponseModel):
     """Answer of POST /v1/score."""
 
     request_id: str
@@ -221,7 +221,7 @@ class ScoreResponse(Answered):
     scores: list[TrajectoryScore]
 
 
-class ScoreResult(Answered):
+class ScoreResult(ResponseModel):
     """One scene of a batch."""
 
     status: int
@@ -229,7 +229,7 @@ class ScoreResult(Answered):
     problem: Problem | None = None
 
 
-class ScoreBatchResponse(Answered):
+class ScoreBatchResponse(ResponseModel):
     """Answer of POST /v1/score/batch."""
 
     results: list[ScoreResult]

@@ -141,14 +141,14 @@ class Admission:
         """The same as `place`, but wait for it; for scenes of a batch."""
         turn = _Turn(Place(draws), self._clock())
         self._turns.append(turn)
-        self._next_turns()
+        self._admit_waiting()
         try:
             await turn.come.wait()
             yield turn.place
         finally:
             if turn in self._turns:
                 self._turns.remove(turn)
-                self._next_turns()
+                self._admit_waiting()
             else:
                 self._leave(turn.place)
 
@@ -166,9 +166,9 @@ class Admission:
         held_s = self._clock() - place.since_s
         self._draw_s += _MEMORY * (held_s / self._held - self._draw_s)
         self._places.remove(place)
-        self._next_turns()
+        self._admit_waiting()
 
-    def _next_turns(self) -> None:
+    def _admit_waiting(self) -> None:
         while self._turns and self._fits(self._turns[0].place.draws):
             turn = self._turns.popleft()
             turn.place.waited_s = self._clock() - turn.since_s
@@ -177,7 +177,7 @@ class Admission:
         if self._turns and self._turns[0].first_s is None:
             self._turns[0].first_s = self._clock()
 
-    def _is_turns(self) -> bool:
+    def _free_is_reserved(self) -> bool:
         """Whether what is free is kept for a batch's next scene."""
         first_s = self._turns[0].first_s if self._turns else None
         return first_s is not None and self._clock() - first_s > PATIENCE_S
@@ -189,7 +189,7 @@ class Admission:
             raise Full(f"{detail}; {self.scenes} are accepted at once", waiting_s)
 
     def _check(self, draws: int) -> None:
-        if self._is_turns():
+        if self._free_is_reserved():
             first = self._turns[0].place.draws
             raise Full("the next scene of a batch has waited and goes first", first * self._draw_s)
         if self._fits(draws):

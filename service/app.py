@@ -20,6 +20,7 @@ from model.engines.engine import Engine
 from service.admission import Admission
 from service.auth import Guard
 from service.body_limit import BodyLimit
+from service.dependencies import Dependencies
 from service.errors import install_error_handlers
 from service.idempotency import Idempotency
 from service.inspector.page import add_inspector
@@ -28,7 +29,6 @@ from service.logs import configure_logging
 from service.metrics import Metrics
 from service.middleware import Around
 from service.openapi import describe
-from service.parts import Parts
 from service.planning import Limits, Planning
 from service.pulse import Pulse
 from service.rates import Rates
@@ -119,8 +119,10 @@ def create_app(
     app.add_middleware(Around, metrics=metrics, traces=traces, stopping=lambda: lifecycle.stopping)
     install_error_handlers(app, metrics)
     began_s = int(time.time())
-    parts = Parts(settings, metrics, lifecycle, planning, idempotency, teacher, load, began_s, pulse, scorer)
-    app.include_router(make_router(parts))
+    deps = Dependencies(
+        settings, metrics, lifecycle, planning, idempotency, teacher, load, began_s, pulse, scorer
+    )
+    app.include_router(make_router(deps))
     add_inspector(app)
     describe(app, keys=bool(keys))
     app.state.drain = lifecycle.drain

@@ -63,7 +63,7 @@ class Guard:
         await self._app(scope, receive, send)
 
     async def _refuse(self, problem: ProblemError, scope: Scope, receive: Receive, send: Send) -> None:
-        self._metrics.problem_told(problem.kind)
+        self._metrics.count_problem(problem.kind)
         answer = problem_response(problem, scope["state"]["request_id"], scope["path"])
         await answer(scope, receive, send)
 

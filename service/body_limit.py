@@ -17,7 +17,7 @@ LARGE_BYTES: Final = 1_000_000
 _LARGE_SHARE: Final = 4
 
 
-class _Pace:
+class _ByteRate:
     """Lets so many bytes a second pass, and as many as ``at_once`` after a pause."""
 
     def __init__(self, bytes_per_s: int, at_once: int) -> None:
@@ -52,7 +52,7 @@ class BodyLimit:
         self._app, self._timeout_s = app, timeout_s
         self._max_bytes, self._max_held_bytes, self._held_bytes = max_bytes, max_held_bytes, 0
         self._max_large_bytes, self._large_bytes = max(max_bytes, max_held_bytes // _LARGE_SHARE), 0
-        self._pace = _Pace(large_bytes_per_s, max_bytes)
+        self._byte_rate = _ByteRate(large_bytes_per_s, max_bytes)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection; anything but HTTP passes through."""
@@ -84,7 +84,7 @@ class BodyLimit:
             self._held_bytes += received - before
             if large := _large(received) - _large(before):
                 self._large_bytes += large
-                goes_on_s = self._pace.take(large)
+                goes_on_s = self._byte_rate.take(large)
             too_large = received > self._max_bytes
             too_many = self._too_many(received)
             if (too_large or too_many is not None) and not complete:
@@ -125,7 +125,7 @@ class BodyLimit:
                     message = await receive()
                     count = len(message.get("body", b""))
                     dropped += count
-                    goes_on_s = self._pace.take(count)
+                    goes_on_s = self._byte_rate.take(count)
                     if not message.get("more_body", False):
                         return
 

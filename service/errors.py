@@ -81,7 +81,7 @@ def install_error_handlers(app: FastAPI, metrics: Metrics) -> None:
     """Answer every error of ``app`` with a problem document; what is not foreseen, the middleware answers."""
 
     def answer(request: Request, problem: ProblemError, headers: dict[str, str] | None = None) -> Response:
-        metrics.problem_told(problem.kind)
+        metrics.count_problem(problem.kind)
         return problem_response(problem, request.state.request_id, request.url.path, headers)
 
     @app.exception_handler(ProblemError)

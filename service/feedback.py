@@ -10,6 +10,7 @@ from typing import Final, Literal
 import structlog
 
 import clients.wire_feedback as wire_feedback
+from clients.labelling.retries import with_retries
 from clients.labelling.teachers.feedback import (
     FeedbackQuestion,
     FeedbackTeacher,
@@ -17,7 +18,6 @@ from clients.labelling.teachers.feedback import (
     check_feedback,
     question_of,
 )
-from clients.labelling.teachers.patience import patiently
 from clients.labelling.teachers.teacher import (
     Answer,
     ReflectionRefused,
@@ -34,6 +34,7 @@ from model.driving.pdm.judged import JudgedPlan, Number
 from model.driving.pdm.judging import Said, judged_plans
 from model.driving.pdm.rule_teacher import NAME, REVISION, feedback_on
 from model.driving.pdm.world import ScoreError
+from service.inspector_scenes import BundledScenes
 from service.metrics import Metrics
 from service.problems import (
     FEEDBACK_REFUSED,
@@ -46,7 +47,6 @@ from service.problems import (
     at,
 )
 from service.scoring import rounded, scores_of, trajectory_of
-from service.views import BundledScenes
 
 log = structlog.stdlib.get_logger()
 
@@ -197,7 +197,7 @@ async def _asked(
 ) -> tuple[Feedback, int]:
     answers: list[Answer] = []
     try:
-        written = await patiently(lambda: ask_feedback(teacher, question, answers), PATIENCE_S)
+        written = await with_retries(lambda: ask_feedback(teacher, question, answers), PATIENCE_S)
     except (TeacherBusy, TeacherClosed) as error:
         # What an endpoint says, or where it is, is the operator's business.
         log.warning("teacher away", teacher=teacher.name, reason=str(error))

@@ -11,10 +11,10 @@ import clients.wire_feedback as wire_feedback
 from clients.labelling.teachers.feedback import FeedbackTeacher
 from service.admission import Admission
 from service.callers import while_connected
+from service.dependencies import Dependencies
 from service.examples import example_feedback
 from service.feedback import taught
 from service.openapi import PACKED, payloads, problems
-from service.parts import Parts
 from service.payloads import payload_route
 from service.planning import full_as_problem, let_in
 from service.planning_routes import arrival_of, respond
@@ -30,21 +30,21 @@ from service.scoring_routes import SCORING_REFUSALS
 EXAMPLES: Final[dict[str, Example]] = {"why one of two trajectories is wrong": {"value": example_feedback()}}
 
 
-def feedback_router(parts: Parts, admission: Admission) -> APIRouter:
+def feedback_router(deps: Dependencies, admission: Admission) -> APIRouter:
     """The endpoint; it takes its places from the scorer's ``admission``."""
 
     def check_open(_: Request) -> None:
-        parts.lifecycle.check_accepting()
+        deps.lifecycle.check_accepting()
         with full_as_problem():
             admission.check_open()
 
     async def given(asked: wire_feedback.FeedbackRequest, request_id: str) -> wire_feedback.FeedbackResponse:
-        found = await parts.scorer.feedback(asked, request_id)
+        found = await deps.scorer.feedback(asked, request_id)
         response = found.response
-        if asked.mode == "teacher" and isinstance(parts.teacher, FeedbackTeacher):
-            response = await taught(found, parts.teacher, parts.metrics)
+        if asked.mode == "teacher" and isinstance(deps.teacher, FeedbackTeacher):
+            response = await taught(found, deps.teacher, deps.metrics)
         for each in response.feedback:
-            parts.metrics.feedback_told(each.written_by, correct=each.correct)
+            deps.metrics.count_feedback(each.written_by, correct=each.correct)
         return response
 
     router = APIRouter(route_class=payload_route(check_open), tags=["scoring"])
@@ -64,8 +64,8 @@ def feedback_router(parts: Parts, admission: Admission) -> APIRouter:
     ) -> Any:
         """Why trajectories fail: facts, and a teacher's five sections on each that is wrong."""
         arrival = arrival_of(request)
-        with parts.lifecycle.accepted(), let_in(admission.place(1)):
-            await parts.planning.spend(arrival.owner, len(asked.trajectories))
+        with deps.lifecycle.accepted(), let_in(admission.place(1)):
+            await deps.planning.spend(arrival.owner, len(asked.trajectories))
             return respond(request, await while_connected(request, given(asked, arrival.request_id)))
 
     return router

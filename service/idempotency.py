@@ -17,7 +17,7 @@ _KEPT: Final = 1024
 _KEPT_BYTES: Final = 64_000_000
 
 
-class NotKept(Exception):
+class NotCached(Exception):
     """An answer that is given and not kept: another try may get a better one."""
 
     def __init__(self, answer: Response) -> None:

@@ -11,10 +11,10 @@ from fastapi.openapi.models import Example
 import clients.wire_imagine as wire_imagine
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from service.callers import while_connected
+from service.dependencies import Dependencies
 from service.examples import example_imagining
 from service.imagining import ImagineTeller, imagine_answer, imagining_of
 from service.openapi import answers_and_stream, payloads, problems
-from service.parts import Parts
 from service.payloads import payload_route
 from service.planning import Planned, last
 from service.planning_routes import REFUSALS, arrival_of, respond
@@ -29,9 +29,9 @@ EXAMPLES: Final[dict[str, Example]] = {
 }
 
 
-def imagine_router(parts: Parts) -> APIRouter:
+def imagine_router(deps: Dependencies) -> APIRouter:
     """The endpoint; pictures take places as draws of /v1/plan do."""
-    router = APIRouter(route_class=payload_route(lambda _: parts.planning.check_open()), tags=["planning"])
+    router = APIRouter(route_class=payload_route(lambda _: deps.planning.check_open()), tags=["planning"])
 
     @router.post(
         "/v1/imagine",
@@ -44,8 +44,8 @@ def imagine_router(parts: Parts) -> APIRouter:
     ) -> Any:
         """What a camera will see in half a second: n pictures, and what the model perceives and predicts."""
         arrival = arrival_of(request)
-        imagining = imagining_of(asked, parts.lifecycle.card)
-        events = parts.planning.events(imagining.planning, arrival)
+        imagining = imagining_of(asked, deps.lifecycle.card)
+        events = deps.planning.events(imagining.planning, arrival)
 
         async def answer(planned: Planned) -> wire_imagine.ImagineResponse:
             # On a thread: painting must not hold up the answers of others.
@@ -60,7 +60,7 @@ def imagine_router(parts: Parts) -> APIRouter:
                 events,
                 ImagineTeller(imagining.imagination),
                 lambda told: server_sent(told, answer, arrival.request_id),
-                parts.metrics,
+                deps.metrics,
             )
         return respond(request, await while_connected(request, work()))
 

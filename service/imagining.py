@@ -16,8 +16,7 @@ from model.engines.engine import CodesWritten, Draw, SectionFinished
 from model.families.family import Imagination, Predicted
 from model.families.registry import family_named
 from model.network.model_card import ModelCard
-from service.planning import Arrival, Begun, Paint, Planned
-from service.planning import Told as Happened
+from service.planning import Arrival, Begun, Paint, Planned, SceneEvent
 from service.problems import CANNOT_IMAGINE, UNKNOWN_FORMAT, ProblemError
 
 _DECIMALS = 4
@@ -101,7 +100,7 @@ class ImagineTeller:
         self._paint: Paint | None = None
         self._rows: dict[int, int] = {}
 
-    async def __call__(self, event: Happened) -> list[tuple[str, Written]]:
+    async def __call__(self, event: SceneEvent) -> list[tuple[str, Written]]:
         """Events of `clients.wire_imagine.EVENTS` with their data."""
         imagination = self._imagination
         match event:

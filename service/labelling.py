@@ -9,7 +9,7 @@ import numpy as np
 import structlog
 
 import clients.wire as wire
-from clients.labelling.teachers.patience import patiently
+from clients.labelling.retries import with_retries
 from clients.labelling.teachers.teacher import (
     AnnotationsMissing,
     Answer,
@@ -26,7 +26,6 @@ from model.driving.outcome import Outcome
 from model.driving.scene import AGENT_KINDS, Agent, SceneError
 from model.driving.tracks import track_of
 from model.driving.view import Surroundings
-from service.intake import plan_of, scene_of
 from service.metrics import Metrics
 from service.problems import (
     INVALID_REQUEST,
@@ -38,6 +37,7 @@ from service.problems import (
     ProblemError,
     at,
 )
+from service.validation import plan_of, scene_of
 
 log = structlog.stdlib.get_logger()
 
@@ -67,7 +67,7 @@ async def label(
     question = await asyncio.to_thread(_question, asked)
     answers: list[Answer] = []
     try:
-        reflection = await patiently(lambda: ask(teacher, question, answers), PATIENCE_S)
+        reflection = await with_retries(lambda: ask(teacher, question, answers), PATIENCE_S)
     except (TeacherBusy, TeacherClosed) as error:
         # What an endpoint says, or where it is, is the operator's business.
         log.warning("teacher away", teacher=teacher.name, reason=str(error))
@@ -81,14 +81,14 @@ async def label(
         detail = f"{teacher.name} does not take this question; the log has why"
         raise ProblemError(TEACHER_REFUSED, detail) from None
     except ReflectionRefused as error:
-        metrics.label_asked(teacher.name, [each.check for each in error.failed], written=False)
+        metrics.count_label(teacher.name, [each.check for each in error.failed], written=False)
         raise ProblemError(LABEL_REFUSED, f"{teacher.name}, asked {error.attempts} times: {error}") from None
     finally:
         input_tokens = sum(answer.input_tokens for answer in answers)
         output_tokens = sum(answer.output_tokens for answer in answers)
         cost_usd = sum(answer.cost_usd for answer in answers)
         metrics.teacher_paid(teacher.name, input_tokens, output_tokens, cost_usd)
-    metrics.label_asked(teacher.name, [each.check for each in reflection.failed], written=True)
+    metrics.count_label(teacher.name, [each.check for each in reflection.failed], written=True)
     return wire.LabelResponse(
         request_id=request_id,
         reflection=reflection.text,

@@ -232,14 +232,14 @@ class Metrics:
         )
         self.registry.register(_LinesLost())
 
-    def problem_told(self, kind: Kind) -> None:
+    def count_problem(self, kind: Kind) -> None:
         """Count a request, or a scene of a batch, that may have been right and was not served."""
         if kind in REJECTIONS:
             self._rejections.labels(kind.slug).inc()
 
-    def problem_told_within(self, kind: Kind) -> None:
+    def count_problem_within(self, kind: Kind) -> None:
         """Count a problem that no status shows, since it is told in a stream or in a batch's answer."""
-        self.problem_told(kind)
+        self.count_problem(kind)
         if kind.status >= 500 and kind.status != 503:
             self._failures.labels(kind.slug).inc()
 
@@ -248,7 +248,7 @@ class Metrics:
         self._queue.observe(queue_s)
         self._engine.labels(endpoint).observe(engine_s)
 
-    def deadline_told(self, *, met: bool) -> None:
+    def count_deadline(self, *, met: bool) -> None:
         """Count one scene with a deadline, whether it was answered or given up."""
         self._deadlines.labels("met" if met else "missed").inc()
 
@@ -265,14 +265,14 @@ class Metrics:
         self._model.clear()
         self._model.labels(card.name, card.revision, card.engine).set(1)
 
-    def label_asked(self, teacher: str, failed: Iterable[str], *, written: bool) -> None:
+    def count_label(self, teacher: str, failed: Iterable[str], *, written: bool) -> None:
         """Count one question to a teacher, and the checks that its answers failed."""
         if written:
             self._labels.labels(teacher).inc()
         for check in failed:
             self._label_checks_failed.labels(teacher, check).inc()
 
-    def feedback_told(self, teacher: str, *, correct: bool) -> None:
+    def count_feedback(self, teacher: str, *, correct: bool) -> None:
         """Count feedback on one trajectory."""
         self._feedback.labels(teacher, "correct" if correct else "wrong").inc()
 

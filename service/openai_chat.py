@@ -97,7 +97,7 @@ class StreamOptions(_Dialect):
     include_usage: Annotated[bool, _null_is(False)] = False
 
 
-class Extras(wire.Asked):
+class Extras(wire.RequestModel):
     """What chat completions have no words for."""
 
     history: wire.History | None = Field(default=None, description="Without it the car is taken to stand.")

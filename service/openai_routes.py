@@ -13,8 +13,8 @@ from starlette.responses import JSONResponse
 import clients.wire as wire
 from service.answers import wire_branch
 from service.callers import while_connected
+from service.dependencies import Dependencies
 from service.errors import validated
-from service.intake import format_of
 from service.openai_chat import (
     THINKING,
     ChatPlaces,
@@ -26,13 +26,13 @@ from service.openai_chat import (
 )
 from service.openai_errors import dialect_error
 from service.openapi import Responses, event_stream, problems
-from service.parts import Parts
 from service.payloads import payload_route
 from service.planning import Planned, last
 from service.planning_routes import REFUSALS, arrival_of
 from service.problems import DRAINING, ENGINE_FAILED, NOT_READY, UNAUTHORIZED, UNKNOWN_MODEL, ProblemError
 from service.streaming import streamed
 from service.telling import PlanTeller, Written
+from service.validation import format_of
 
 _ANSWERS: Final[Responses] = {
     200: {
@@ -54,9 +54,9 @@ _ANSWERS: Final[Responses] = {
 }
 
 
-def openai_router(parts: Parts) -> APIRouter:
+def openai_router(deps: Dependencies) -> APIRouter:
     """The endpoint for clients of OpenAI's API."""
-    router = APIRouter(route_class=payload_route(lambda _: parts.planning.check_open()), tags=["planning"])
+    router = APIRouter(route_class=payload_route(lambda _: deps.planning.check_open()), tags=["planning"])
 
     refusals = problems(*REFUSALS, UNKNOWN_MODEL, dialect=True)
 
@@ -64,11 +64,11 @@ def openai_router(parts: Parts) -> APIRouter:
     async def chat_completions(request: Request, chat: ChatRequest) -> Any:
         """Planning in OpenAI's dialect: pictures as image parts, a message per draw; see docs/http.md."""
         arrival = arrival_of(request)
-        card = parts.lifecycle.card
+        card = deps.lifecycle.card
         completion, places = Completion(arrival.request_id, card.name, chat), ChatPlaces(chat)
         try:
             asked = validated(wire.PlanRequest, plan_document(chat, card))
-            events = parts.planning.events(asked, arrival)
+            events = deps.planning.events(asked, arrival)
             if not chat.stream:
                 return JSONResponse(completion.whole(await while_connected(request, last(events))))
             return await streamed(
@@ -76,7 +76,7 @@ def openai_router(parts: Parts) -> APIRouter:
                 events,
                 PlanTeller(format_of(asked, card)),
                 lambda told: _chunks(told, completion, places),
-                parts.metrics,
+                deps.metrics,
             )
         except ProblemError as problem:
             raise places.problem(problem) from problem
@@ -87,10 +87,10 @@ def openai_router(parts: Parts) -> APIRouter:
     )
     async def model(name: str) -> wire.NamedModel:
         """One model, in OpenAI's dialect."""
-        parts.lifecycle.check_ready()
-        card = parts.lifecycle.card
+        deps.lifecycle.check_ready()
+        card = deps.lifecycle.card
         check_model(name, card)
-        return wire.NamedModel(id=card.name, created=parts.began_s)
+        return wire.NamedModel(id=card.name, created=deps.began_s)
 
     return router
 

@@ -33,7 +33,6 @@ from model.engines.engine import (
 )
 from model.network.model_card import ModelCard
 from service.admission import Admission, Full, Place, whole_seconds
-from service.intake import Geometry, engine_request
 from service.lifecycle import Lifecycle
 from service.metrics import Metrics
 from service.problems import (
@@ -48,11 +47,12 @@ from service.problems import (
 )
 from service.rates import RateLimited, Rates
 from service.traces import Traces
+from service.validation import Geometry, engine_request
 
 _ANSWERING_MS: Final = 3
 """Of a deadline, left for writing the answer."""
 
-Asked = wire.PlanRequest | wire.ReflectRequest
+AnyPlanRequest = wire.PlanRequest | wire.ReflectRequest
 Paint = Callable[[Sequence[int]], npt.NDArray[np.uint8]]
 _Held = TypeVar("_Held")
 
@@ -118,7 +118,7 @@ class Begun:
     paint: Paint
 
 
-Told = Event | Begun | Judged | Planned
+SceneEvent = Event | Begun | Judged | Planned
 """What a scene's events are here: the engine's, and what is made of them."""
 
 
@@ -166,8 +166,8 @@ class Planning:
             raise ProblemError(RATE_LIMITED, str(error), retry_after_s=wait_s) from None
 
     async def events(
-        self, asked: Asked, arrival: Arrival, geometry: Geometry | None = None
-    ) -> AsyncGenerator[Told]:
+        self, asked: AnyPlanRequest, arrival: Arrival, geometry: Geometry | None = None
+    ) -> AsyncGenerator[SceneEvent]:
         """What happens to a scene, at last the whole of it; closing it early frees everything.
 
         `Started` is told as `Begun`, finished draws as `Judged`.
@@ -186,14 +186,14 @@ class Planning:
                 async for event in events:
                     yield event
 
-    async def in_turn(self, asked: Asked, arrival: Arrival) -> Planned:
+    async def in_turn(self, asked: AnyPlanRequest, arrival: Arrival) -> Planned:
         """A scene of a batch that was let in, which waits for its place; raises `ProblemError`."""
         async with self._admission.place_in_turn(asked.controls.n) as place:
             return await last(self._plan(asked, arrival, place))
 
     async def _plan(
-        self, asked: Asked, arrival: Arrival, place: Place, geometry: Geometry | None = None
-    ) -> AsyncGenerator[Told]:
+        self, asked: AnyPlanRequest, arrival: Arrival, place: Place, geometry: Geometry | None = None
+    ) -> AsyncGenerator[SceneEvent]:
         endpoint = "reflect" if isinstance(asked, wire.ReflectRequest) else "plan"
         draws, drafts, agreements = list[Draw](), dict[int, Draw](), dict[int, Agreement]()
         with self._lifecycle.engine() as engine, self._traces.planning(asked, engine.card) as span:
@@ -220,7 +220,7 @@ class Planning:
                             yield event
             except ProblemError as error:
                 if asked.controls.deadline_ms is not None and error.kind in (QUEUE_TIMEOUT, DECODE_TIMEOUT):
-                    self._metrics.deadline_told(met=False)
+                    self._metrics.count_deadline(met=False)
                 raise
             finished_s = time.monotonic()
             draws.sort(key=lambda draw: draw.index)
@@ -231,7 +231,7 @@ class Planning:
             queue_s = place.waited_s + began_s - submitted_s
             self._metrics.answered(endpoint, queue_s, finished_s - submitted_s)
             if deadline_met is not None:
-                self._metrics.deadline_told(met=deadline_met)
+                self._metrics.count_deadline(met=deadline_met)
             span.drew(draws)
             timing = wire.Timing(
                 total_ms=_ms(finished_s - arrival.since_s),
@@ -249,7 +249,7 @@ class Planning:
             )
 
     async def _checked(
-        self, asked: Asked, card: ModelCard, arrival: Arrival, geometry: Geometry | None
+        self, asked: AnyPlanRequest, card: ModelCard, arrival: Arrival, geometry: Geometry | None
     ) -> PlanRequest:
         engine_id = f"{arrival.request_id}/{secrets.token_hex(4)}"
         # On a thread: megabytes of base64 must not hold up the answers of others.
@@ -286,7 +286,7 @@ class Planning:
             raise ProblemError(ENGINE_FAILED, "decoding failed; the log has why") from error
 
 
-async def last(events: AsyncGenerator[Told]) -> Planned:
+async def last(events: AsyncGenerator[SceneEvent]) -> Planned:
     """The whole of a scene, once it is there."""
     async with aclosing(events):
         async for event in events:

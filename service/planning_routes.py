@@ -17,14 +17,13 @@ import clients.wire as wire
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from service.answers import plan_answer, reflect_answer
 from service.callers import while_connected
+from service.dependencies import Dependencies
 from service.errors import problem_document, validated
 from service.examples import example_reflection, example_request
-from service.idempotency import NotKept
-from service.intake import format_of
+from service.idempotency import NotCached
 from service.openapi import PACKED, answers_and_stream, payloads, problems
-from service.parts import Parts
 from service.payloads import packed, payload_route
-from service.planning import Arrival, Asked, Planned, last
+from service.planning import AnyPlanRequest, Arrival, Planned, last
 from service.problems import (
     BODY_TIMEOUT,
     BODY_TOO_LARGE,
@@ -60,6 +59,7 @@ from service.problems import (
 )
 from service.streaming import server_sent, streamed
 from service.telling import PlanTeller
+from service.validation import format_of
 
 log = structlog.stdlib.get_logger()
 
@@ -89,12 +89,12 @@ IdempotencyKey = Annotated[
 ]
 
 
-def planning_router(parts: Parts) -> APIRouter:
+def planning_router(deps: Dependencies) -> APIRouter:
     """The endpoints that the engine works for."""
 
     def check_open(request: Request, *, batch: bool = False) -> None:
-        if not made_before(request, parts):
-            parts.planning.check_open(batch=batch)
+        if not made_before(request, deps):
+            deps.planning.check_open(batch=batch)
 
     router = APIRouter(route_class=payload_route(check_open), tags=["planning"])
     batches = APIRouter(route_class=payload_route(partial(check_open, batch=True)), tags=["planning"])
@@ -112,7 +112,7 @@ def planning_router(parts: Parts) -> APIRouter:
         idempotency_key: IdempotencyKey = None,
     ) -> Any:
         """One scene: per draw a plan, the branch, a second look where one was taken, a trajectory."""
-        return await _one(request, parts, asked, idempotency_key, plan_answer)
+        return await _one(request, deps, asked, idempotency_key, plan_answer)
 
     @router.post(
         "/v1/reflect",
@@ -126,7 +126,7 @@ def planning_router(parts: Parts) -> APIRouter:
         idempotency_key: IdempotencyKey = None,
     ) -> Any:
         """A second look at a given plan: keep it or revise it, why, and the trajectory that follows."""
-        return await _one(request, parts, asked, idempotency_key, reflect_answer)
+        return await _one(request, deps, asked, idempotency_key, reflect_answer)
 
     @batches.post(
         "/v1/plan/batch",
@@ -146,27 +146,27 @@ def planning_router(parts: Parts) -> APIRouter:
         arrival = arrival_of(request)
 
         async def work() -> Response:
-            with parts.planning.batch(len(scenes)):
+            with deps.planning.batch(len(scenes)):
                 draws = sum(each.controls.n for each in scenes if isinstance(each, wire.PlanRequest))
-                await parts.planning.spend(arrival.owner, draws)
+                await deps.planning.spend(arrival.owner, draws)
                 async with asyncio.TaskGroup() as group:
-                    tasks = [group.create_task(_result(parts, each, arrival)) for each in scenes]
+                    tasks = [group.create_task(_result(deps, each, arrival)) for each in scenes]
             results = [task.result() for task in tasks]
             answer = respond(request, wire.BatchResponse(results=results))
             if any(result.status in _TRY_AGAIN for result in results):
-                raise NotKept(answer)
+                raise NotCached(answer)
             return answer
 
-        return await once(request, parts, arrival, idempotency_key, asked, work)
+        return await once(request, deps, arrival, idempotency_key, asked, work)
 
     router.include_router(batches)
     return router
 
 
-def made_before(request: Request, parts: Parts) -> bool:
+def made_before(request: Request, deps: Dependencies) -> bool:
     """Whether a request's answer was made, or is being made: to give it again costs nothing."""
     key = request.headers.get(wire.IDEMPOTENCY_KEY_HEADER)
-    return key is not None and parts.idempotency.knows(request.state.owner, key)
+    return key is not None and deps.idempotency.knows(request.state.owner, key)
 
 
 def arrival_of(request: Request) -> Arrival:
@@ -184,8 +184,8 @@ def respond(request: Request, answer: BaseModel) -> Response:
 
 async def _one(
     request: Request,
-    parts: Parts,
-    asked: Asked,
+    deps: Dependencies,
+    asked: AnyPlanRequest,
     idempotency_key: str | None,
     made: Callable[[Planned, str], BaseModel],
 ) -> Response:
@@ -202,16 +202,16 @@ async def _one(
 
         return await streamed(
             request,
-            parts.planning.events(asked, arrival),
-            PlanTeller(format_of(asked, parts.lifecycle.card)),
+            deps.planning.events(asked, arrival),
+            PlanTeller(format_of(asked, deps.lifecycle.card)),
             lambda told: server_sent(told, done, arrival.request_id),
-            parts.metrics,
+            deps.metrics,
         )
 
     async def work() -> Response:
-        return respond(request, answer(await last(parts.planning.events(asked, arrival))))
+        return respond(request, answer(await last(deps.planning.events(asked, arrival))))
 
-    return await once(request, parts, arrival, idempotency_key, asked, work)
+    return await once(request, deps, arrival, idempotency_key, asked, work)
 
 
 def refuse_key(idempotency_key: str | None) -> None:
@@ -222,7 +222,7 @@ def refuse_key(idempotency_key: str | None) -> None:
 
 async def once(
     request: Request,
-    parts: Parts,
+    deps: Dependencies,
     arrival: Arrival,
     idempotency_key: str | None,
     asked: BaseModel,
@@ -236,9 +236,9 @@ async def once(
     try:
         if idempotency_key is not None:
             same = request.url.path.encode() + packed(asked.model_dump(warnings=False))
-            return await parts.idempotency.once(arrival.owner, idempotency_key, same, work)
+            return await deps.idempotency.once(arrival.owner, idempotency_key, same, work)
         return await while_connected(request, work())
-    except NotKept as given:
+    except NotCached as given:
         return given.answer
 
 
@@ -250,17 +250,19 @@ def _scene_of_batch(given: Any) -> wire.PlanRequest | ProblemError:
         return problem
 
 
-async def _result(parts: Parts, asked: wire.PlanRequest | ProblemError, arrival: Arrival) -> wire.BatchResult:
+async def _result(
+    deps: Dependencies, asked: wire.PlanRequest | ProblemError, arrival: Arrival
+) -> wire.BatchResult:
     try:
         if isinstance(asked, ProblemError):
             raise asked
-        planned = await parts.planning.in_turn(asked, arrival)
+        planned = await deps.planning.in_turn(asked, arrival)
         return wire.BatchResult(status=200, response=plan_answer(planned, arrival.request_id))
     except ProblemError as error:
         failure = error
     except Exception:  # one scene must not end the others
         log.exception("scene of a batch failed")
         failure = unforeseen()
-    parts.metrics.problem_told_within(failure.kind)
+    deps.metrics.count_problem_within(failure.kind)
     document = problem_document(failure, arrival.request_id)
     return wire.BatchResult(status=failure.kind.status, problem=document)

@@ -12,9 +12,9 @@ from starlette.responses import Response
 import clients.wire_refine as wire_refine
 from model.driving.scene import FRONT_TELE, FRONT_WIDE
 from service.callers import while_connected
+from service.dependencies import Dependencies
 from service.examples import example_refinement
 from service.openapi import answers_and_stream, payloads, problems
-from service.parts import Parts
 from service.payloads import payload_route
 from service.planning import Planned, last
 from service.planning_routes import (
@@ -37,12 +37,12 @@ EXAMPLES: Final[dict[str, Example]] = {
 }
 
 
-def refine_router(parts: Parts) -> APIRouter:
+def refine_router(deps: Dependencies) -> APIRouter:
     """The endpoint; refinements take places as draws of /v1/plan do."""
 
     def check_open(request: Request) -> None:
-        if not made_before(request, parts):
-            parts.planning.check_open()
+        if not made_before(request, deps):
+            deps.planning.check_open()
 
     router = APIRouter(route_class=payload_route(check_open), tags=["planning"])
     refusals = problems(*REFUSALS, INVALID_TRAJECTORY, INVALID_FEEDBACK, NEEDS_TRACKS)
@@ -63,29 +63,29 @@ def refine_router(parts: Parts) -> APIRouter:
 
         async def begin() -> Refining:
             # On a thread: numbers of a few ms must not hold up the answers of others.
-            return await asyncio.to_thread(refining_of, asked, parts.lifecycle.card, arrival.request_id)
+            return await asyncio.to_thread(refining_of, asked, deps.lifecycle.card, arrival.request_id)
 
         async def answer(refining: Refining, planned: Planned) -> wire_refine.RefineResponse:
             told = refining.judged.feedback
             if told.correct is not None:
-                parts.metrics.feedback_told(told.written_by, correct=told.correct)
+                deps.metrics.count_feedback(told.written_by, correct=told.correct)
             return await asyncio.to_thread(refine_answer, refining, planned, arrival)
 
         async def work() -> Response:
             refining = await begin()
-            planned = await last(parts.planning.events(refining.planning, arrival, refining.geometry))
+            planned = await last(deps.planning.events(refining.planning, arrival, refining.geometry))
             return respond(request, await answer(refining, planned))
 
         if not asked.stream:
-            return await once(request, parts, arrival, idempotency_key, asked, work)
+            return await once(request, deps, arrival, idempotency_key, asked, work)
         refuse_key(idempotency_key)
         refining = await while_connected(request, begin())
         return await streamed(
             request,
-            parts.planning.events(refining.planning, arrival, refining.geometry),
+            deps.planning.events(refining.planning, arrival, refining.geometry),
             RefineTeller(refining),
             lambda told: server_sent(told, lambda planned: answer(refining, planned), arrival.request_id),
-            parts.metrics,
+            deps.metrics,
         )
 
     return router

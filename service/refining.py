@@ -35,9 +35,7 @@ from model.families.registry import family_named
 from model.network.model_card import ModelCard
 from service.answers import plan_answer
 from service.feedback import CALLER
-from service.intake import Geometry, geometry_of
-from service.planning import Arrival, Begun, Planned
-from service.planning import Told as Happened
+from service.planning import Arrival, Begun, Planned, SceneEvent
 from service.problems import (
     INVALID_FEEDBACK,
     INVALID_TRACKS,
@@ -49,6 +47,7 @@ from service.problems import (
 )
 from service.scoring import answer as score_answer
 from service.telling import PlanTeller, Written
+from service.validation import Geometry, geometry_of
 
 VERSION: Final[Version] = "v1.1"
 """PDMS, which the paper judges by."""
@@ -178,7 +177,7 @@ class RefineTeller:
         self._judged = refining.judged
         self._tell = PlanTeller(refining.format)
 
-    async def __call__(self, event: Happened) -> list[tuple[str, Written | wire_refine.DraftJudged]]:
+    async def __call__(self, event: SceneEvent) -> list[tuple[str, Written | wire_refine.DraftJudged]]:
         """Events of `clients.wire_refine.EVENTS` with their data."""
         if isinstance(event, Begun):
             return [("feedback", self._judged)]

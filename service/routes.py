@@ -15,12 +15,13 @@ from service.admission import Admission
 from service.answers import model_card
 from service.auth import NOBODY
 from service.callers import while_connected
+from service.dependencies import Dependencies
 from service.feedback_routes import feedback_router
 from service.imagine_routes import imagine_router
+from service.inspector_scenes import BundledScenes, view
 from service.labelling import label, teacher_name
 from service.openai_routes import openai_router
 from service.openapi import PACKED, Responses, payloads, problems
-from service.parts import Parts
 from service.payloads import LARGE_BODIES, payload_route
 from service.planning import full_as_problem, let_in
 from service.planning_routes import arrival_of, planning_router, respond
@@ -61,7 +62,6 @@ from service.problems import (
 from service.refine_routes import refine_router
 from service.scene_files import read_scene_file
 from service.scoring_routes import scoring_router
-from service.views import BundledScenes, view
 
 _FILES_AT_ONCE: Final = 1
 """Scene files that are unpacked, which may take much memory; others wait."""
@@ -74,30 +74,30 @@ METRICS_TEXT: Responses = {
 }
 
 
-def make_router(parts: Parts) -> APIRouter:
+def make_router(deps: Dependencies) -> APIRouter:
     """All endpoints but the inspector page."""
     router = APIRouter()
-    router.include_router(planning_router(parts))
-    router.include_router(refine_router(parts))
-    router.include_router(imagine_router(parts))
-    router.include_router(openai_router(parts))
-    _add_labelling(router, parts)
-    bundled = BundledScenes(parts.settings.bundled_scenes)
-    scoring = Admission(parts.settings.max_scenes, parts.settings.max_scenes, time.monotonic)
-    router.include_router(scoring_router(parts, scoring))
-    router.include_router(feedback_router(parts, scoring))
-    _add_models(router, parts)
-    _add_probes(router, parts)
-    _add_scenes(router, parts, bundled)
+    router.include_router(planning_router(deps))
+    router.include_router(refine_router(deps))
+    router.include_router(imagine_router(deps))
+    router.include_router(openai_router(deps))
+    _add_labelling(router, deps)
+    bundled = BundledScenes(deps.settings.bundled_scenes)
+    scoring = Admission(deps.settings.max_scenes, deps.settings.max_scenes, time.monotonic)
+    router.include_router(scoring_router(deps, scoring))
+    router.include_router(feedback_router(deps, scoring))
+    _add_models(router, deps)
+    _add_probes(router, deps)
+    _add_scenes(router, deps, bundled)
     return router
 
 
-def _add_labelling(router: APIRouter, parts: Parts) -> None:
+def _add_labelling(router: APIRouter, deps: Dependencies) -> None:
     # A teacher that is slow must not gather callers and their pictures without end.
-    admission = Admission(parts.settings.max_scenes, parts.settings.max_scenes, time.monotonic)
+    admission = Admission(deps.settings.max_scenes, deps.settings.max_scenes, time.monotonic)
 
     def check_open(_: Request) -> None:
-        parts.lifecycle.check_accepting()
+        deps.lifecycle.check_accepting()
         with full_as_problem():
             admission.check_open()
 
@@ -121,22 +121,22 @@ def _add_labelling(router: APIRouter, parts: Parts) -> None:
     async def write_label(request: Request, asked: wire.LabelRequest) -> Any:
         """Why a plan is less good than another: a teacher's paragraph, checked, to train on."""
         arrival = arrival_of(request)
-        with parts.lifecycle.accepted(), let_in(admission.place(1)):
-            await parts.planning.spend(arrival.owner, 1)
-            written = label(asked, parts.teacher, parts.metrics, arrival.request_id)
+        with deps.lifecycle.accepted(), let_in(admission.place(1)):
+            await deps.planning.spend(arrival.owner, 1)
+            written = label(asked, deps.teacher, deps.metrics, arrival.request_id)
             return respond(request, await while_connected(request, written))
 
     router.include_router(labelling)
 
 
-def _add_models(router: APIRouter, parts: Parts) -> None:
+def _add_models(router: APIRouter, deps: Dependencies) -> None:
     @router.get("/v1/models", tags=["planning"], responses=problems(UNAUTHORIZED, *NOT_NOW, dialect=True))
     async def models() -> wire.ModelList:
         """The models that answer here."""
-        parts.lifecycle.check_ready()
-        card = model_card(parts.lifecycle.card)
-        named = wire.NamedModel(id=card.name, created=parts.began_s)
-        return wire.ModelList(models=[card], teacher=teacher_name(parts.teacher), data=[named])
+        deps.lifecycle.check_ready()
+        card = model_card(deps.lifecycle.card)
+        named = wire.NamedModel(id=card.name, created=deps.began_s)
+        return wire.ModelList(models=[card], teacher=teacher_name(deps.teacher), data=[named])
 
     loading = APIRouter(route_class=payload_route(lambda _: None))
 
@@ -151,38 +151,38 @@ def _add_models(router: APIRouter, parts: Parts) -> None:
     )
     async def load(request: Request, asked: wire.LoadRequest) -> wire.ModelCard:
         """Let another checkpoint answer; requests that run are finished by the one that has them."""
-        owner, settings = arrival_of(request).owner, parts.settings
+        owner, settings = arrival_of(request).owner, deps.settings
         if owner != NOBODY and owner not in settings.operators:
             raise ProblemError(FORBIDDEN, "only operators' keys may replace the checkpoint")
-        make, folder = parts.load, settings.checkpoints
+        make, folder = deps.load, settings.checkpoints
         if make is None or folder is None:
             raise ProblemError(UNKNOWN_CHECKPOINT, "set LOOKTWICE_CHECKPOINTS to the folder that holds them")
         found = folder / asked.checkpoint
         if not found.is_dir():
             raise ProblemError(UNKNOWN_CHECKPOINT, f"there is no checkpoint {asked.checkpoint!r}")
-        return model_card(await parts.lifecycle.replace(lambda: make(found), f"{folder}/"))
+        return model_card(await deps.lifecycle.replace(lambda: make(found), f"{folder}/"))
 
     router.include_router(loading)
 
 
-def _add_probes(router: APIRouter, parts: Parts) -> None:
+def _add_probes(router: APIRouter, deps: Dependencies) -> None:
     @router.get("/healthz", tags=["operations"], responses=problems(ENGINE_FAILED))
     async def healthz() -> dict[str, str]:
         """Whether the process is worth keeping."""
-        parts.lifecycle.check_alive()
+        deps.lifecycle.check_alive()
         return {"status": "alive"}
 
     @router.get("/readyz", tags=["operations"], responses=problems(*NOT_NOW))
     async def readyz() -> dict[str, str]:
         """Whether requests can be served now, and were lately."""
-        parts.lifecycle.check_ready()
+        deps.lifecycle.check_ready()
         for stood_s, what in (
-            (parts.pulse.stood_still_s, "nobody was answered for {:.1f} s"),
-            (parts.pulse.threads_wait_s, "requests have waited for {:.1f} s to be checked"),
+            (deps.pulse.stood_still_s, "nobody was answered for {:.1f} s"),
+            (deps.pulse.threads_wait_s, "requests have waited for {:.1f} s to be checked"),
             (LARGE_BODIES.reading_s, "one large body has been read for {:.1f} s"),
-            (parts.lifecycle.load.pictures_wait_s, "pictures have waited for {:.1f} s to be decoded"),
+            (deps.lifecycle.load.pictures_wait_s, "pictures have waited for {:.1f} s to be decoded"),
         ):
-            if stood_s > parts.settings.stall_s:
+            if stood_s > deps.settings.stall_s:
                 raise ProblemError(NOT_READY, what.format(stood_s))
         return {"status": "ready"}
 
@@ -195,10 +195,10 @@ def _add_probes(router: APIRouter, parts: Parts) -> None:
     async def metrics(request: Request) -> Response:
         """What Prometheus scrapes; in OpenMetrics' format where it is asked for."""
         encode, media_type = choose_encoder(request.headers.get("accept", ""))
-        return Response(encode(parts.metrics.registry), headers={"Content-Type": media_type})
+        return Response(encode(deps.metrics.registry), headers={"Content-Type": media_type})
 
 
-def _add_scenes(router: APIRouter, parts: Parts, bundled: BundledScenes) -> None:
+def _add_scenes(router: APIRouter, deps: Dependencies, bundled: BundledScenes) -> None:
     reading = asyncio.Semaphore(_FILES_AT_ONCE)
 
     @router.get("/v1/scenes", tags=["scenes"], responses=problems(UNAUTHORIZED, SCENES_UNREADABLE))
@@ -232,7 +232,7 @@ def _add_scenes(router: APIRouter, parts: Parts, bundled: BundledScenes) -> None
     async def read(request: Request) -> Any:
         """The scenes of a Parquet scene file, for looking at; nothing is kept."""
         content = await request.body()
-        largest = parts.settings.max_scene_file_bytes
+        largest = deps.settings.max_scene_file_bytes
         if len(content) > largest:
             raise ProblemError(
                 BODY_TOO_LARGE, f"the file has {len(content)} bytes; at most {largest} are read"

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Final
 
 import clients.wire as wire
+from service.inspector_scenes import scenes_of_file
 from service.problems import INVALID_SCENE_FILE, ProblemError
-from service.views import scenes_of_file
 
 MAX_MEMORY_BYTES: Final = 512_000_000
 """Of data; about 150 MB are taken by libraries, and 130 MB more by 60 scenes."""

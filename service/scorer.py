@@ -24,9 +24,9 @@ import clients.wire_feedback as wire_feedback
 import clients.wire_scores as wire_scores
 from clients.wire import Fault
 from service.feedback import Given, feedback_given
+from service.inspector_scenes import BundledScenes
 from service.problems import INVALID_LABELS, KINDS, ProblemError
 from service.scoring import scored
-from service.views import BundledScenes
 
 MAX_MEMORY_BYTES: Final = 768_000_000
 """Of data; about 150 MB are taken by libraries."""

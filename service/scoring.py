@@ -37,8 +37,8 @@ from model.driving.pdm.world import (
     Vehicle,
     World,
 )
+from service.inspector_scenes import BundledScenes
 from service.problems import INVALID_LABELS, INVALID_TRAJECTORY, at
-from service.views import BundledScenes
 
 _Asked = TypeVar("_Asked")
 _Made = TypeVar("_Made")

@@ -12,10 +12,10 @@ from fastapi.openapi.models import Example
 import clients.wire_scores as wire_scores
 from service.admission import Admission
 from service.callers import while_connected
+from service.dependencies import Dependencies
 from service.errors import problem_document, validated
 from service.examples import example_score
 from service.openapi import PACKED, payloads, problems
-from service.parts import Parts
 from service.payloads import payload_route
 from service.planning import Arrival, full_as_problem, let_in
 from service.planning_routes import arrival_of, respond
@@ -49,11 +49,11 @@ SCORING_REFUSALS: Final = (
 )
 
 
-def scoring_router(parts: Parts, admission: Admission) -> APIRouter:
+def scoring_router(deps: Dependencies, admission: Admission) -> APIRouter:
     """The endpoints of the scorer; ``admission`` bounds how many requests it has."""
 
     def check_open(_: Request) -> None:
-        parts.lifecycle.check_accepting()
+        deps.lifecycle.check_accepting()
         with full_as_problem():
             admission.check_open()
 
@@ -61,14 +61,14 @@ def scoring_router(parts: Parts, admission: Admission) -> APIRouter:
         try:
             asked = await asyncio.to_thread(validated, wire_scores.ScoreRequest, given)
             return wire_scores.ScoreResult(
-                status=200, response=await parts.scorer.score(asked, arrival.request_id)
+                status=200, response=await deps.scorer.score(asked, arrival.request_id)
             )
         except ProblemError as error:
             failure = error
         except Exception:  # one scene must not end the others
             log.exception("scene of a batch failed")
             failure = unforeseen()
-        parts.metrics.problem_told_within(failure.kind)
+        deps.metrics.count_problem_within(failure.kind)
         document = problem_document(failure, arrival.request_id)
         return wire_scores.ScoreResult(status=failure.kind.status, problem=document)
 
@@ -86,9 +86,9 @@ def scoring_router(parts: Parts, admission: Admission) -> APIRouter:
     ) -> Any:
         """What trajectories are worth by NAVSIM's rules: sub-scores, and why each one fails."""
         arrival = arrival_of(request)
-        with parts.lifecycle.accepted(), let_in(admission.place(1)):
-            await parts.planning.spend(arrival.owner, 1)
-            scoring = parts.scorer.score(asked, arrival.request_id)
+        with deps.lifecycle.accepted(), let_in(admission.place(1)):
+            await deps.planning.spend(arrival.owner, 1)
+            scoring = deps.scorer.score(asked, arrival.request_id)
             return respond(request, await while_connected(request, scoring))
 
     @router.post(
@@ -106,8 +106,8 @@ def scoring_router(parts: Parts, admission: Admission) -> APIRouter:
                 results=[await result(each, arrival) for each in asked.requests]
             )
 
-        with parts.lifecycle.accepted(), let_in(admission.place(1)):
-            await parts.planning.spend(arrival.owner, len(asked.requests))
+        with deps.lifecycle.accepted(), let_in(admission.place(1)):
+            await deps.planning.spend(arrival.owner, len(asked.requests))
             return respond(request, await while_connected(request, work()))
 
     return router

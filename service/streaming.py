@@ -16,8 +16,7 @@ import clients.wire as wire
 from service.callers import CallerLeft, while_connected
 from service.errors import problem_document
 from service.metrics import Metrics
-from service.planning import Planned
-from service.planning import Told as Happened
+from service.planning import Planned, SceneEvent
 from service.problems import ProblemError, unforeseen
 
 log = structlog.stdlib.get_logger()
@@ -26,12 +25,12 @@ _NO_BUFFERING: Final = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
 """Proxies must not hold events back."""
 
 Data = TypeVar("Data", bound=BaseModel)
-Tell = Callable[[Happened], Awaitable[Sequence[tuple[str, Data]]]]
+Tell = Callable[[SceneEvent], Awaitable[Sequence[tuple[str, Data]]]]
 """What an event of a scene is in the wire's words: events with their data, none where it is not told of."""
 
 
 async def told_events(
-    first: Happened, events: AsyncGenerator[Happened], tell: Tell[Data], metrics: Metrics
+    first: SceneEvent, events: AsyncGenerator[SceneEvent], tell: Tell[Data], metrics: Metrics
 ) -> AsyncGenerator[tuple[str, Data] | Planned]:
     """What happens to a scene, told; at last the whole of it. Closing it early frees everything.
 
@@ -46,7 +45,7 @@ async def told_events(
     """
     async with aclosing(events):
         try:
-            event: Happened | None = first
+            event: SceneEvent | None = first
             while event is not None:
                 if isinstance(event, Planned):
                     yield event
@@ -55,12 +54,12 @@ async def told_events(
                     yield each
                 event = await anext(events, None)
         except ProblemError as error:
-            metrics.problem_told_within(error.kind)
+            metrics.count_problem_within(error.kind)
             raise
         except Exception as error:
             log.exception("stream failed")
             failure = unforeseen()
-            metrics.problem_told_within(failure.kind)
+            metrics.count_problem_within(failure.kind)
             raise failure from error
 
 
@@ -83,7 +82,7 @@ async def server_sent(
 
 async def streamed(
     request: Request,
-    events: AsyncGenerator[Happened],
+    events: AsyncGenerator[SceneEvent],
     tell: Tell[Data],
     sent: Callable[[AsyncGenerator[tuple[str, Data] | Planned]], AsyncGenerator[bytes]],
     metrics: Metrics,

@@ -9,8 +9,7 @@ from model.families.family import Family
 from model.families.registry import family_named
 from model.formats.pieces import Values
 from service.answers import wire_branch, wire_plan, wire_sections, wire_times, wire_trajectory
-from service.planning import Judged
-from service.planning import Told as Happened
+from service.planning import Judged, SceneEvent
 
 Written = (
     wire.PlanWritten | wire.BranchTaken | wire.ThinkingWritten | wire.SectionWritten | wire.TrajectoryWritten
@@ -31,7 +30,7 @@ class PlanTeller:
         self._family: Family = family_named(format)
         self._told: dict[int, str] = {}
 
-    async def __call__(self, event: Happened) -> list[tuple[str, Written]]:
+    async def __call__(self, event: SceneEvent) -> list[tuple[str, Written]]:
         """Events of `clients.wire.EVENTS` with their data."""
         family = self._family
         match event:

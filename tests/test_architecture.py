@@ -32,7 +32,8 @@ ALLOWED = {
     "loadtests": ("loadtests", "clients", "model.driving"),
     "service": (
         *("service", "clients.wire", "clients.wire_feedback", "clients.wire_imagine", "clients.wire_refine"),
-        *("clients.wire_scores", "clients.wire_values", "clients.labelling.teachers", "model"),
+        *("clients.wire_scores", "clients.wire_values", "clients.labelling.teachers"),
+        *("clients.labelling.retries", "model"),
     ),
     "service.cli": EVERYTHING,
     "deploy": ("deploy", "service", "model.bundled"),

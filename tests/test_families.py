@@ -28,7 +28,6 @@ OTHERWISE = {
     "service/telling.py": 5,
     # Controls and columns of tables.
     "model/bench/report.py": 3,
-    "model/evaluation/table.py": 1,
     "service/cli/bench.py": 1,
     # Commands, routes and kinds of work.
     "service/cli/commands.py": 1,
@@ -37,7 +36,7 @@ OTHERWISE = {
     # Records of draws.
     "model/driving/feedback_store.py": 1,
     "model/driving/trajectory.py": 1,
-    "model/evaluation/kept.py": 9,
+    "model/evaluation/draw_store.py": 9,
     "model/evaluation/pictures.py": 1,
     # The alphabet of trajectory codes.
     "model/families/trajectory_codes.py": 1,

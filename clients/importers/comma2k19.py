@@ -17,8 +17,8 @@ import numpy as np
 from cachetools import FIFOCache
 
 from clients.importers.recording import Array, Recording, RecordingError
+from clients.importers.resampling import OneCamera, Source, View, fov_of
 from clients.importers.rotations import matrices
-from clients.importers.views import OneCamera, Source, View, fov_of
 from model.driving.cameras import CameraSpec
 
 POSES_FOLDER: Final = "global_pose"

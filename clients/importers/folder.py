@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from clients.importers.recording import Array, Recording, RecordingError
-from clients.importers.views import OneCamera, PictureFiles, Source
+from clients.importers.resampling import OneCamera, PictureFiles, Source
 from model.driving.cameras import CameraSpec
 
 POSES_FILE: Final = "poses.csv"

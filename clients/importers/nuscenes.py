@@ -20,9 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from clients.importers.recording import Array, Recording, RecordingError
+from clients.importers.resampling import JPEG_QUALITY, PictureFiles, nearest
 from clients.importers.rotations import matrices
-from clients.importers.views import JPEG_QUALITY, PictureFiles, nearest
-from clients.navsim.views import seen_as
+from clients.navsim.reprojection import seen_as
 from model.driving.cameras import CameraSpec
 from model.driving.images import encode_jpeg
 

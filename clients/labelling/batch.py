@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from clients.labelling.label import Asked, record, refused
+from clients.labelling.label import LabelTask, record, refused
 from clients.labelling.ledger import Ledger, Run
 from clients.labelling.pipeline import Job, Tally
 from clients.labelling.teachers.openai import OpenAiSettings, completion_answer, completion_request
@@ -38,7 +38,7 @@ class _Result(BaseModel):
 
 
 def batch_requests(
-    ledger: Ledger, jobs: Iterable[Job[Asked]], settings: OpenAiSettings
+    ledger: Ledger, jobs: Iterable[Job[LabelTask]], settings: OpenAiSettings
 ) -> Iterator[dict[str, Any]]:
     """The lines of a batch: every question that the ledger has no outcome for."""
     for job in jobs:
@@ -75,7 +75,9 @@ def read_results(lines: Iterable[str], settings: OpenAiSettings) -> dict[str, An
     return answers
 
 
-def take_results(ledger: Ledger, run: Run, jobs: Iterable[Job[Asked]], results: dict[str, Answer]) -> Tally:
+def take_results(
+    ledger: Ledger, run: Run, jobs: Iterable[Job[LabelTask]], results: dict[str, Answer]
+) -> Tally:
     """Enter answers, each once; what fails its checks for the last time is a dead letter."""
     tally = Tally()
     for job in jobs:
@@ -91,7 +93,7 @@ def take_results(ledger: Ledger, run: Run, jobs: Iterable[Job[Asked]], results: 
             verdict = judge(job.subject.question, answers)
         except ReflectionRefused as error:
             letter = refused(error)
-            ledger.bury(run, job.key, job.scene_id, str(letter), **letter.more)
+            ledger.dead_letter(run, job.key, job.scene_id, str(letter), **letter.more)
             tally.dead += 1
             continue
         if isinstance(verdict, Reflection):

@@ -18,7 +18,7 @@ from clients.labelling.pipeline import Limits, StageStopped, Tally
 from clients.labelling.rollout import key_of, unpacked
 from clients.metadrive.outcomes import MomentOutcomes
 from clients.metadrive.replay import EpisodeSetting, Moment, setting_of
-from clients.metadrive.workers import Asked, WorkerDied, follow_episodes
+from clients.metadrive.workers import FollowTask, WorkerDied, follow_episodes
 from model.driving.hashing import hash_of
 from model.driving.scene_store import read_scenes
 from model.driving.trajectory import FloatArray
@@ -62,7 +62,7 @@ def follow_all(
     tally, began_s, faults = Tally(), time.monotonic(), 0
     works: dict[str, _Work] = {}
 
-    def episodes() -> Iterator[list[Asked]]:
+    def episodes() -> Iterator[list[FollowTask]]:
         for episode in _episodes(_works(ledger, run, rollout, scenes, setting, tally), limits.at_most):
             works.update((work.moment.scene_id, work) for work in episode)
             yield [(work.moment, work.trajectories) for work in episode]
@@ -83,7 +83,7 @@ def follow_all(
 def _enter(ledger: Ledger, run: Run, work: _Work, found: MomentOutcomes | str, tally: Tally) -> bool:
     """Enter what came of a scene; returns whether something went wrong."""
     if isinstance(found, str):
-        ledger.bury(run, work.key, work.moment.scene_id, found)
+        ledger.dead_letter(run, work.key, work.moment.scene_id, found)
         tally.dead += 1
         return True
     record: dict[str, Any] = {

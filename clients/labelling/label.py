@@ -35,7 +35,7 @@ CHECKS_VERSION: Final = 3
 """Of `clients.labelling.checks` and what they are made of; raised when they ask for something else."""
 
 
-class Asked(NamedTuple):
+class LabelTask(NamedTuple):
     """A question, the rollout that it comes from, and what stands for the annotations that it was made of."""
 
     entry: Entry
@@ -63,7 +63,7 @@ def questions(
     plans_per_scene: int = 1,
     seed: int = 0,
     group: int | None = None,
-) -> Iterator[Asked]:
+) -> Iterator[LabelTask]:
     """What a teacher is to be asked: each kept scene with some of the plans that were kept of it.
 
     Which plans is left to chance, once and for all for a scene and a seed. Where plans were followed, a
@@ -71,7 +71,7 @@ def questions(
     """
     followed = followed_entries(ledger, rollout)
     for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None, group=group):
-        kept = ledger.kept(key_of(rollout, labelled))
+        kept = ledger.selected(key_of(rollout, labelled))
         if kept is None:
             continue
         entry, draws = kept
@@ -79,7 +79,7 @@ def questions(
         for text in predicted_plans(entry, draws, plans_per_scene, seed):
             fate = followed.get(entry.key)
             failure = None if fate is None else failure_of(text, entry, Followed.of(fate.record))
-            yield Asked(entry, _question(labelled, entry, text, seed, failure), annotations)
+            yield LabelTask(entry, _question(labelled, entry, text, seed, failure), annotations)
 
 
 def predicted_plans(entry: Entry, draws: Sequence[int], count: int, seed: int) -> list[str]:
@@ -90,7 +90,7 @@ def predicted_plans(entry: Entry, draws: Sequence[int], count: int, seed: int) -
     return texts[:count]
 
 
-def jobs(run: Run, asked: Iterator[Asked]) -> Iterator[Job[Asked]]:
+def jobs(run: Run, asked: Iterator[LabelTask]) -> Iterator[Job[LabelTask]]:
     """Questions as pieces of work."""
     for each in asked:
         question = each.question
@@ -102,10 +102,10 @@ def jobs(run: Run, asked: Iterator[Asked]) -> Iterator[Job[Asked]]:
         yield Job(key, each.entry.scene_id, each)
 
 
-def labeller(ledger: Ledger, run: Run, teacher: Teacher) -> Callable[[Job[Asked]], Awaitable[Record]]:
+def labeller(ledger: Ledger, run: Run, teacher: Teacher) -> Callable[[Job[LabelTask]], Awaitable[Record]]:
     """Asks ``teacher`` and makes records of its answers, each of which is in the ledger before it is read."""
 
-    async def label(job: Job[Asked]) -> Record:
+    async def label(job: Job[LabelTask]) -> Record:
         try:
             reflection = await ask(
                 teacher,
@@ -128,7 +128,7 @@ def labeller(ledger: Ledger, run: Run, teacher: Teacher) -> Callable[[Job[Asked]
     return label
 
 
-def record(asked: Asked, reflection: Reflection) -> Record:
+def record(asked: LabelTask, reflection: Reflection) -> Record:
     """What the ledger keeps of a label."""
     return {
         "rollout": asked.entry.key,

@@ -216,7 +216,7 @@ class Ledger:
         """A piece of work is done."""
         self._end(run, key, scene_id, "done", record)
 
-    def bury(self, run: Run, key: str, scene_id: str, reason: str, **more: Any) -> None:
+    def dead_letter(self, run: Run, key: str, scene_id: str, reason: str, **more: Any) -> None:
         """A piece of work cannot be done."""
         self._end(run, key, scene_id, "dead", {"reason": reason, **more})
 
@@ -266,7 +266,7 @@ class Ledger:
             gone = self._db.execute("DELETE FROM outcomes WHERE run = ? AND state = 'dead'", (run.id,))
         return gone.rowcount
 
-    def keep(self, run: Run, draws: Iterable[tuple[str, Sequence[int]]]) -> None:
+    def select(self, run: Run, draws: Iterable[tuple[str, Sequence[int]]]) -> None:
         """Choose what the next stage works on: keys, each with some of its draws.
 
         What was chosen of the run before is chosen no more.
@@ -279,7 +279,7 @@ class Ledger:
                 "INSERT INTO kept VALUES (?, ?)", ((key, json.dumps(list(some))) for key, some in draws)
             )
 
-    def kept(self, key: str) -> tuple[Entry, list[int]] | None:
+    def selected(self, key: str) -> tuple[Entry, list[int]] | None:
         """What is done under that key, with the draws that were chosen of it, if any were."""
         row = self._db.execute(
             "SELECT scene_id, record, ended_at, draws FROM outcomes JOIN kept USING (key) WHERE key = ?",
@@ -290,7 +290,7 @@ class Ledger:
         scene_id, record, ended_at, draws = row
         return Entry(key, scene_id, "done", json.loads(record), ended_at), json.loads(draws)
 
-    def count_kept(self, run: Run, most: int) -> int:
+    def selected_draws(self, run: Run, most: int) -> int:
         """How many draws of a run are chosen, at most so many of each piece of work."""
         (count,) = self._db.execute(
             "SELECT coalesce(sum(min(json_array_length(draws), ?)), 0) "

@@ -20,7 +20,7 @@ from clients import wire
 from clients.labelling import label, outcomes, rollout
 from clients.labelling.ledger import Entered, Entry, Ledger, Run
 from clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
-from clients.labelling.rollout import PATIENCE, Sampling, roll_out
+from clients.labelling.rollout import RETRY_POLICY, Sampling, roll_out
 from clients.labelling.teachers.teacher import Teacher, TeacherError
 from clients.planner import Access, AsyncPlannerClient
 from model.driving.scene_store import row_groups, scene_files
@@ -74,7 +74,7 @@ class RolloutWork:
         """Roll the chunk's scenes out."""
         book.run(self.run.stage, self.run.config)
         found = rollout.jobs(self.run, chunk.file, unlabelled, chunk.group)
-        async with AsyncPlannerClient(self.service, PATIENCE, access=self.access) as planner:
+        async with AsyncPlannerClient(self.service, RETRY_POLICY, access=self.access) as planner:
             return await work_through(
                 book,
                 self.run,
@@ -104,7 +104,7 @@ class LabelWork:
         outcomes_run = book.run("outcomes", outcomes.config_of(self.rollout))
         for entry in chunk.followed:
             book.finish(outcomes_run, entry.key, entry.scene_id, entry.record)
-        book.keep(self.rollout, [(entry.key, draws) for entry, draws in chunk.kept])
+        book.select(self.rollout, [(entry.key, draws) for entry, draws in chunk.kept])
         book.take_over(self.run, chunk.begun)
         asked = label.questions(
             book,
@@ -137,7 +137,7 @@ def chunks(ledger: Ledger, run: Run, scenes: Path, rollout: Run | None = None) -
     followed = {} if rollout is None else outcomes.followed_entries(ledger, rollout)
     if rollout is not None:
         for entry in ledger.entries(rollout):
-            found = ledger.kept(entry.key)
+            found = ledger.selected(entry.key)
             if found is not None:
                 kept.setdefault(entry.scene_id, []).append(found)
     for file in scene_files(scenes):

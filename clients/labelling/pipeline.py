@@ -8,9 +8,9 @@ from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
-from clients.labelling.crowd import Crowd
+from clients.labelling.concurrency import ConcurrencyLimit
 from clients.labelling.ledger import Ledger, Record, Run
-from clients.labelling.teachers.patience import TryLater, patiently
+from clients.labelling.retries import TryLater, with_retries
 
 _Subject = TypeVar("_Subject")
 
@@ -96,22 +96,22 @@ async def work_through(
     Raises:
         StageStopped: too many errors, or the other side is away for too long.
     """
-    crowd, tally, began_s = Crowd(limits.at_once), Tally(), time.monotonic()
+    concurrency, tally, began_s = ConcurrencyLimit(limits.at_once), Tally(), time.monotonic()
     under_way: set[asyncio.Task[None]] = set()
     begun: set[str] = set()
     faults = 0
 
     async def attempt(job: Job[_Subject]) -> Record:
-        async with crowd.place():
+        async with concurrency.slot():
             return await do(job)
 
     async def finish(job: Job[_Subject]) -> None:
         nonlocal faults
         done_before = tally.done
         try:
-            record = await patiently(lambda: attempt(job), limits.give_up_after_s)
+            record = await with_retries(lambda: attempt(job), limits.give_up_after_s)
         except CannotBeDone as error:
-            ledger.bury(run, job.key, job.scene_id, str(error), **error.more)
+            ledger.dead_letter(run, job.key, job.scene_id, str(error), **error.more)
             tally.dead += 1
             faults += error.fault
         except TryLater as error:
@@ -119,7 +119,7 @@ async def work_through(
             if tally.done == done_before:
                 raise StageStopped(told) from error
             # Others were served meanwhile: it is this one.
-            ledger.bury(run, job.key, job.scene_id, told)
+            ledger.dead_letter(run, job.key, job.scene_id, told)
             tally.dead += 1
             faults += 1
         else:
@@ -152,7 +152,7 @@ async def work_through(
                 continue
             begun.add(job.key)
             # One more than may run waits at the door, so that a place is taken as soon as it is free.
-            await collect(crowd.allowed)
+            await collect(concurrency.allowed)
             under_way.add(asyncio.create_task(finish(job)))
         await collect(0)
         tally.seconds = time.monotonic() - began_s

@@ -22,8 +22,8 @@ from clients.answers import (
 )
 from clients.labelling.ledger import Record, Run
 from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
-from clients.labelling.teachers.patience import TryLater
-from clients.planner import AsyncPlannerClient, Patience
+from clients.labelling.retries import TryLater
+from clients.planner import AsyncPlannerClient, RetryPolicy
 from model.driving.hashing import hash_of, scene_hash
 from model.driving.labeller import expert_plan
 from model.driving.metrics import displacement_errors
@@ -32,7 +32,7 @@ from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
 from model.driving.trajectory import FUTURE_STEPS, FloatArray
 
-PATIENCE = Patience(timeout_s=120.0, attempts=1)
+RETRY_POLICY = RetryPolicy(timeout_s=120.0, attempts=1)
 """Who waits how long is the pipeline's to say."""
 _PACKED: Final = np.dtype("<f4")
 

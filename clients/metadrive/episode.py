@@ -18,7 +18,7 @@ from clients.metadrive.driver import SpeedLimits, Style
 from clients.metadrive.episode_log import EpisodeLog, Outcome, Recorder
 from clients.metadrive.expert import Expert, varied
 from clients.metadrive.hazards import Director
-from clients.metadrive.lapses import Lapses
+from clients.metadrive.late_braking import LateBraking
 from clients.metadrive.maps import make_map
 from clients.metadrive.roads import Array, RoadMap
 from clients.metadrive.tracking import FreeVehicle
@@ -57,7 +57,7 @@ def worlds_of_episode(
     Raises:
         MapError: no map fits the seed.
     """
-    world = make_world(seed, duration_s, Lapses(seed) if lapses else None)
+    world = make_world(seed, duration_s, LateBraking(seed) if lapses else None)
     drifter = Drifter(seed) if drifts else None
     near = world.remember()
     yield world
@@ -69,7 +69,7 @@ def worlds_of_episode(
         yield world
 
 
-def make_world(seed: int, duration_s: float = 48.0, lapses: Lapses | None = None) -> World:
+def make_world(seed: int, duration_s: float = 48.0, lapses: LateBraking | None = None) -> World:
     """An episode before its first step, its expert's ``lapses`` given; raises `MapError`."""
     rng = np.random.default_rng([seed, 2])
     speed = float(
@@ -105,7 +105,7 @@ class World:
         style: Style,
         rng: np.random.Generator,
         steps: int,
-        lapses: Lapses | None = None,
+        lapses: LateBraking | None = None,
     ) -> None:
         self._map = road_map
         self._rng = rng

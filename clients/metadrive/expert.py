@@ -20,7 +20,7 @@ from clients.metadrive.driver import (
     smoothed,
     wanted_acceleration,
 )
-from clients.metadrive.lapses import Lapses
+from clients.metadrive.late_braking import LateBraking
 from clients.metadrive.roads import RoadMap
 
 _ROUND_M: Final = 11.0
@@ -51,7 +51,7 @@ class Expert:
         limits: SpeedLimits,
         ambition: bool,
         eager: bool,
-        lapses: Lapses | None = None,
+        lapses: LateBraking | None = None,
     ) -> None:
         self._map = road_map
         self.style = style

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from clients.metadrive import scenery, simulator
+from clients.metadrive import map_meshes, simulator
 from clients.metadrive.actors import BODY_SIZES
 from clients.metadrive.episode_log import BRAKE_LIGHT, LEFT_LIGHT, RIGHT_LIGHT, ActorLog, EpisodeLog
 from clients.metadrive.meshes import box
@@ -31,16 +31,18 @@ class Stage:
         self._log, self._rig = log, rig
         core = simulator.panda()
         self._world = rig.root.attachNewNode("episode")
-        look = scenery.make_look(log.seed)
+        look = map_meshes.make_look(log.seed)
         rig.set_sky(look.sky)
         self._flat(
-            scenery.ground_mesh(log.road_map, look.ground), 1, scenery.noise_texture(log.seed, 128, 0.5, "g")
+            map_meshes.ground_mesh(log.road_map, look.ground),
+            1,
+            map_meshes.noise_texture(log.seed, 128, 0.5, "g"),
         )
-        asphalt = scenery.noise_texture(log.seed + 1, 128, 0.28, "a")
-        self._flat(scenery.road_mesh(log.road_map, look.asphalt), 2, asphalt)
-        self._flat(scenery.kerb_mesh(log.road_map), 3, None)
-        self._flat(scenery.marking_mesh(log.road_map), 4, None)
-        scenery.roadside_mesh(log.road_map, log.seed).node("roadside").reparentTo(self._world)
+        asphalt = map_meshes.noise_texture(log.seed + 1, 128, 0.28, "a")
+        self._flat(map_meshes.road_mesh(log.road_map, look.asphalt), 2, asphalt)
+        self._flat(map_meshes.kerb_mesh(log.road_map), 3, None)
+        self._flat(map_meshes.marking_mesh(log.road_map), 4, None)
+        map_meshes.roadside_mesh(log.road_map, log.seed).node("roadside").reparentTo(self._world)
         self._light(core, look)
         self._actors = [_ActorNode(actor, self._world) for actor in log.actors]
 
@@ -58,7 +60,7 @@ class Stage:
             node.setTexture(texture)
         node.reparentTo(self._world)
 
-    def _light(self, core: Any, look: scenery.Look) -> None:
+    def _light(self, core: Any, look: map_meshes.Look) -> None:
         ambient = core.AmbientLight("ambient")
         ambient.setColor((look.ambient, look.ambient, look.ambient * 1.05, 1))
         sun = core.DirectionalLight("sun")

@@ -14,7 +14,7 @@ from clients.metadrive.outcomes import MomentOutcomes
 from clients.metadrive.replay import EpisodeSetting, Moment, ReplayError, outcomes_of_episode
 from model.driving.trajectory import FloatArray
 
-Asked = tuple[Moment, Sequence[FloatArray]]
+FollowTask = tuple[Moment, Sequence[FloatArray]]
 """A moment, and the trajectories [64, 4] that are to be followed from it."""
 
 _EPISODES_A_PROCESS: Final = 20
@@ -26,7 +26,7 @@ class WorkerDied(RuntimeError):
 
 
 def follow_episodes(
-    episodes: Iterator[Sequence[Asked]], setting: EpisodeSetting, workers: int
+    episodes: Iterator[Sequence[FollowTask]], setting: EpisodeSetting, workers: int
 ) -> Iterator[tuple[str, MomentOutcomes | str]]:
     """Follow plans in so many processes; they end with this one, however it ends.
 
@@ -66,7 +66,7 @@ def follow_episodes(
 
 
 def _follow_episode(
-    setting: EpisodeSetting, asked: Sequence[Asked]
+    setting: EpisodeSetting, asked: Sequence[FollowTask]
 ) -> list[tuple[str, MomentOutcomes | str]]:
     """One episode in a process of its own; what cannot be followed is told as text."""
     return [

@@ -12,8 +12,8 @@ import numpy as np
 from clients import wire
 from clients.navsim.history import PERIOD_S, STATUSES, history_of
 from clients.navsim.inputs import AgentInput, Cameras, InputError
-from clients.navsim.views import seen_as
-from clients.planner import Access, Patience, PlannerClient
+from clients.navsim.reprojection import seen_as
+from clients.planner import Access, PlannerClient, RetryPolicy
 from model.driving.cameras import FRONT_CAMERAS, CameraSpec
 from model.driving.hashing import scene_hash
 from model.driving.images import encode_jpeg
@@ -137,7 +137,7 @@ def make_agent(
         def initialize(self) -> None:
             """Connect; each worker does it for itself."""
             self._client = PlannerClient(
-                service, Patience(timeout_s=timeout_s), access=Access.from_environment()
+                service, RetryPolicy(timeout_s=timeout_s), access=Access.from_environment()
             )
             self._planner = NavsimPlanner(self._client, controls)
 

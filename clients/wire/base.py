@@ -89,19 +89,19 @@ def check_times(answer: _TimedAnswer) -> _TimedAnswer:
     return answer
 
 
-class Asked(BaseModel):
+class RequestModel(BaseModel):
     """Base of everything a caller sends: unknown fields are refused."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
 
-class Answered(BaseModel):
+class ResponseModel(BaseModel):
     """Base of everything the service sends: readers ignore fields they do not know."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="ignore")
 
 
-class ModelName(Answered):
+class ModelName(ResponseModel):
     """Which weights answered."""
 
     name: str

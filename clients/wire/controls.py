@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag
 
-from clients.wire.base import MAX_SEED, Asked, Camera, Finite, Probability, Temperature, TopP
+from clients.wire.base import MAX_SEED, Camera, Finite, Probability, RequestModel, Temperature, TopP
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
@@ -14,7 +14,7 @@ Reasons = Literal["in_view", "any"]
 Imagine = Literal["auto", "never", "always"]
 
 
-class MetaAction(Asked):
+class MetaAction(RequestModel):
     """One named intent over one time interval."""
 
     start_s: Finite = Field(description="Begin in s, on the 0.1 s grid.")
@@ -22,7 +22,7 @@ class MetaAction(Asked):
     word: str = Field(max_length=40, description="e.g. Accelerate, Left Turn, Keep Lane.")
 
 
-class Tracks(Asked):
+class Tracks(RequestModel):
     """The three tracks of a plan; each one that is there covers 0.0 s to 6.4 s without gap or overlap."""
 
     longitudinal: list[MetaAction] | None = Field(default=None, max_length=64)
@@ -41,7 +41,7 @@ PlanGiven = Annotated[
 """A plan as bullet text or as tracks; the discriminator keeps errors to the form that was meant."""
 
 
-class ReflectControls(Asked):
+class ReflectControls(RequestModel):
     """What the caller decides about decoding behind a given plan."""
 
     thinking: Thinking = Field(

@@ -6,40 +6,40 @@ from typing import Final
 
 from pydantic import Field, model_validator
 
-from clients.wire.base import Answered, Poses, TimesS, check_times
+from clients.wire.base import Poses, ResponseModel, TimesS, check_times
 from clients.wire.plan import Branch, Plan, Section
 from clients.wire.problem import Problem
 
 
-class PlanWritten(Answered):
+class PlanWritten(ResponseModel):
     """Data of the events `plan` and `revised_plan`."""
 
     index: int
     plan: Plan
 
 
-class BranchTaken(Answered):
+class BranchTaken(ResponseModel):
     """Data of the event `branch`."""
 
     index: int
     branch: Branch
 
 
-class ThinkingWritten(Answered):
+class ThinkingWritten(ResponseModel):
     """Data of the event `thinking`: more of the reasoning, to be put behind what came before."""
 
     index: int
     text: str
 
 
-class SectionWritten(Answered):
+class SectionWritten(ResponseModel):
     """Data of the event `section`: one that only the format has is finished."""
 
     index: int
     section: Section
 
 
-class TrajectoryWritten(Answered):
+class TrajectoryWritten(ResponseModel):
     """Data of the events `draft_trajectory` and `trajectory`; whether parts agree is not said of a draft."""
 
     index: int

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from clients.wire.base import MAX_SEED, Answered, Asked, Nearby, NearbyPoint
+from clients.wire.base import MAX_SEED, Nearby, NearbyPoint, RequestModel, ResponseModel
 from clients.wire.controls import PlanGiven
 from clients.wire.scene import Scene
 from clients.wire.scenes import Agent
@@ -14,7 +14,7 @@ from clients.wire.scenes import Agent
 LaneLine = Annotated[list[NearbyPoint], Field(min_length=2, max_length=2000, fail_fast=True)]
 
 
-class Annotations(Asked):
+class Annotations(RequestModel):
     """What is known about a scene besides what its cameras show; as GET /v1/scenes/ID gives it."""
 
     # Of long lists the first fault alone is told: a body may hold hundreds of thousands.
@@ -27,7 +27,7 @@ class Annotations(Asked):
 Seconds = Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)]
 
 
-class PlanOutcome(Asked):
+class PlanOutcome(RequestModel):
     """What a plan came to when it was followed; each failure needs the fields that tell of it."""
 
     fails: list[Literal["collision", "off_road", "off_route", "comfort", "behind", "ahead"]] = Field(
@@ -47,7 +47,7 @@ class PlanOutcome(Asked):
     expert_m: Nearby = Field(default=0.0, description="For behind and ahead: by the better plan.")
 
 
-class LabelRequest(Asked):
+class LabelRequest(RequestModel):
     """Body of POST /v1/label."""
 
     scene: Scene
@@ -66,14 +66,14 @@ class LabelRequest(Asked):
     seed: int = Field(default=0, ge=0, le=MAX_SEED, description="Another one, other words.")
 
 
-class TeacherName(Answered):
+class TeacherName(ResponseModel):
     """Who wrote a reflection."""
 
     name: str
     revision: str = Field(description="Changes when it would write something else.")
 
 
-class LabelResponse(Answered):
+class LabelResponse(ResponseModel):
     """Answer of POST /v1/label: a reflection that passed all checks."""
 
     request_id: str

@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from clients.wire.base import Answered, Asked
+from clients.wire.base import RequestModel, ResponseModel
 from clients.wire.label import TeacherName
 
 
-class ModelCard(Answered):
+class ModelCard(ResponseModel):
     """What a loaded checkpoint is."""
 
     name: str
@@ -38,7 +38,7 @@ class ModelCard(Answered):
     details: dict[str, Any] = Field(default_factory=dict)
 
 
-class NamedModel(Answered):
+class NamedModel(ResponseModel):
     """A model as clients of OpenAI's API expect it."""
 
     id: str
@@ -47,7 +47,7 @@ class NamedModel(Answered):
     owned_by: str = "looktwice"
 
 
-class ModelList(Answered):
+class ModelList(ResponseModel):
     """Answer of GET /v1/models; `object` and `data` are for clients of OpenAI's API."""
 
     object: Literal["list"] = "list"
@@ -59,7 +59,7 @@ class ModelList(Answered):
     )
 
 
-class LoadRequest(Asked):
+class LoadRequest(RequestModel):
     """Body of POST /v1/models:load."""
 
     checkpoint: str = Field(

@@ -7,12 +7,12 @@ from typing import Annotated, Final, Literal
 from pydantic import Field, JsonValue, SkipValidation, model_validator
 
 from clients.wire.base import (
-    Answered,
-    Asked,
     Milliseconds,
     ModelName,
     Poses,
     Probability,
+    RequestModel,
+    ResponseModel,
     TimesS,
     check_times,
 )
@@ -27,7 +27,7 @@ MAX_FEEDBACK_CHARACTERS: Final = 4_000
 """Of feedback on a draft; a model's prompt may have room for less."""
 
 
-class Attempt(Asked):
+class Attempt(RequestModel):
     """An answer that was given to the scene before, and what is said of it."""
 
     trajectory: Poses = Field(description="The draft: 64 poses, or one for each of times_s.")
@@ -43,7 +43,7 @@ class Attempt(Asked):
     _timed = model_validator(mode="after")(check_times)
 
 
-class PlanRequest(Asked):
+class PlanRequest(RequestModel):
     """Body of POST /v1/plan."""
 
     scene: Scene
@@ -61,14 +61,14 @@ class PlanRequest(Asked):
     stream: bool = Field(default=False, description="Answer with server-sent events, as draws are written.")
 
 
-class Plan(Answered):
+class Plan(ResponseModel):
     """A plan in both its forms; either can be sent back as `prefill`."""
 
     text: str = Field(description="The plan as bullet text.")
     tracks: Tracks
 
 
-class Logprobs(Answered):
+class Logprobs(ResponseModel):
     """A draw token by token; both lists have as many entries as it has tokens."""
 
     token_ids: list[int] = Field(description="In the checkpoint's own vocabulary.")
@@ -112,7 +112,7 @@ TokenCounts = Annotated[dict[str, int], Field(description="Tokens per section of
 LogprobsOfDraw = Annotated[Logprobs | None, Field(description="Null unless asked for.")]
 
 
-class Section(Answered):
+class Section(ResponseModel):
     """A section of a response that has no field of its own."""
 
     name: str = Field(description="As the format calls it.")
@@ -121,7 +121,7 @@ class Section(Answered):
     )
 
 
-class Draw(Answered):
+class Draw(ResponseModel):
     """One of the n responses of a scene."""
 
     index: int = Field(ge=0, description="0..n-1.")
@@ -149,7 +149,7 @@ class Draw(Answered):
     _timed = model_validator(mode="after")(check_times)
 
 
-class Timing(Answered):
+class Timing(ResponseModel):
     """Where the time went, in milliseconds."""
 
     total_ms: Milliseconds = Field(description="From the request's arrival to the finished answer.")
@@ -158,14 +158,14 @@ class Timing(Answered):
     queue_ms: Milliseconds = Field(default=0.0, description="Of these: waiting for a place in the batch.")
 
 
-class Deadline(Answered):
+class Deadline(ResponseModel):
     """What became of a deadline."""
 
     met: bool = Field(description="Whether the answer was finished in time.")
     cut: list[int] = Field(description="Draws whose second look was skipped, shortened or replaced.")
 
 
-class PlanResponse(Answered):
+class PlanResponse(ResponseModel):
     """Answer of POST /v1/plan."""
 
     request_id: str
@@ -178,7 +178,7 @@ class PlanResponse(Answered):
     deadline: Deadline | None = Field(default=None, description="Null where none was set.")
 
 
-class BatchRequest(Asked):
+class BatchRequest(RequestModel):
     """Body of POST /v1/plan/batch."""
 
     # Each is checked by itself, so that one that breaks the contract fails alone.
@@ -187,7 +187,7 @@ class BatchRequest(Asked):
     )
 
 
-class BatchResult(Answered):
+class BatchResult(ResponseModel):
     """What became of one request of a batch: its answer, or its problem."""
 
     status: int = Field(description="That the request alone would have been answered with.")
@@ -195,7 +195,7 @@ class BatchResult(Answered):
     problem: Problem | None = None
 
 
-class BatchResponse(Answered):
+class BatchResponse(ResponseModel):
     """Answer of POST /v1/plan/batch: a result per request, in their order."""
 
     results: list[BatchResult]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from clients.wire.base import Answered
+from clients.wire.base import ResponseModel
 
 
-class Fault(Answered):
+class Fault(ResponseModel):
     """One thing that is wrong with a request."""
 
     pointer: str = Field(description="JSON pointer (RFC 6901) into the body.")
@@ -16,7 +16,7 @@ class Fault(Answered):
     column: int | None = Field(default=None, description="In that line, from 1.")
 
 
-class Problem(Answered):
+class Problem(ResponseModel):
     """A problem document (RFC 9457)."""
 
     type: str = Field(description="Stable URI of the kind of problem.")

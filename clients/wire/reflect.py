@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from clients.wire.base import Answered, Asked, ModelName, Poses, Probability, TimesS, check_times
+from clients.wire.base import ModelName, Poses, Probability, RequestModel, ResponseModel, TimesS, check_times
 from clients.wire.controls import PlanGiven, ReflectControls
 from clients.wire.plan import (
     Consistent,
@@ -26,7 +26,7 @@ from clients.wire.scene import Scene
 Group = Literal["longitudinal", "lateral", "lane"]
 
 
-class ReflectRequest(Asked):
+class ReflectRequest(RequestModel):
     """Body of POST /v1/reflect."""
 
     scene: Scene
@@ -40,7 +40,7 @@ class ReflectRequest(Asked):
     stream: bool = Field(default=False, description="Answer with server-sent events, as draws are written.")
 
 
-class PlanChange(Answered):
+class PlanChange(ResponseModel):
     """A stretch of one track in which the revised plan says something else than the given one."""
 
     group: Group
@@ -50,7 +50,7 @@ class PlanChange(Answered):
     revised: str | None = Field(description="The word of the revised plan; null where it has none.")
 
 
-class Reflection(Answered):
+class Reflection(ResponseModel):
     """One of the n looks at the given plan."""
 
     index: int = Field(ge=0, description="0..n-1.")
@@ -75,7 +75,7 @@ class Reflection(Answered):
     _timed = model_validator(mode="after")(check_times)
 
 
-class ReflectResponse(Answered):
+class ReflectResponse(ResponseModel):
     """Answer of POST /v1/reflect."""
 
     request_id: str

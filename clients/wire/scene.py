@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Discriminator, Field, Tag, WithJsonSchema
 
-from clients.wire.base import AgentKind, Asked, Camera, Finite, History, Length, Light, Nearby, Route
+from clients.wire.base import AgentKind, Camera, Finite, History, Length, Light, Nearby, RequestModel, Route
 
 
 def _form_of_image(value: object) -> str:
@@ -21,7 +21,7 @@ Image = Annotated[
 """A picture: base64 in JSON, bytes in msgpack and multipart bodies."""
 
 
-class Clip(Asked):
+class Clip(RequestModel):
     """Four pictures of one camera over the past 2 s."""
 
     camera: Camera = Field(description="Which camera.")
@@ -33,7 +33,7 @@ class Clip(Asked):
     )
 
 
-class Track(Asked):
+class Track(RequestModel):
     """One tracked road user or obstacle, now, in the ego frame."""
 
     x_m: Nearby = Field(description="Centre of its box.")
@@ -50,7 +50,7 @@ class Track(Asked):
     )
 
 
-class Scene(Asked):
+class Scene(RequestModel):
     """One planning instant."""
 
     scene_id: str = Field(default="", max_length=200, description="The caller's name for the scene.")

@@ -6,11 +6,11 @@ from typing import Annotated
 
 from pydantic import Field
 
-from clients.wire.base import Answered, Camera, Length, Nearby, Point, Trajectory
+from clients.wire.base import Camera, Length, Nearby, Point, ResponseModel, Trajectory
 from clients.wire.scene import Scene, Track
 
 
-class Agent(Answered):
+class Agent(ResponseModel):
     """Another road user or obstacle of a labelled scene, as an oriented box over past and future."""
 
     agent_id: int
@@ -25,14 +25,14 @@ class Agent(Answered):
     )
 
 
-class NextImage(Answered):
+class NextImage(ResponseModel):
     """What one camera saw half a second after a scene."""
 
     camera: Camera = Field(description="Which camera.")
     image: str = Field(description="JPEG, PNG or WebP in base64.")
 
 
-class LabelledScene(Answered):
+class LabelledScene(ResponseModel):
     """A scene with what is known about it besides, for looking at; `scene` can be planned for as it is."""
 
     scene: Scene
@@ -56,20 +56,20 @@ class LabelledScene(Answered):
     )
 
 
-class SceneEntry(Answered):
+class SceneEntry(ResponseModel):
     """A line in the list of bundled scenes."""
 
     scene_id: str
     tags: list[str]
 
 
-class SceneList(Answered):
+class SceneList(ResponseModel):
     """Answer of GET /v1/scenes."""
 
     scenes: list[SceneEntry]
 
 
-class SceneFile(Answered):
+class SceneFile(ResponseModel):
     """Answer of POST /v1/scenes:read."""
 
     scenes: list[LabelledScene]

@@ -14,7 +14,7 @@ from model.engines.engine import Controls, PlanRequest
 from model.engines.sampling import probabilities, uniform
 from model.engines.torch.batch import Batch, Feed
 from model.engines.torch.offline import draws_of
-from model.engines.torch.runner import Asked, Prompt, Runner
+from model.engines.torch.runner import Prompt, PromptRequest, Runner
 from model.network.checkpoint import load
 
 _AT_ONCE = 8
@@ -82,7 +82,7 @@ def _margin(exact: Runner, request: PlanRequest, draw: int, written: Sequence[in
     cursor = exact.formats[request.format].start()
     for token in written:
         cursor = cursor.advance(token)
-    [prompt] = exact.begin_prompts([Asked(request.scene, request.format, 0)])
+    [prompt] = exact.begin_prompts([PromptRequest(request.scene, request.format, 0)])
     assert isinstance(prompt, Prompt)
     exact.feed_prompts([(prompt, exact.prompt_tokens)])
     feed = Feed(0, prompt, 0, [prompt.last_token, *written], [(len(written), cursor.allowed().ids)])

@@ -126,7 +126,7 @@ def _object(kind: AgentKind, words: str, before: str, behind: str, *, negated: b
 
     def is_there(view: View) -> bool:
         return any(
-            sight.kind == kind and sight.place in places and about(told_m, sight.ahead_m)
+            sight.kind == kind and sight.place in places and is_near(told_m, sight.ahead_m)
             for sight in view.sights
         )
 
@@ -144,12 +144,12 @@ def _roads(seen: str) -> Iterator[Claim]:
     told_m = _distance(seen)
     if bends := _BENDS.search(seen):
         side = _side(bends)
-        yield Claim("road", seen, lambda view: view.bend == side and about(told_m, view.bend_m))
+        yield Claim("road", seen, lambda view: view.bend == side and is_near(told_m, view.bend_m))
     elif branches := _BRANCHES.search(seen):
         way = _side(branches)
         yield Claim("road", seen, lambda view: way in view.turns)
     elif _CURVE.search(seen):
-        yield Claim("road", seen, lambda view: view.bend is not None and about(told_m, view.bend_m))
+        yield Claim("road", seen, lambda view: view.bend is not None and is_near(told_m, view.bend_m))
     elif _STRAIGHT.search(seen):
         yield Claim("road", seen, lambda view: view.bend is None)
 
@@ -176,7 +176,7 @@ def _distance(words: str) -> float | None:
     return RIGHT_AHEAD_M if _RIGHT_AHEAD.search(words) else None
 
 
-def about(told_m: float | None, true_m: float) -> bool:
+def is_near(told_m: float | None, true_m: float) -> bool:
     """Whether a distance is told well enough; always where none is told."""
     return told_m is None or abs(told_m - true_m) <= max(DISTANCE_ERROR_M, DISTANCE_ERROR * true_m)
 

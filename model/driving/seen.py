@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from model.driving.claims import CLEAR_WITHIN_M, about
+from model.driving.claims import CLEAR_WITHIN_M, is_near
 from model.driving.phrases import Bend, Clear, Cue, Facts, Junction, Room, Side, Spot, State, Straight, Thing
 from model.driving.view import Place, Sight, View
 
@@ -25,12 +25,12 @@ def shown(cue: Cue, view: View) -> bool:
             return any(
                 sight.kind == kind
                 and (comes(sight) if place == "oncoming" else sight.place == place)
-                and about(ahead_m, sight.ahead_m)
+                and is_near(ahead_m, sight.ahead_m)
                 and _moves(sight, state, view)
                 for sight in view.sights
             )
         case Bend(side, told_m):
-            return view.bend == side and about(told_m, view.bend_m)
+            return view.bend == side and is_near(told_m, view.bend_m)
         case Junction(side):
             return side in view.turns
         case Room(side):

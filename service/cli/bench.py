@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from service.cli.engines import Device
-from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, ScenePath, told
+from service.cli.options import (
+    DEFAULT_CHECKPOINT,
+    DEFAULT_SCENES,
+    Checkpoint,
+    Json,
+    ScenePath,
+    reported_errors,
+)
 
 if TYPE_CHECKING:
     from model.bench.report import Roofline
@@ -48,7 +55,7 @@ def engine(
     as_json: Json = False,
 ) -> None:
     """Our engine, transformers and vLLM on the same checkpoint, scenes and controls."""
-    with told(), tempfile.TemporaryDirectory() as folder:
+    with reported_errors(), tempfile.TemporaryDirectory() as folder:
         from model.bench.report import BenchReport
         from model.bench.run import Job, run, run_deadlines, run_planner
         from model.bench.workload import Workload
@@ -101,7 +108,7 @@ def precision(
     as_json: Json = False,
 ) -> None:
     """How often rounding in float32 and bfloat16 changes a response, and how close the decision was."""
-    with told():
+    with reported_errors():
         from model.bench.precision import measure
         from model.driving.scene_store import read_scenes
 
@@ -127,7 +134,7 @@ def score(
     as_json: Json = False,
 ) -> None:
     """Our scorer of plans, and NAVSIM's own beside it, in seconds of one core."""
-    with told():
+    with reported_errors():
         from model.bench.scoring import measure
 
         found = measure(repeats, navsim or [], navsim_python and navsim_python.absolute())
@@ -155,7 +162,7 @@ def egodriver(
     as_json: Json = False,
 ) -> None:
     """The egodriver: the same rollouts one by one and together, without deadlines."""
-    with told():
+    with reported_errors():
         from itertools import islice
 
         from clients.alpasim.throughput import measure
@@ -185,7 +192,7 @@ def http(
     as_json: Json = False,
 ) -> None:
     """What HTTP adds to planning, by kind of body, on a service that is otherwise idle."""
-    with told():
+    with reported_errors():
         import httpx
 
         from clients.planner import Access

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from service.cli.options import Json, told
+from service.cli.options import Json, reported_errors
 from service.cli.stages import do_jobs, progress_bar, report_run, run_stage, scenes_in
 
 if TYPE_CHECKING:
-    from clients.labelling.label import Asked
+    from clients.labelling.label import LabelTask
     from clients.labelling.ledger import Ledger, Run
     from clients.labelling.pipeline import Job, Tally
     from clients.labelling.teachers.openai import OpenAiSettings
@@ -66,7 +66,7 @@ def rollout(
 ) -> None:
     """Roll a served model out over scenes: what it plans alone, and with the expert's plan given."""
     from clients.labelling.pipeline import Limits
-    from clients.labelling.rollout import PATIENCE, Sampling, config_of, jobs, roll_out
+    from clients.labelling.rollout import RETRY_POLICY, Sampling, config_of, jobs, roll_out
     from clients.planner import Access, AsyncPlannerClient, PlannerError
     from clients.wire import ModelName
 
@@ -75,7 +75,7 @@ def rollout(
     unlabelled: list[str] = []
 
     async def roll(ledger: Ledger) -> tuple[Run, Tally]:
-        async with AsyncPlannerClient(service, PATIENCE, access=access) as planner:
+        async with AsyncPlannerClient(service, RETRY_POLICY, access=access) as planner:
             try:
                 (card, *_) = await planner.models()
             except PlannerError as error:
@@ -101,7 +101,7 @@ def rollout(
                 quiet=as_json,
             )
 
-    with told():
+    with reported_errors():
         _check_ray(on_ray, limit, dry_run, every)
         run, tally = run_stage(folder, roll, dry=dry_run > 0)
         for name in unlabelled:
@@ -152,7 +152,7 @@ def outcomes(
         )
         return begun, tally
 
-    with told():
+    with reported_errors():
         begun, tally = run_stage(folder, follow, dry=dry_run > 0)
         report_run(begun, tally, as_json, **counts)
 
@@ -187,7 +187,7 @@ def choose(
     from model.driving.scene_store import row_groups, scene_files
 
     thresholds = Thresholds(epsilon, gain, plan_iou, everything)
-    with told(), Ledger(folder) as ledger:
+    with reported_errors(), Ledger(folder) as ledger:
         if outcomes and thresholds != Thresholds():
             raise ValueError(
                 "--outcomes asks what came of plans: no --epsilon, --gain, --plan-iou, --everything"
@@ -202,7 +202,7 @@ def choose(
             if outcomes
             else filtered(entries, thresholds)
         )
-        ledger.keep(rollout, ((scene.entry.key, scene.draws) for scene in found if scene.kept))
+        ledger.select(rollout, ((scene.entry.key, scene.draws) for scene in found if scene.kept))
         scatter(found, None if outcomes else thresholds, folder / "filter.png")
         result = summary(found)
     if as_json:
@@ -251,7 +251,7 @@ def label(
 
     async def ask_all(ledger: Ledger) -> tuple[Run, Tally]:
         rollout = ledger.the_run("rollout", run)
-        if not ledger.count_kept(rollout, 1):
+        if not ledger.selected_draws(rollout, 1):
             raise RuntimeError("no scene is kept: run `looktwice build filter` first")
         try:
             asked = await connect()
@@ -268,7 +268,9 @@ def label(
 
                 work = LabelWork(begun, rollout, connect, plans_per_scene, seed, limits)
                 kept = chunks(ledger, begun, scenes, rollout)
-                with progress_bar(begun, ledger.count_kept(rollout, plans_per_scene), quiet=as_json) as show:
+                with progress_bar(
+                    begun, ledger.selected_draws(rollout, plans_per_scene), quiet=as_json
+                ) as show:
                     tally = work_on_ray(ledger, begun, kept, work, on_ray, show)
             else:
                 found = questions(ledger, rollout, scenes, plans_per_scene=plans_per_scene, seed=seed)
@@ -278,7 +280,7 @@ def label(
                     jobs(begun, found),
                     labeller(ledger, begun, asked),
                     limits,
-                    total=ledger.count_kept(rollout, plans_per_scene),
+                    total=ledger.selected_draws(rollout, plans_per_scene),
                     quiet=as_json,
                 )
             spent.update(ledger.spent(begun).since(before))
@@ -286,7 +288,7 @@ def label(
         finally:
             await asked.close()
 
-    with told():
+    with reported_errors():
         _check_ray(on_ray, limit, dry_run)
         begun, tally = run_stage(folder, ask_all, dry=dry_run > 0)
         report_run(begun, tally, as_json, **spent)
@@ -329,7 +331,7 @@ def export(
     from model.driving.reflection_store import write_reflections
     from model.driving.whole_files import written_whole
 
-    with told(), Ledger(folder) as ledger:
+    with reported_errors(), Ledger(folder) as ledger:
         if (right_iou is not None or right_outcomes) and form != "parquet":
             raise ValueError(
                 f"--form {form} has no place for plans that are right: "
@@ -377,7 +379,7 @@ def take(
     from clients.labelling.dead_letters import write_dead_letters
     from clients.labelling.ledger import Ledger
 
-    with told(), Ledger(folder) as ledger, results.open() as lines:
+    with reported_errors(), Ledger(folder) as ledger, results.open() as lines:
         settings, begun, found = _batch(ledger, scenes, plans_per_scene, seed, run)
         before = ledger.spent(begun)
         tally = take_results(ledger, begun, found, read_results(lines, settings))
@@ -387,7 +389,7 @@ def take(
 
 def _batch(
     ledger: Ledger, scenes: Path, plans_per_scene: int, seed: int, run: str | None
-) -> tuple[OpenAiSettings, Run, Iterator[Job[Asked]]]:
+) -> tuple[OpenAiSettings, Run, Iterator[Job[LabelTask]]]:
     """The questions for the endpoint that the settings name."""
     from clients.labelling.label import config_of, jobs, questions
     from clients.labelling.teachers.openai import OpenAiTeacher

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import told
+from service.cli.options import reported_errors
 
 
 def describe(
@@ -18,7 +18,7 @@ def describe(
     ] = None,
 ) -> None:
     """Write model card, processor and chat template into a checkpoint folder; weights stay as they are."""
-    with told():
+    with reported_errors():
         from model.network.repository import CARD, write_repository
 
         figures = dict(map(_split, figure)) if figure else None

@@ -10,7 +10,7 @@ from typing import Annotated, Final, cast
 
 import typer
 
-from service.cli.options import Json, told
+from service.cli.options import Json, reported_errors
 
 SERVICE_DRIVERS: Final = ("adaptive", "never", "always")
 DRIVERS: Final = ("expert", "constant-velocity", *SERVICE_DRIVERS)
@@ -58,11 +58,11 @@ def drive(
     from clients.metadrive.drive import drive as drive_episode
     from clients.metadrive.drive_table import driver_rows, format_table, to_json
     from clients.metadrive.film import IMAGINED, Film
-    from clients.metadrive.kept_drives import KeptDrives
     from clients.metadrive.maps import MapError
     from clients.metadrive.pilots import ConstantVelocity, Pilot, ServicePilot
+    from clients.metadrive.result_store import drive_store
     from clients.metadrive.rig import Rig
-    from clients.planner import Access, Patience, PlannerClient
+    from clients.planner import Access, PlannerClient, RetryPolicy
     from model.driving.cameras import FRONT_CAMERAS
     from model.driving.hashing import hash_of
     from model.driving.scene import split_of_seed
@@ -103,16 +103,16 @@ def drive(
         formats = () if format is None else (format,)
         return hash_of(driver, seed, seconds, asked, route, tracks, models, width_px, *formats)
 
-    with told():
+    with reported_errors():
         small_pilots = {pilot.name: pilot for pilot in map(SmallPilot, small or ())}
     wanted = [*(drivers or ([] if small else DRIVERS[:-1])), *small_pilots]
     asks = any(driver in SERVICE_DRIVERS for driver in wanted)
     if unknown := set(drivers or ()) - set(DRIVERS):
         raise typer.BadParameter(f"unknown drivers: {', '.join(sorted(unknown))}")
     with (
-        told(),
+        reported_errors(),
         _named(service),
-        PlannerClient(service, Patience(timeout_s=120.0), access=Access.from_environment()) as planner,
+        PlannerClient(service, RetryPolicy(timeout_s=120.0), access=Access.from_environment()) as planner,
     ):
         seeds = range(first_seed, first_seed + episodes)
         for seed in (seeds[0], seeds[-1]):
@@ -123,7 +123,7 @@ def drive(
         rig = Rig.of_width(width_px)
         imagines = wanted[-1] in SERVICE_DRIVERS and any(card.imagines and card.paints for card in cards)
         film, config = Film(imagines=imagines), DriveConfig(seconds)
-        kept = KeptDrives(keep) if keep is not None else None
+        store = drive_store(keep) if keep is not None else None
         found: dict[str, list[Drive]] = {}
         # Progress goes to stderr, so that stdout holds nothing but the table.
         with Progress(console=Console(stderr=True, quiet=as_json)) as progress:
@@ -134,12 +134,12 @@ def drive(
                     pilot = pilot_of(driver, planner, imagines=filmed and imagines)
                     name = EXPERT if pilot is None else pilot.name
                     key = key_of(driver, seed, models)
-                    drove = kept.find(key) if kept is not None and not filmed else None
+                    drove = store.find(key) if store is not None and not filmed else None
                     try:
                         if drove is None:
                             drove = drive_episode(seed, pilot, rig, config, film.add if filmed else None)
-                            if kept is not None:
-                                kept.keep(key, drove)
+                            if store is not None:
+                                store.store(key, drove)
                     except MapError:
                         typer.echo(f"no map fits seed {seed}: left out", err=True)
                         break

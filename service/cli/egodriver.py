@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
-from service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, told
+from service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, reported_errors
 
 if TYPE_CHECKING:
     from clients.planner import AsyncPlannerClient
@@ -70,7 +70,7 @@ def egodriver(
     """Serve alpasim's egodriver contract over gRPC, many sessions batched together."""
     from clients import wire
 
-    with told():
+    with reported_errors():
         if find_spec("carla_driver_interface") is None:
             raise RuntimeError("the egodriver needs more: pip install 'looktwice[alpasim]'")
         from clients.alpasim.driver import DriverConfig

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 import typer
 
 from service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
-from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, ScenePath, told
+from service.cli.options import (
+    DEFAULT_CHECKPOINT,
+    DEFAULT_SCENES,
+    Checkpoint,
+    Json,
+    ScenePath,
+    reported_errors,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
@@ -121,10 +128,10 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Evaluate open loop: baselines, with and without route, expert plans given, images shuffled."""
-    with told():
+    with reported_errors():
         from model.driving.scene_store import count_scenes, read_scenes
         from model.engines.engine import Controls
-        from model.evaluation.kept import KeptDraws
+        from model.evaluation.draw_store import DrawStore
 
         controls = Controls(
             n=n,
@@ -145,7 +152,7 @@ def evaluate(
 
         def engine_of(folder: Path) -> Engine:
             made = make_engine(folder, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
-            return made if keep is None else KeptDraws(made, keep)
+            return made if keep is None else DrawStore(made, keep)
 
         if outcomes:
             told_as, text = _outcomes(

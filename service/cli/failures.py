@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.build import AtOnce, Every, Folder, GiveUp, Limit, MaxErrorRate, RetryDead, Scenes
-from service.cli.options import Json, told
+from service.cli.options import Json, reported_errors
 from service.cli.stages import do_jobs, report_run, run_stage, scenes_in
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def failures(
 
     inference = Inference(n, temperature, top_p, seed, route=route, tracks=tracks, format=format)
     limits = Limits(at_once, give_up_after, max_error_rate, limit)
-    with told():
+    with reported_errors():
         sample = Sample(threshold, correct, wrong, seed)
         inferred, tally = run_stage(
             folder,
@@ -92,11 +92,11 @@ async def _infer(
     quiet: bool,
 ) -> tuple[Run, Tally]:
     from clients.labelling.failures import infer, inference_config
-    from clients.labelling.rollout import PATIENCE, jobs
+    from clients.labelling.rollout import RETRY_POLICY, jobs
     from clients.planner import Access, AsyncPlannerClient, PlannerError
     from clients.wire import ModelName
 
-    async with AsyncPlannerClient(service, PATIENCE, access=Access.from_environment()) as planner:
+    async with AsyncPlannerClient(service, RETRY_POLICY, access=Access.from_environment()) as planner:
         try:
             (card, *_) = await planner.models()
         except PlannerError as error:

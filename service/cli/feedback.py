@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import DEFAULT_SCENES, Json, ScenePath, told
+from service.cli.options import DEFAULT_SCENES, Json, ScenePath, reported_errors
 
 
 def feedback(
@@ -23,10 +23,10 @@ def feedback(
     from clients.wire_feedback import FeedbackRequest
     from service.errors import validated
     from service.feedback import feedback_given
+    from service.inspector_scenes import BundledScenes
     from service.problems import ProblemError
-    from service.views import BundledScenes
 
-    with told():
+    with reported_errors():
         text = sys.stdin.read() if str(request) == "-" else request.read_text()
         try:
             asked = validated(FeedbackRequest, json.loads(text))

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from service.cli.options import DEFAULT_SCENES, Json, ScenePath, told
+from service.cli.options import DEFAULT_SCENES, Json, ScenePath, reported_errors
 
 Scenario = Literal["poisson", "sweep", "fleet", "soak", "burst", "hostile", "costly"]
 
@@ -85,7 +85,7 @@ def loadtest(
     as_json: Json = False,
 ) -> None:
     """Offer load, measured from when each request was due; exits with 1 where the run is not valid."""
-    with told(), ExitStack() as stack:
+    with reported_errors(), ExitStack() as stack:
         from loadtests.attacks import RUDE
         from loadtests.bad_teacher import bad_teacher
         from loadtests.environment import describe_client, describe_service, versions

@@ -14,7 +14,7 @@ from model.bundled import CHECKPOINT, SCENES
 
 
 @contextmanager
-def told() -> Iterator[None]:
+def reported_errors() -> Iterator[None]:
     """Turn the project's own errors, and a disk that is full, into one line on stderr and exit code 2."""
     try:
         yield
@@ -28,7 +28,7 @@ def _found(checkpoint: Path) -> Path:
         return checkpoint
     from model.network.hub import checkpoint_folder
 
-    with told():
+    with reported_errors():
         return checkpoint_folder(checkpoint)
 
 

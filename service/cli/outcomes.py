@@ -11,10 +11,10 @@ from typing import Final
 from rich.console import Console
 from rich.progress import Progress
 
-from clients.metadrive.kept_outcomes import KeptOutcomes, key_of
 from clients.metadrive.outcomes import MomentOutcomes
 from clients.metadrive.replay import EpisodeSetting, Moment, ReplayError
-from clients.metadrive.workers import Asked, follow_episodes
+from clients.metadrive.result_store import ResultStore, outcome_key, outcome_store
+from clients.metadrive.workers import FollowTask, follow_episodes
 from model.driving.scene import LabelledScene
 from model.driving.trajectory import FloatArray
 from model.engines.engine import Controls, Draw, EngineError
@@ -64,7 +64,7 @@ def followed_table(
     adaptive: DrawsOf,
     setting: EpisodeSetting,
     workers: int,
-    kept: KeptOutcomes,
+    store: ResultStore[MomentOutcomes],
     on_scene: Callable[[], None] = lambda: None,
 ) -> OutcomeTable:
     """Follow the draws of both runs in every scene, and tell what second looks bring.
@@ -74,7 +74,7 @@ def followed_table(
         never, adaptive: draws of both runs in all of them, made with the same seeds.
         setting: of the scenes' episodes.
         workers: processes.
-        kept: outcomes that are known; new ones are added.
+        store: outcomes that are known; new ones are added.
         on_scene: called after each scene.
 
     Raises:
@@ -88,17 +88,17 @@ def followed_table(
         )
         for labelled in scenes
     }
-    keys = {scene_id: key_of(each, setting) for scene_id, each in asked.items()}
+    keys = {scene_id: outcome_key(each, setting) for scene_id, each in asked.items()}
     found: dict[str, MomentOutcomes] = {}
     for scene_id, key in keys.items():
-        if (known := kept.find(key)) is not None:
+        if (known := store.find(key)) is not None:
             found[scene_id] = known
             on_scene()
     rest = [each for scene_id, each in asked.items() if scene_id not in found]
     for scene_id, outcomes in follow_episodes(_episodes(rest), setting, workers):
         if isinstance(outcomes, str):
             raise ReplayError(outcomes)
-        kept.keep(keys[scene_id], outcomes)
+        store.store(keys[scene_id], outcomes)
         found[scene_id] = outcomes
         on_scene()
     draws: list[FollowedDraw | None] = []
@@ -116,7 +116,7 @@ def followed_table(
     return outcome_table(paired, len(held), len(scenes) - len(held), unpaired)
 
 
-def _asked(labelled: LabelledScene, never: Sequence[Draw], adaptive: Sequence[Draw]) -> Asked:
+def _asked(labelled: LabelledScene, never: Sequence[Draw], adaptive: Sequence[Draw]) -> FollowTask:
     """The trajectories of all first plans, then those of the second looks."""
     trajectories: list[FloatArray] = [draw.trajectory for draw in never]
     trajectories += [draw.trajectory for draw in adaptive if draw.looked_twice]
@@ -136,7 +136,7 @@ def _draws(
             yield FollowedDraw(episode_id, draw.think_probability, first, draw.looked_twice, last)
 
 
-def _episodes(asked: Sequence[Asked]) -> Iterator[list[Asked]]:
+def _episodes(asked: Sequence[FollowTask]) -> Iterator[list[FollowTask]]:
     by_seed = sorted(asked, key=lambda each: each[0].seed)
     for _, episode in groupby(by_seed, lambda each: each[0].seed):
         yield list(episode)
@@ -156,7 +156,7 @@ def follow_pairs(
 
     Raises as `followed_table` does.
     """
-    kept = KeptOutcomes(keep)
+    store = outcome_store(keep)
     # Progress goes to stderr, so that stdout holds nothing but the table.
     with Progress(console=Console(stderr=True, quiet=quiet)) as progress:
         task = progress.add_task("plans followed", total=len(scenes) * len(pairs))
@@ -164,7 +164,7 @@ def follow_pairs(
         def table(pair: Pair) -> OutcomeTable:
             never, adaptive = draws[pair.never.name], draws[pair.adaptive.name]
             return followed_table(
-                scenes, never, adaptive, setting, workers, kept, lambda: progress.advance(task)
+                scenes, never, adaptive, setting, workers, store, lambda: progress.advance(task)
             )
 
         return {pair.given: table(pair) for pair in pairs}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, told
+from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, reported_errors
 
 if TYPE_CHECKING:
     import clients.wire as wire
@@ -52,7 +52,7 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """Plan for scenes and draw what was planned."""
-    with told():
+    with reported_errors():
         files = scenes or [DEFAULT_SCENES]
         _refuse_what_requests_say(context, files)
         found = [each for file in files for each in islice(_read(file), skip, skip + limit)]
@@ -110,8 +110,8 @@ def _requested(
     """The engine's request for a scene, or for a request as the service would make it."""
     from model.driving.scene import LabelledScene
     from model.engines.engine import Controls, PlanRequest
-    from service.intake import engine_request
     from service.problems import ProblemError
+    from service.validation import engine_request
 
     if isinstance(found, LabelledScene):
         scene = found.given(**given)

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.options import DEFAULT_SCENES, Json, told
+from service.cli.options import DEFAULT_SCENES, Json, reported_errors
 
 if TYPE_CHECKING:
     from clients.importers.recording import Recording
-    from clients.importers.views import Source
+    from clients.importers.resampling import Source
     from clients.metadrive.pilots import Pilot
     from model.driving.cameras import CameraSpec
     from model.driving.scene import LabelledScene
@@ -64,7 +64,7 @@ def generate(
     ] = True,
 ) -> None:
     """Drive episodes in MetaDrive and store their scenes; run again after a kill, it resumes."""
-    with told():
+    with reported_errors():
         from clients.metadrive.generate import GenerateConfig, generate
 
         driver, pilot = _driver(service, small, tracks=tracks, pictures=pictures)
@@ -109,9 +109,9 @@ def served_pilot(service: str, *, tracks: bool) -> Pilot:
     """A service's model, without second looks: those are taught by what comes of first plans."""
     from clients import wire
     from clients.metadrive.pilots import ServicePilot
-    from clients.planner import Access, Patience, PlannerClient
+    from clients.planner import Access, PlannerClient, RetryPolicy
 
-    planner = PlannerClient(service, Patience(timeout_s=120.0), access=Access.from_environment())
+    planner = PlannerClient(service, RetryPolicy(timeout_s=120.0), access=Access.from_environment())
     return ServicePilot(planner, "never", wire.Controls(n=6, thinking="never"), tracks=tracks)
 
 
@@ -138,7 +138,7 @@ def import_(
     width: Annotated[int, typer.Option(help="Width of the pictures in pixels, twice their height.")] = 336,
 ) -> None:
     """Make scenes of recorded drives, your own or others'; docs/own-cameras.md tells how."""
-    with told():
+    with reported_errors():
         from clients.importers.recording import RecordingError
         from model.driving.scene_store import write_scenes
 
@@ -183,7 +183,7 @@ def _recordings(folder: Path, told: list[str], width: int) -> Iterable[Recording
 
 def _played(told: list[str], specs: list[CameraSpec]) -> dict[CameraSpec, Source]:
     from clients.importers.recording import RecordingError
-    from clients.importers.views import Source
+    from clients.importers.resampling import Source
 
     if not told:
         return {spec: Source(spec.name, spec.hfov_degrees, spec.horizon) for spec in specs}
@@ -206,7 +206,7 @@ def _played(told: list[str], specs: list[CameraSpec]) -> dict[CameraSpec, Source
 @app.command("stats")
 def stats(path: _Scenes = DEFAULT_SCENES, as_json: Json = False) -> None:
     """Count scenes per tag and per meta-action, and check the expert."""
-    with told():
+    with reported_errors():
         from clients.metadrive.stats import scene_stats
 
         figures = scene_stats(path)
@@ -230,7 +230,7 @@ def show(
     every: Annotated[int, typer.Option(help="Take every so-many-th scene.", min=1)] = 1,
 ) -> None:
     """Write a contact sheet: cameras and bird's-eye view of scenes."""
-    with told():
+    with reported_errors():
         from clients.metadrive.sheet import contact_sheet
         from model.driving.scene_store import read_scenes
 
@@ -246,7 +246,7 @@ def pick(
     count: Annotated[int, typer.Option(help="How many scenes.", min=1)] = 12,
 ) -> None:
     """Pick a few scenes that show every tag, each from another episode, without their dense targets."""
-    with told():
+    with reported_errors():
         from model.driving.scene_store import read_scenes, write_scenes
         from model.driving.selection import pick_varied
 

@@ -12,7 +12,7 @@ import typer
 
 from service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
 from service.cli.evaluate import evenly, run_started
-from service.cli.options import DEFAULT_SCENES, Json, OptionalCheckpoint, ScenePath, told
+from service.cli.options import DEFAULT_SCENES, Json, OptionalCheckpoint, ScenePath, reported_errors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,7 +46,7 @@ def score(
     as_json: Json = False,
 ) -> None:
     """Score a request's trajectories, or planners over scenes; docs/scoring.md tells how."""
-    with told():
+    with reported_errors():
         if what.is_dir() or what.suffix == ".parquet":
             from model.driving.scene_store import count_scenes, read_scenes
             from model.engines.engine import Controls
@@ -99,9 +99,9 @@ def _agreed_draws(
 def _score_request(request: Path, scenes: Path, *, as_json: bool) -> None:
     from clients.wire_scores import ScoreRequest
     from service.errors import validated
+    from service.inspector_scenes import BundledScenes
     from service.problems import ProblemError
     from service.scoring import scored
-    from service.views import BundledScenes
 
     text = sys.stdin.read() if str(request) == "-" else request.read_text()
     try:

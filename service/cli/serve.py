@@ -13,7 +13,7 @@ import typer
 from pydantic_settings import BaseSettings
 
 from service.cli.engines import CacheMb, Device, EngineName, Reproducible, Rows, VllmArguments, make_engine
-from service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, told
+from service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, reported_errors
 
 _TURN_S: Final = 0.0001
 """After which a thread that computes in Python lets others go on. The engine's thread asks for its turn many
@@ -53,7 +53,7 @@ def serve(
         return
     return_large_buffers()
     sys.setswitchinterval(_TURN_S)
-    with told():
+    with reported_errors():
         settings = Settings()
         _check_free(host, port)
         load = partial(

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from model.bundled import CHECKPOINT as BUNDLED_CHECKPOINT
-from service.cli.options import told
+from service.cli.options import reported_errors
 
 
 def train(
@@ -115,7 +115,7 @@ def train(
 
     if threads is not None:
         torch.set_num_threads(threads)
-    with told():
+    with reported_errors():
         if recipe == "create":
             for name, value in create(scenes, cache, target, seed=seed).items():
                 typer.echo(f"codec {name} {value:.3f}")

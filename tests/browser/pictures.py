@@ -20,7 +20,7 @@ from PIL.PngImagePlugin import PngInfo
 from playwright.sync_api import expect, sync_playwright
 
 from clients.answers import PlannedDraw
-from clients.planner import Patience, PlannerClient
+from clients.planner import PlannerClient, RetryPolicy
 from clients.wire import Controls
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.facts import LANE_WIDTH_M
@@ -110,7 +110,7 @@ def main() -> None:
         folder = Path(kept)
         with (
             serve(TorchEngine(CHECKPOINT), Settings(bundled_scenes=SCENES)) as served,
-            PlannerClient(served.url, Patience(timeout_s=120)) as planner,
+            PlannerClient(served.url, RetryPolicy(timeout_s=120)) as planner,
         ):
             place, seed, draw = chosen(planner, scenes)
             scene_id = scenes[place].scene.scene_id

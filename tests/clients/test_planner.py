@@ -14,16 +14,16 @@ from clients.planner import (
     Access,
     AsyncPlannerClient,
     BadAnswer,
-    Patience,
+    PlanEvent,
     PlannerClient,
     PlannerError,
     PlannerTimeout,
     PlannerUnreachable,
     PlanResult,
     RequestRefused,
+    RetryPolicy,
     ServiceBusy,
     ServiceFailed,
-    Told,
     plan_request,
     reflect_request,
 )
@@ -138,8 +138,8 @@ def test_asyncio_tries_again_too() -> None:
 
 def test_gives_up_after_the_last_attempt() -> None:
     transport, seen = answering((503, {"Retry-After": "0"}))
-    patience = Patience(attempts=4)
-    with PlannerClient("http://x", patience, transport) as planner, pytest.raises(ServiceBusy) as caught:
+    retries = RetryPolicy(attempts=4)
+    with PlannerClient("http://x", retries, transport) as planner, pytest.raises(ServiceBusy) as caught:
         planner.models()
     assert len(seen) == 4
     assert caught.value.retry_after_s == 0
@@ -252,7 +252,7 @@ def test_packed_bodies_and_a_key_change_nothing(tmp_path: Path) -> None:
 def test_a_stream_is_read_event_by_event() -> None:
     asked = plan_request(scene(), wire.Controls(n=2, thinking="always"))
 
-    async def follow(url: str) -> list[tuple[str, Told]]:
+    async def follow(url: str) -> list[tuple[str, PlanEvent]]:
         async with AsyncPlannerClient(url) as planner:
             return [event async for event in planner.stream(asked)]
 

@@ -22,7 +22,7 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from clients import wire
-from clients.planner import Patience, PlannerClient
+from clients.planner import PlannerClient, RetryPolicy
 from model.bundled import SCENES
 from model.driving.scene import Scene
 from model.driving.scene_store import read_scenes
@@ -112,7 +112,7 @@ def test_a_replica_plans_over_http(serving: tuple[str, psutil.Process], scene: S
     url, process = serving
     names = Counter(one.name() for one in process.children(recursive=True))
     assert sum(count for name, count in names.items() if "ServeReplica" in name) == 1
-    with PlannerClient(url, Patience(timeout_s=60)) as planner:
+    with PlannerClient(url, RetryPolicy(timeout_s=60)) as planner:
         answer = planner.plan(scene, wire.Controls(n=2, seed=1))
     assert [draw.trajectory.shape for draw in answer.draws] == [(64, 4)] * 2
 

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from clients import wire
-from clients.planner import Patience, PlannerClient, PlanResult
+from clients.planner import PlannerClient, PlanResult, RetryPolicy
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.plan import parse_plan
 from model.driving.scene import split_of_seed
@@ -41,7 +41,7 @@ def served() -> Iterator[Served[TorchEngine]]:
 
 @pytest.fixture(scope="module")
 def planner(served: Served[TorchEngine]) -> Iterator[PlannerClient]:
-    with PlannerClient(served.url, Patience(timeout_s=120)) as planner:
+    with PlannerClient(served.url, RetryPolicy(timeout_s=120)) as planner:
         yield planner
 
 

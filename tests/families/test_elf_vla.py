@@ -27,7 +27,7 @@ from model.engines.engine import Controls, Draw, PlanRequest, RequestError
 from model.engines.requests import begin
 from model.engines.torch.decoder import Decoder
 from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.torch.runner import Asked, Runner
+from model.engines.torch.runner import PromptRequest, Runner
 from model.evaluation.open_loop import evaluate_draws
 from model.evaluation.variants import standard_variants
 from model.families.elf_vla import ELF_VLA, ELF_VLA_REFINE
@@ -192,7 +192,7 @@ def test_an_engine_counts_the_words_of_its_prompts(elf: Loaded, checkpoint: Path
         (faster, "elf_vla_refine", ATTEMPT),
     ):
         with torch.inference_mode():
-            [read] = runner.begin_prompts([Asked(scene, format, 0, attempt)])
+            [read] = runner.begin_prompts([PromptRequest(scene, format, 0, attempt)])
         assert not isinstance(read, Exception)
         request = PlanRequest("count", scene, format, attempt=attempt)
         assert engine.prompt_tokens(request) == read.length + 1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import clients.wire as wire
-from clients.planner import PlannerClient, PlanResult, Told, attempt_at, plan_request
+from clients.planner import PlanEvent, PlannerClient, PlanResult, attempt_at, plan_request
 from model.driving.phrases import ReflectionLanguage
 from model.engines.torch.engine import TorchEngine, TorchSettings
 from model.families.registry import OURS, family_named
@@ -42,7 +42,7 @@ def asked(format: str, **controls: Any) -> wire.PlanRequest:
     return plan_request(SCENE, settings, format=format, attempt=attempt)
 
 
-def told_of(index: int, events: list[tuple[str, Told]]) -> dict[str, Any]:
+def told_of(index: int, events: list[tuple[str, PlanEvent]]) -> dict[str, Any]:
     """What the events say of a draw, put together."""
     told: dict[str, Any] = {}
     for name, data in events:

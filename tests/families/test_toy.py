@@ -33,7 +33,7 @@ from model.training.examples import Examples
 from model.training.targets import make_target
 from service.metrics import Metrics
 from service.planning import Judged
-from service.planning import Told as Happened
+from service.planning import SceneEvent as Happened
 from service.settings import Settings
 from service.streaming import told_events
 from service.telling import PlanTeller

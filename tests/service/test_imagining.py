@@ -19,7 +19,7 @@ from PIL import Image
 
 import clients.wire as wire
 from clients.planner import AsyncPlannerClient, PlannerClient, RequestRefused, ServiceBusy, imagine_request
-from clients.streams import ImagineTold
+from clients.streams import ImagineEvent
 from clients.wire_imagine import CodesWritten, ImagineControls, ImagineRequest, ImagineResponse
 from model.driving.scene import CAMERAS
 from model.engines.engine import EngineError
@@ -128,7 +128,7 @@ def test_clients_imagine_too_in_both_kinds(served: Served[TorchEngine]) -> None:
     assert ImagineResponse.model_validate(msgpack.unpackb(packed.content)).pictures == told.pictures
 
 
-def events_of(served: Served[Any], **changes: Any) -> list[tuple[str, ImagineTold]]:
+def events_of(served: Served[Any], **changes: Any) -> list[tuple[str, ImagineEvent]]:
     request = ImagineRequest.model_validate_json(json.dumps(asked(**changes)))
     with PlannerClient(served.url) as planner:
         return list(planner.stream_imagine(request))

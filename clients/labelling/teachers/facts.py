@@ -29,12 +29,12 @@ from model.driving.phrases import (
 Seen = Annotated[str, Field(json_schema_extra={"enum": list(HEADS)})]
 
 
-class _Told(BaseModel):
+class _Answer(BaseModel):
     # Strict: an endpoint that is held to the schema writes every field.
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class ToldStatement(_Told):
+class ToldStatement(_Answer):
     """One statement as a teacher fills it in."""
 
     seen: Seen
@@ -44,7 +44,7 @@ class ToldStatement(_Told):
     correction: Correction
 
 
-class ToldFacts(_Told):
+class ToldFacts(_Answer):
     """A teacher's answer."""
 
     statements: list[ToldStatement]

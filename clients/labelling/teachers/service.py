@@ -15,10 +15,10 @@ from clients.labelling.teachers.teacher import (
     TeacherClosed,
     TeacherError,
 )
-from clients.planner import Access, AsyncPlannerClient, Patience
+from clients.planner import Access, AsyncPlannerClient, RetryPolicy
 from clients.wire import MAX_SEED, TeacherName
 
-PATIENCE = Patience(timeout_s=120.0, attempts=1)
+RETRY_POLICY = RetryPolicy(timeout_s=120.0, attempts=1)
 """Who waits how long is the asker's to say."""
 LABEL_REFUSED, NOTHING_IN_VIEW = "label-refused", "nothing-in-view"
 
@@ -36,7 +36,7 @@ class ServiceTeacher:
         Raises:
             TeacherClosed: nobody answers there, or nobody who labels.
         """
-        planner = AsyncPlannerClient(base_url, PATIENCE, access=access)
+        planner = AsyncPlannerClient(base_url, RETRY_POLICY, access=access)
         try:
             teacher = await planner.teacher()
         except PlannerError as error:

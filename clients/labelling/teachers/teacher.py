@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
 from clients.labelling.checks import FailedCheck, check_reflection
-from clients.labelling.teachers.patience import TryLater
+from clients.labelling.retries import TryLater
 from model.driving.outcome import Outcome
 from model.driving.plan import Plan
 from model.driving.scene import Scene

@@ -33,7 +33,7 @@ from model.engines.torch.expected_picture import expected_picture
 from model.engines.torch.integrity import check
 from model.engines.torch.request import Phase, Request, Tree
 from model.engines.torch.rows import Row
-from model.engines.torch.runner import ROWS_A_TREE, Asked, Runner
+from model.engines.torch.runner import ROWS_A_TREE, PromptRequest, Runner
 from model.engines.torch.scheduler import Scheduler
 from model.engines.torch.shortcuts import Shortcuts
 
@@ -280,7 +280,7 @@ class Decoder:
             assert tree.kv_row is not None
             asked = tree.request.plan_request
             camera = asked.controls.camera
-            scenes.append(Asked(asked.scene, asked.format, tree.kv_row, asked.attempt, camera))
+            scenes.append(PromptRequest(asked.scene, asked.format, tree.kv_row, asked.attempt, camera))
         events: list[StepEvent] = []
         for tree, begun in zip(trees, self._runner.begin_prompts(scenes), strict=True):
             if tree.request.phase is Phase.ENDED:

@@ -52,7 +52,7 @@ USUAL_TOKENS: Final = 128
 """Of a response. A KV row has room for so many of each of its rows; what outgrows it takes another one."""
 
 
-class Asked(NamedTuple):
+class PromptRequest(NamedTuple):
     """All that decides a prompt, and the KV row that it goes to."""
 
     scene: Scene
@@ -196,7 +196,7 @@ class Runner:
         """Make the kernels of passes with up to so many tokens."""
         self._decoder.warm_up(sorted({bucket(count) for count in range(1, tokens + 1)}))
 
-    def begin_prompts(self, asked: Sequence[Asked]) -> list[Prompt | Exception]:
+    def begin_prompts(self, asked: Sequence[PromptRequest]) -> list[Prompt | Exception]:
         """Begin to prefill scenes, their pictures encoded all at once.
 
         Of each prompt its KV row holds what is known already. A scene that cannot be made into inputs (a
@@ -332,7 +332,7 @@ class Runner:
         rotation = self._rotation.at(positions.to(device))
         return self._decoder(embeddings, rotation, attention, wanted.to(device) if len(wanted) else None)
 
-    def _begin_prompt(self, asked: Asked, encoded: Encoded) -> Prompt:
+    def _begin_prompt(self, asked: PromptRequest, encoded: Encoded) -> Prompt:
         loaded, (scene, format, kv_row, attempt, camera) = self.loaded, asked
         route, tracks = loaded.inputs.way(scene), loaded.inputs.tracks(scene)
         prompt = loaded.inputs.prompt_for(scene, format, attempt, camera)

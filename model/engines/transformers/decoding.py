@@ -28,7 +28,7 @@ Logits = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class Prepared:
     """A request, and what its draws share.
 
     Attributes:
@@ -72,7 +72,7 @@ class Decoding:
         self._loaded, self._model = loaded, _any(loaded.model)
         self._least_error = LeastError(loaded.codec, loaded.vocabulary)
 
-    def begin(self, request: PlanRequest, family: Family, start: Cursor, inputs: ModelInputs) -> Asked:
+    def begin(self, request: PlanRequest, family: Family, start: Cursor, inputs: ModelInputs) -> Prepared:
         """What all draws of a request share.
 
         Args:
@@ -86,9 +86,9 @@ class Decoding:
         facts = self._model.read_facts(prompt.embeddings[inputs.prompt.ids == video])
         reason_mask = reason_mask_of(request, family, loaded.vocabulary, facts)
         binding = binding_of(request, loaded.codec, loaded.vocabulary)
-        return Asked(request, family, start, inputs, binding, reason_mask)
+        return Prepared(request, family, start, inputs, binding, reason_mask)
 
-    def write(self, asked: Asked, index: int) -> Iterator[Step]:
+    def write(self, asked: Prepared, index: int) -> Iterator[Step]:
         """Write draw ``index``, token by token, from a prompt of its own."""
         model, prompt = self._model, self._model.encode_prompt_embeddings(asked.inputs)
         cache = DynamicCache(config=model.config)
@@ -114,7 +114,9 @@ class Decoding:
                 use_cache=True,
             ).logits[0, -1]
 
-    def _chosen(self, asked: Asked, response: Response, allowed: Allowed, scores: Logits, index: int) -> int:
+    def _chosen(
+        self, asked: Prepared, response: Response, allowed: Allowed, scores: Logits, index: int
+    ) -> int:
         controls = asked.request.controls
         left = self._left(asked, response, allowed, scores)
         expected = self._least_error.expected(allowed, controls)
@@ -125,7 +127,7 @@ class Decoding:
         return int(allowed.ids[left][place])
 
     def _left(
-        self, asked: Asked, response: Response, allowed: Allowed, scores: Logits
+        self, asked: Prepared, response: Response, allowed: Allowed, scores: Logits
     ) -> npt.NDArray[np.bool_]:
         """Which of the allowed tokens the request's controls leave; notes the think probability."""
         controls, family, cursor = asked.request.controls, asked.family, response.cursor

@@ -22,7 +22,7 @@ from model.engines.engine import (
 )
 from model.engines.pictures import PictureThreads
 from model.engines.requests import begin, inputs_of, painted, prompt_tokens, read, told
-from model.engines.transformers.decoding import Asked, Decoding
+from model.engines.transformers.decoding import Decoding, Prepared
 from model.engines.warm_up import warm_up
 from model.families.registry import families_of
 from model.formats.cursor import CompiledFormat, Cursor
@@ -168,7 +168,7 @@ class TransformersEngine:
         except Exception as error:  # one request that cannot be decoded must not end the others
             tell(EngineError.because("decoding failed", error))
 
-    def _draw(self, asked: Asked, index: int) -> Iterator[Event]:
+    def _draw(self, asked: Prepared, index: int) -> Iterator[Event]:
         passes = 0
         for step in self._decoding.write(asked, index):
             passes += 1

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from clients.importers.comma2k19 import read_segments
 from clients.importers.recording import RecordingError
-from clients.importers.views import OneCamera
+from clients.importers.resampling import OneCamera
 from model.driving.cameras import FRONT_CAMERAS
 from model.driving.images import decode_image
 from model.driving.scene_store import read_scenes

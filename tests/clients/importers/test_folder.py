@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from clients.importers.folder import read_folder
 from clients.importers.recording import RecordingError
-from clients.importers.views import Source, as_seen, fov_of, grey_share
+from clients.importers.resampling import Source, as_seen, fov_of, grey_share
 from model.driving.cameras import FRONT_CAMERAS
 from model.driving.images import decode_image
 from model.driving.scene_store import read_scenes

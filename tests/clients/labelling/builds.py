@@ -55,7 +55,7 @@ def rolled_out(folder: Path, count: int) -> Run:
             scene = named(one, f"scene-{number:04d}")
             keys.append(key_of(run, scene))
             ledger.finish(run, keys[-1], scene.scene.scene_id, rollout_record())
-        ledger.keep(run, [(key, (0,)) for key in keys])
+        ledger.select(run, [(key, (0,)) for key in keys])
     return run
 
 

@@ -18,7 +18,7 @@ from clients.labelling.failures import (
 from clients.labelling.label import config_of, jobs, labeller, questions
 from clients.labelling.ledger import Ledger
 from clients.labelling.pipeline import Limits, work_through
-from clients.labelling.rollout import PATIENCE
+from clients.labelling.rollout import RETRY_POLICY
 from clients.labelling.rollout import jobs as rollout_jobs
 from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
 from clients.planner import AsyncPlannerClient
@@ -52,7 +52,7 @@ def fail_all(folder: Path, scenes: Path, service: str, teacher_url: str, key: st
         inference, sample = Inference(n=2), Sample(threshold=1.0)
         teacher = OpenAiTeacher(OpenAiSettings(f"{teacher_url}/v1", "some-vlm", key))
         with Ledger(folder) as ledger:
-            async with AsyncPlannerClient(service, PATIENCE) as planner:
+            async with AsyncPlannerClient(service, RETRY_POLICY) as planner:
                 (card, *_) = await planner.models()
                 model = ModelName(name=card.name, revision=card.revision)
                 inferred = ledger.run("inference", inference_config(model, inference))

@@ -92,7 +92,7 @@ def test_nothing_is_lost_and_nothing_is_paid_twice(tmp_path: Path) -> None:
             record = rollout_record()
             record["free"][0]["plan"] = str(own_plan(number))
             ledger.finish(rollout, keys[-1], scene.scene.scene_id, record)
-        ledger.keep(rollout, [(key, (0,)) for key in keys])
+        ledger.select(rollout, [(key, (0,)) for key in keys])
         label = ledger.run("label", config_of(rollout, OpenAiTeacher(OpenAiSettings("", "some-vlm")), 0))
         plan_of = {
             job.key: str(job.subject.question.predicted)

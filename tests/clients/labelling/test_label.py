@@ -12,7 +12,7 @@ from clients.labelling import outcomes
 from clients.labelling.batch import BatchError, batch_requests, read_results, take_results
 from clients.labelling.checks import FailedCheck
 from clients.labelling.export import DATASET, PARTS_FILE, reflections, right_plans, write_messages
-from clients.labelling.label import Asked, config_of, jobs, labeller, predicted_plans, questions
+from clients.labelling.label import LabelTask, config_of, jobs, labeller, predicted_plans, questions
 from clients.labelling.ledger import Entry, Ledger, LedgerError, Run
 from clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
 from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
@@ -82,7 +82,7 @@ def labelled(ledger: Ledger, file: Path, teacher: Teacher, *, plans: int = 1) ->
 def test_every_kept_scene_is_asked_about(ledger: Ledger, file: Path) -> None:
     rollout = ledger.the_run("rollout")
     kept = [entry.key for entry in ledger.entries(rollout)][:3]
-    ledger.keep(rollout, [(key, (0,)) for key in kept])
+    ledger.select(rollout, [(key, (0,)) for key in kept])
     run, tally = labelled(ledger, file, RuleTeacher())
     assert (tally.done, tally.dead) == (3, 0)
     assert {entry.record["rollout"] for entry in ledger.entries(run)} == set(kept)
@@ -254,7 +254,7 @@ def test_messages_are_what_trainers_read(ledger: Ledger, file: Path, tmp_path: P
 SETTINGS = OpenAiSettings("https://api.example/v1", "some-vlm", api_key="sk-secret")
 
 
-def in_batch(ledger: Ledger, file: Path) -> tuple[Run, list[Job[Asked]]]:
+def in_batch(ledger: Ledger, file: Path) -> tuple[Run, list[Job[LabelTask]]]:
     rollout = ledger.the_run("rollout")
     run = ledger.run("label", config_of(rollout, OpenAiTeacher(SETTINGS), 0))
     return run, list(jobs(run, questions(ledger, rollout, file)))

@@ -17,7 +17,7 @@ def test_what_is_entered_is_there_in_the_next_process(tmp_path: Path) -> None:
     with Ledger(tmp_path) as ledger:
         run = ledger.run("rollout", CONFIG)
         ledger.finish(run, "a", "scene a", {"x": [1.5]})
-        ledger.bury(run, "b", "scene b", "no", status=422)
+        ledger.dead_letter(run, "b", "scene b", "no", status=422)
     with Ledger(tmp_path) as ledger:
         assert ledger.run("rollout", CONFIG) == run == ledger.the_run("rollout")
         assert ledger.run("rollout", {**CONFIG, "seed": 1}).id != run.id
@@ -86,24 +86,28 @@ def test_what_is_kept_can_be_chosen_anew(tmp_path: Path) -> None:
         for key in "abc":
             ledger.finish(run, key, f"scene {key}", {"key": key})
         ledger.finish(other, "d", "scene d", {})
-        ledger.keep(run, [("a", [0]), ("b", [0])])
-        ledger.keep(other, [("d", [0])])
-        ledger.keep(run, [("b", [0, 2, 3]), ("c", [1])])
-        kept = {key: ledger.kept(key) for key in "abcd"}
+        ledger.select(run, [("a", [0]), ("b", [0])])
+        ledger.select(other, [("d", [0])])
+        ledger.select(run, [("b", [0, 2, 3]), ("c", [1])])
+        kept = {key: ledger.selected(key) for key in "abcd"}
         assert {key: found and found[1] for key, found in kept.items()} == {
             "a": None,
             "b": [0, 2, 3],
             "c": [1],
             "d": [0],
         }
-        assert (ledger.count_kept(run, 1), ledger.count_kept(run, 9), ledger.count_kept(other, 9)) == (
+        assert (
+            ledger.selected_draws(run, 1),
+            ledger.selected_draws(run, 9),
+            ledger.selected_draws(other, 9),
+        ) == (
             2,
             4,
             1,
         )
         with pytest.raises(sqlite3.IntegrityError):
-            ledger.keep(run, [("a", [0]), ("a", [0])])
-        assert ledger.count_kept(run, 1) == 2, "a choice that fails changes nothing"
+            ledger.select(run, [("a", [0]), ("a", [0])])
+        assert ledger.selected_draws(run, 1) == 2, "a choice that fails changes nothing"
 
 
 def test_dead_letters_are_written_and_can_be_tried_again(tmp_path: Path) -> None:
@@ -111,7 +115,7 @@ def test_dead_letters_are_written_and_can_be_tried_again(tmp_path: Path) -> None
         run = ledger.run("label", CONFIG)
         ledger.finish(run, "a", "scene a", {})
         ledger.answered(run, "b", 1, Answer("no"))
-        ledger.bury(run, "b", "scene b", "leaks", text="no")
+        ledger.dead_letter(run, "b", "scene b", "leaks", text="no")
         assert write_dead_letters(ledger, tmp_path) == 1
         (line,) = (tmp_path / LETTERS).read_text().splitlines()
         assert '"scene_id": "scene b"' in line
@@ -130,7 +134,7 @@ def test_what_a_helper_entered_is_taken_over_once(tmp_path: Path) -> None:
         helper.run("label", {})
         helper.finish(run, "a", "scene a", {"x": 1})
         helper.answered(run, "a", 1, Answer("yes", 10, 5))
-        helper.bury(run, "b", "scene b", "no")
+        helper.dead_letter(run, "b", "scene b", "no")
         for _ in range(2):
             ledger.take_over(run, helper.entered(run))
         assert (ledger.count(run), ledger.count(run, "dead")) == (1, 1)

@@ -60,7 +60,7 @@ def test_rolled_out_and_labelled_by_workers(scenes: Path, url: str, tmp_path: Pa
     with Ledger(tmp_path) as ledger:
         run = ledger.the_run("rollout")
         keys = [entry.key for entry in ledger.entries(run)][: EACH + 1]
-        ledger.keep(run, [(key, (0, 1)) for key in keys])
+        ledger.select(run, [(key, (0, 1)) for key in keys])
     done = build("label", tmp_path, scenes)
     assert (done["done"], done["dead"], done["answers"]) == (EACH + 1, 0, EACH + 1)
     with Ledger(tmp_path) as ledger:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from clients.labelling.crowd import Crowd
+from clients.labelling.concurrency import ConcurrencyLimit
 from clients.labelling.ledger import Ledger, Record
 from clients.labelling.pipeline import CannotBeDone, Job, Limits, StageStopped, Tally, work_through
-from clients.labelling.teachers.patience import TryLater
+from clients.labelling.retries import TryLater
 
 
 def jobs(count: int, first: int = 0) -> Iterator[Job[int]]:
@@ -151,16 +151,16 @@ def test_never_more_at_once_than_allowed(tmp_path: Path) -> None:
 
 def test_a_crowd_shrinks_once_for_calls_that_were_refused_together() -> None:
     async def go() -> tuple[int, int]:
-        crowd = Crowd(16)
+        concurrency = ConcurrencyLimit(16)
         for _ in range(200):
-            async with crowd.place():
+            async with concurrency.slot():
                 pass
-        full = crowd.allowed
+        full = concurrency.allowed
         gate = asyncio.Event()
 
         async def refused() -> None:
             try:
-                async with crowd.place():
+                async with concurrency.slot():
                     await gate.wait()
                     raise TryLater("busy")
             except TryLater:
@@ -171,6 +171,6 @@ def test_a_crowd_shrinks_once_for_calls_that_were_refused_together() -> None:
         await asyncio.sleep(0)
         gate.set()
         await asyncio.gather(*together)
-        return full, crowd.allowed
+        return full, concurrency.allowed
 
     assert asyncio.run(go()) == (16, 8)

@@ -14,7 +14,7 @@ from fastapi import FastAPI
 from clients.labelling.ledger import Ledger, Run
 from clients.labelling.pipeline import Limits, StageStopped, Tally, work_through
 from clients.labelling.rollout import (
-    PATIENCE,
+    RETRY_POLICY,
     Sampling,
     config_of,
     jobs,
@@ -54,7 +54,7 @@ def rolled(url: str, file: Path, folder: Path) -> tuple[Run, Tally]:
     model, chosen = MODEL, Sampling(n=2)
 
     async def go() -> tuple[Run, Tally]:
-        async with AsyncPlannerClient(url, PATIENCE) as planner:
+        async with AsyncPlannerClient(url, RETRY_POLICY) as planner:
             with Ledger(folder) as ledger:
                 run = ledger.run("rollout", config_of(model, chosen))
                 found = jobs(run, file, lambda _: None)
@@ -120,7 +120,7 @@ def test_a_service_that_restarts_in_the_middle_is_waited_for(tmp_path: Path) -> 
     slow = ScriptedEngine()
 
     async def go() -> Tally:
-        async with AsyncPlannerClient(f"http://127.0.0.1:{port}", PATIENCE) as planner:
+        async with AsyncPlannerClient(f"http://127.0.0.1:{port}", RETRY_POLICY) as planner:
             with Ledger(folder) as ledger:
                 run = ledger.run("rollout", config_of(MODEL, Sampling(n=2)))
                 work = asyncio.create_task(

@@ -15,8 +15,8 @@ from clients.metadrive.drive_table import driver_rows, format_table, to_json
 from clients.metadrive.episode import make_world, run_episode
 from clients.metadrive.episode_log import EpisodeLog
 from clients.metadrive.film import IMAGINED, Film
-from clients.metadrive.kept_drives import KeptDrives
 from clients.metadrive.pilots import ConstantVelocity, Planned, ServicePilot
+from clients.metadrive.result_store import drive_store
 from clients.metadrive.rig import Rig
 from clients.metadrive.tracking import FreeVehicle, world_trajectory
 from clients.planner import PlannerClient
@@ -218,14 +218,14 @@ def test_a_run_that_was_cut_goes_on_behind_what_is_kept(tmp_path: Path) -> None:
     file = tmp_path / "drives.jsonl"
     whole = Drive(1, "time", 200.0, False, 3.0, 1.0)
     half = Drive(2, "collision", 100.0, True, 5.0, 2.0, 10, 0.2, 1, 250.0)
-    kept = KeptDrives(file)
-    kept.keep("a", whole)
-    kept.keep("b", half)
+    stored = drive_store(file)
+    stored.store("a", whole)
+    stored.store("b", half)
     text = file.read_text()
     file.write_text(text[:-20])  # killed while it wrote
-    again = KeptDrives(file)
+    again = drive_store(file)
     assert again.find("a") == whole
     assert again.find("b") is None
-    again.keep("b", half)
+    again.store("b", half)
     assert file.read_text() == text
-    assert KeptDrives(file).find("b") == half
+    assert drive_store(file).find("b") == half

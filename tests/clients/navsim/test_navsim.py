@@ -13,7 +13,7 @@ from clients import wire
 from clients.navsim.agent import NavsimMissing, NavsimPlanner, make_agent
 from clients.navsim.history import history_of
 from clients.navsim.inputs import InputError
-from clients.navsim.views import seen_as
+from clients.navsim.reprojection import seen_as
 from clients.planner import PlannerClient
 from model.driving.cameras import FRONT_CAMERAS
 from model.driving.images import check_image

@@ -11,7 +11,7 @@ import torch
 
 from model.driving.scene import Clip, Scene
 from model.engines.torch.clips import ClipCache
-from model.engines.torch.runner import Asked, Runner
+from model.engines.torch.runner import PromptRequest, Runner
 from model.network.checkpoint import load
 from tests.checkpoints import noisy_scene
 
@@ -48,7 +48,7 @@ def test_pictures_seen_lately_are_not_encoded_again(
     with torch.inference_mode():
         runner = Runner(loaded, 2, clip_bytes=1 << 24, reuse=reuse)
         scene = noisy_scene()
-        runner.begin_prompts([Asked(scene, "cf_vla", 0)])
+        runner.begin_prompts([PromptRequest(scene, "cf_vla", 0)])
         slices, vision = [], loaded.model.vision
 
         def looking(pixels: Any, grid: Any, tower: Any) -> Any:
@@ -56,7 +56,7 @@ def test_pictures_seen_lately_are_not_encoded_again(
             return vision(pixels, grid, tower)
 
         monkeypatch.setattr(loaded.model, "vision", looking)
-        runner.begin_prompts([Asked(shown(scene), "cf_vla", 1)])
+        runner.begin_prompts([PromptRequest(shown(scene), "cf_vla", 1)])
     assert len(slices) == encoded
 
 

@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from clients.labelling.ledger import Run
-from clients.labelling.teachers.patience import TryLater, patiently
+from clients.labelling.retries import TryLater, with_retries
 from model.bundled import CHECKPOINT, SCENES
 from model.driving.phrases import agrees, read_facts
 from model.driving.reflection_store import read_reflections, write_reflections
@@ -275,7 +275,7 @@ def test_waiting_is_told_beside_the_bar_alone(capsys: pytest.CaptureFixture[str]
         return "done"
 
     with progress_bar(Run("id", "rollout", {}), 1, quiet=False):
-        assert asyncio.run(patiently(answer, 10.0)) == "done"
+        assert asyncio.run(with_retries(answer, 10.0)) == "done"
     told = capsys.readouterr()
     assert told.out == ""
     assert "waiting: busy" in told.err

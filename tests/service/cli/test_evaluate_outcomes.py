@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from clients.metadrive.kept_outcomes import KeptOutcomes
+from clients.metadrive.result_store import outcome_store
 from model.bundled import SCENES
 from service.cli import outcomes
 from service.cli.commands import app
@@ -59,7 +59,7 @@ def test_what_second_looks_bring(generated: Path, tmp_path: Path, monkeypatch: p
     file.write_text(whole[:-20])
     assert told(*asked, "--think-threshold", 0) == first
     assert sorted(file.read_text().splitlines()) == sorted(whole.splitlines())
-    assert KeptOutcomes(file).find("another") is None
+    assert outcome_store(file).find("another") is None
 
     # Whoever never takes a second look has none to be judged by; the first plans are the same.
     never = told(*asked, "--think-threshold", 1)[0]

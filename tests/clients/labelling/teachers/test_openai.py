@@ -16,9 +16,9 @@ from starlette.responses import StreamingResponse
 from starlette.types import ASGIApp
 
 from clients.labelling.checks import FailedCheck, check_reflection
+from clients.labelling.retries import with_retries
 from clients.labelling.teachers.facts import phrases_of
 from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
-from clients.labelling.teachers.patience import patiently
 from clients.labelling.teachers.teacher import (
     Answer,
     Question,
@@ -223,7 +223,7 @@ def test_who_asks_to_be_asked_again_at_once_is_not() -> None:
     async def asking(url: str) -> None:
         teacher = OpenAiTeacher(OpenAiSettings(f"{url}/v1", "some-vlm"))
         try:
-            await patiently(lambda: ask(teacher, QUESTION, []), 2.0)
+            await with_retries(lambda: ask(teacher, QUESTION, []), 2.0)
         finally:
             await teacher.close()
 

@@ -11,7 +11,7 @@ import pytest
 from model.driving.perceived import Perceived, PerceivedAgent
 from model.driving.plan import parse_plan
 from model.engines.engine import Controls, Draw, DrawFinished, Engine, EngineError, Event, PlanRequest
-from model.evaluation.kept import KeptDraws
+from model.evaluation.draw_store import DrawStore
 from model.families.family import Attempt, Foreseen, NextPicture
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import FakeEngine, draw_of
@@ -46,8 +46,8 @@ def same(some: Sequence[Draw], others: Sequence[Draw]) -> None:
 
 def test_what_was_asked_before_is_not_asked_again(tmp_path: Path) -> None:
     file, first, again = tmp_path / "kept" / "draws.sqlite", FakeEngine(), FakeEngine()
-    [made] = ask(KeptDraws(first, file), ASKED)
-    [found] = ask(KeptDraws(again, file), replace(ASKED, request_id="by another name"))
+    [made] = ask(DrawStore(first, file), ASKED)
+    [found] = ask(DrawStore(again, file), replace(ASKED, request_id="by another name"))
     assert (len(first.requests), len(again.requests)) == (1, 0)
     assert len(made) == 3
     same(found, made)
@@ -67,8 +67,8 @@ def test_draws_come_back_whole(tmp_path: Path) -> None:
             yield DrawFinished(whole)
 
     asked, file = replace(ASKED, controls=Controls(n=1)), tmp_path / "draws.sqlite"
-    ask(KeptDraws(One(), file), asked)
-    [found] = ask(KeptDraws(FakeEngine(), file), asked)
+    ask(DrawStore(One(), file), asked)
+    [found] = ask(DrawStore(FakeEngine(), file), asked)
     same(found, [whole])
 
 
@@ -84,22 +84,22 @@ def test_anything_else_is_asked(tmp_path: Path) -> None:
         replace(ASKED, scene=replace(SCENE, clips=(other_pictures, *SCENE.clips[1:]))),
         replace(ASKED, scene=replace(SCENE, route=np.full((20, 2), np.arange(20)[:, None], np.float32))),
     ]
-    ask(KeptDraws(engine, tmp_path / "draws.sqlite"), ASKED, *others)
+    ask(DrawStore(engine, tmp_path / "draws.sqlite"), ASKED, *others)
     assert len(engine.requests) == 1 + len(others)
 
 
 def test_what_did_not_come_to_its_end_is_asked_again(tmp_path: Path) -> None:
     file, engine = tmp_path / "draws.sqlite", FakeEngine(missing=1)
-    ask(KeptDraws(engine, file), ASKED)
+    ask(DrawStore(engine, file), ASKED)
     with pytest.raises(EngineError):
-        ask(KeptDraws(FakeEngine(broken=frozenset({SCENE.scene_id})), file), ASKED)
+        ask(DrawStore(FakeEngine(broken=frozenset({SCENE.scene_id})), file), ASKED)
     whole = FakeEngine()
-    ask(KeptDraws(whole, file), ASKED)
+    ask(DrawStore(whole, file), ASKED)
     assert len(whole.requests) == 1
 
 
 def test_another_file_is_left_alone(tmp_path: Path) -> None:
     (file := tmp_path / "draws.sqlite").write_text("a letter to somebody")
     with pytest.raises(ValueError, match="name another file"):
-        ask(KeptDraws(FakeEngine(), file), ASKED)
+        ask(DrawStore(FakeEngine(), file), ASKED)
     assert file.read_text() == "a letter to somebody"

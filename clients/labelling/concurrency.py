@@ -6,10 +6,10 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from clients.labelling.teachers.patience import TryLater
+from clients.labelling.retries import TryLater
 
 
-class Crowd:
+class ConcurrencyLimit:
     """So many calls at once: one more for every so many that succeed, half as many when it was too much.
 
     Additive increase, multiplicative decrease, as TCP does it; calls that were under way together count as
@@ -31,7 +31,7 @@ class Crowd:
         return max(1, int(self._allowed))
 
     @asynccontextmanager
-    async def place(self) -> AsyncIterator[None]:
+    async def slot(self) -> AsyncIterator[None]:
         """Wait for a place; a block that ends in `TryLater` shows that there are too many."""
         async with self._room:
             await self._room.wait_for(lambda: self._inside < self.allowed)

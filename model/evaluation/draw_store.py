@@ -26,7 +26,7 @@ _SCHEMA_VERSION: Final = 4
 _TUPLES: Final = ("codes", "times_s", "ids", "logprobs", "action")
 
 
-class KeptDraws:
+class DrawStore:
     """An `Engine` in front of another, which is asked only what it has not answered before.
 
     The draws of a request are kept when the last of them has come; told by the model's revision, the scene

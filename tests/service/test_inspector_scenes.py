@@ -14,10 +14,10 @@ import pytest
 
 from model.driving.scene import NextFrame
 from model.driving.scene_store import write_scenes
-from service import scene_files, views
+from service import inspector_scenes, scene_files
+from service.inspector_scenes import BundledScenes, scenes_of_file, view
 from service.problems import ProblemError
 from service.settings import Settings
-from service.views import BundledScenes, scenes_of_file, view
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, serve
@@ -135,7 +135,7 @@ def test_another_parquet_file_says_so(served: Served, scene_file: Path) -> None:
 
 
 def test_a_file_that_would_fill_the_memory(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(views, "MAX_UNPACKED_BYTES", 1000)
+    monkeypatch.setattr(inspector_scenes, "MAX_UNPACKED_BYTES", 1000)
     with pytest.raises(ProblemError, match="the file would unpack to"):
         scenes_of_file(scene_file)
 
@@ -143,9 +143,9 @@ def test_a_file_that_would_fill_the_memory(scene_file: Path, monkeypatch: pytest
 def test_a_file_with_too_many_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "many.parquet"
     write_scenes(path, (labelled(str(number)) for number in range(4)))
-    monkeypatch.setattr(views, "MAX_SCENES_SHOWN", 3)
+    monkeypatch.setattr(inspector_scenes, "MAX_SCENES_SHOWN", 3)
     assert len(scenes_of_file(path)) == 3
-    monkeypatch.setattr(views, "MAX_SCENES_IN_FILE", 3)
+    monkeypatch.setattr(inspector_scenes, "MAX_SCENES_IN_FILE", 3)
     with pytest.raises(ProblemError, match="more than 3 scenes"):
         scenes_of_file(path)
 

@@ -28,7 +28,7 @@ _COMPOSED: Final = -1.5
 """m/s²: while it must brake harder than this after a lapse, it does not change lanes."""
 
 
-class Lapses:
+class LateBraking:
     """Keeps one vehicle from braking in time, by a chance of its own."""
 
     def __init__(self, seed: int) -> None:

@@ -18,7 +18,7 @@ from service.settings import Settings
 
 
 @dataclass(frozen=True)
-class Parts:
+class Dependencies:
     """See the modules they come from.
 
     Attributes:

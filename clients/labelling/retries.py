@@ -25,7 +25,7 @@ class TryLater(Exception):
         self.wait_s = wait_s
 
 
-async def patiently(call: Callable[[], Awaitable[_Result]], give_up_after_s: float) -> _Result:
+async def with_retries(call: Callable[[], Awaitable[_Result]], give_up_after_s: float) -> _Result:
     """What a call gives in the end; it is made again, ever later, while it ends in `TryLater`.
 
     Raises:
