@@ -23,7 +23,7 @@ MULTI_ROUND: Final = "multi-round"
 COUNTERFACTUAL: Final = "counterfactual"
 ROUND_2: Final = "round-2"
 WHOLE_DATASET: Final = "whole-dataset"
-RUNGS: Final = (META_ACT, MULTI_ROUND, WHOLE_DATASET, COUNTERFACTUAL, ROUND_2)
+LADDER: Final = (META_ACT, MULTI_ROUND, WHOLE_DATASET, COUNTERFACTUAL, ROUND_2)
 """Checkpoints of a ladder, by the folder that each lies in."""
 
 TEMPERATURES: Final = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)
@@ -35,11 +35,11 @@ GROUPS: Final = 10
 Results = Mapping[Variant, Sequence[SceneResult]]
 
 
-def rung_variants(rung: str, controls: Controls, *, route: bool) -> list[Variant]:
+def ladder_variants(entry: str, controls: Controls, *, route: bool) -> list[Variant]:
     """The rows of one checkpoint of the ladder, without or with the route.
 
     Args:
-        rung: one of `RUNGS`.
+        entry: one of `LADDER`.
         controls: of the adaptive rows; the others differ in ``thinking`` alone.
         route: whether it is given.
     """
@@ -49,39 +49,39 @@ def rung_variants(rung: str, controls: Controls, *, route: bool) -> list[Variant
         given = replace(controls, thinking=thinking, think_threshold=threshold)
         return Variant(f"{name}{' + route' if route else ''}", "cf_vla", given, route, **changes)
 
-    if rung == META_ACT:
+    if entry == META_ACT:
         return [
             replace(variant("traj-only"), format="traj_only"),
             variant(META_ACT),
             variant(f"{META_ACT}, expert plan", expert_plan=True),
         ]
-    if rung == MULTI_ROUND:
+    if entry == MULTI_ROUND:
         return [variant(f"{META_ACT}, {MULTI_ROUND}")]
     return [
-        variant(f"{rung}, adaptive", thinking="adaptive"),
-        variant(f"{rung}, never thinks"),
-        variant(f"{rung}, always thinks", thinking="always"),
+        variant(f"{entry}, adaptive", thinking="adaptive"),
+        variant(f"{entry}, never thinks"),
+        variant(f"{entry}, always thinks", thinking="always"),
     ]
 
 
-def temperature_variants(rung: str, controls: Controls) -> list[Variant]:
+def temperature_variants(entry: str, controls: Controls) -> list[Variant]:
     """Figure 8's temperatures; without the route."""
     return [
-        Variant(f"{rung}, temperature {value:g}", "cf_vla", replace(controls, temperature=value))
+        Variant(f"{entry}, temperature {value:g}", "cf_vla", replace(controls, temperature=value))
         for value in TEMPERATURES
     ]
 
 
-def threshold_variants(rung: str, controls: Controls) -> list[Variant]:
+def threshold_variants(entry: str, controls: Controls) -> list[Variant]:
     """Think thresholds from often to seldom; without the route."""
     return [
-        Variant(f"{rung}, threshold {value:g}", "cf_vla", replace(controls, think_threshold=value))
+        Variant(f"{entry}, threshold {value:g}", "cf_vla", replace(controls, think_threshold=value))
         for value in THRESHOLDS
     ]
 
 
 def threshold_results(
-    rung: str,
+    entry: str,
     variants: Sequence[Variant],
     scenes: Sequence[LabelledScene],
     draws: Mapping[tuple[str, str], Sequence[Draw]],
@@ -89,10 +89,10 @@ def threshold_results(
     """Results at think thresholds, without planning anew.
 
     Args:
-        rung: one of `RUNGS`.
+        entry: one of `LADDER`.
         variants: which have a ``think_threshold``.
         scenes: that were planned for.
-        draws: of the rung's rows that never and that always think, by the row's name and the scene's.
+        draws: of the entry's rows that never and that always think, by the row's name and the scene's.
     """
     results: dict[Variant, list[SceneResult]] = {}
     for variant in variants:
@@ -101,7 +101,7 @@ def threshold_results(
         found = results[variant] = []
         for labelled in scenes:
             name = labelled.scene.scene_id
-            never, always = (draws[f"{rung}, {way} thinks{route}", name] for way in ("never", "always"))
+            never, always = (draws[f"{entry}, {way} thinks{route}", name] for way in ("never", "always"))
             found.append(evaluate_draws(labelled, at_threshold(never, always, threshold)))
     return results
 
@@ -211,8 +211,8 @@ def ladder_report(results: Results) -> LadderReport:
             one, other = (f"{side}{route}" for side in name)
             if one in of and other in of:
                 comparisons.append(compare(f"{one} : {other}", of[one], of[other], measure))
-        for rung in RUNGS:
-            adaptive, never = f"{rung}, adaptive{route}", f"{rung}, never thinks{route}"
+        for entry in LADDER:
+            adaptive, never = f"{entry}, adaptive{route}", f"{entry}, never thinks{route}"
             if adaptive in of and never in of:
                 difficulty[adaptive] = by_difficulty(of[adaptive], of[never])
             if adaptive in of and any(result.thought_iou_first is not None for result in of[adaptive]):
@@ -242,13 +242,13 @@ _COMPARED: Final = (
     ((f"{META_ACT}, expert plan", META_ACT), "min_ade_m"),
     *(((f"{META_ACT}, {MULTI_ROUND}", META_ACT), measure) for measure in _MEASURES),
     *(
-        ((f"{rung}, adaptive", other), measure)
-        for rung in (COUNTERFACTUAL, ROUND_2)
+        ((f"{entry}, adaptive", other), measure)
+        for entry in (COUNTERFACTUAL, ROUND_2)
         for other, measure in (
             *((META_ACT, measure) for measure in _MEASURES),
             *((f"{META_ACT}, {MULTI_ROUND}", measure) for measure in _MEASURES),
-            (f"{rung}, never thinks", "min_ade_m"),
-            (f"{rung}, always thinks", "min_ade_m"),
+            (f"{entry}, never thinks", "min_ade_m"),
+            (f"{entry}, always thinks", "min_ade_m"),
             *((f"{WHOLE_DATASET}, adaptive", measure) for measure in _MEASURES),
         )
     ),

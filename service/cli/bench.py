@@ -87,9 +87,9 @@ def engine(
         steps: list[Row] = []
         ladder = tuple(load for load in loads if load.n > 1 and load.thinking == "adaptive")
         if shortcuts and ladder and "torch" in names:
-            rungs = _ladder(device)
+            entries = _ladder(device)
             # On a GPU one after the other: large models do not fit side by side.
-            for together in [rungs] if device == "cpu" else [(each,) for each in rungs]:
+            for together in [entries] if device == "cpu" else [(each,) for each in entries]:
                 steps += run(Job(together, ladder, checkpoint, scenes, repeats, device), tell)
         planners = [run_planner(job, _whole(n)) for n in draws.split(",") if "torch" in names]
         rooflines = _rooflines(rows, checkpoint, device)

@@ -263,12 +263,12 @@ def _ladder(
     from model.evaluation import ladder_plots
     from model.evaluation.ladder import (
         COUNTERFACTUAL,
+        LADDER,
         ROUND_2,
-        RUNGS,
         TEMPERATURES,
         THRESHOLDS,
         ladder_report,
-        rung_variants,
+        ladder_variants,
         temperature_variants,
         threshold_results,
         threshold_variants,
@@ -276,29 +276,31 @@ def _ladder(
     )
     from model.evaluation.report import evaluate_variants
 
-    rungs = {} if folder is None else {rung: folder / rung for rung in RUNGS if (folder / rung).is_dir()}
-    rungs.setdefault(COUNTERFACTUAL, checkpoint)
-    shown = ROUND_2 if ROUND_2 in rungs else COUNTERFACTUAL
+    entries = (
+        {} if folder is None else {entry: folder / entry for entry in LADDER if (folder / entry).is_dir()}
+    )
+    entries.setdefault(COUNTERFACTUAL, checkpoint)
+    shown = ROUND_2 if ROUND_2 in entries else COUNTERFACTUAL
     results: dict[Variant, list[SceneResult]] = {}
-    for rung, path in rungs.items():
+    for entry, path in entries.items():
         draws: dict[tuple[str, str], Sequence[Draw]] = {}
 
         def keep(variant: Variant, labelled: LabelledScene, of: Sequence[Draw], draws: Any = draws) -> None:
             draws[variant.name, labelled.scene.scene_id] = of
 
-        variants = [each for route in (False, True) for each in rung_variants(rung, controls, route=route)]
+        variants = [each for route in (False, True) for each in ladder_variants(entry, controls, route=route)]
         derived = [each for each in variants if each.controls.think_threshold is not None]
         planned = [each for each in variants if each not in derived]
         evaluate = partial(evaluate_variants, on_draws=keep)
         found = asyncio.run(
             run_started(evaluate, scenes, engine_of(path), planned, controls.n, rows, quiet=quiet)
         )
-        found |= threshold_results(rung, derived, scenes, draws)
+        found |= threshold_results(entry, derived, scenes, draws)
         results |= {variant: found[variant] for variant in variants}
-        if rung == shown:
-            results |= threshold_results(rung, threshold_variants(rung, controls), scenes, draws)
+        if entry == shown:
+            results |= threshold_results(entry, threshold_variants(entry, controls), scenes, draws)
             swept = list(evenly(scenes, len(scenes), sweep))
-            variants = temperature_variants(rung, controls)
+            variants = temperature_variants(entry, controls)
             run = run_started(
                 evaluate_variants, swept, engine_of(path), variants, controls.n, rows, quiet=quiet
             )

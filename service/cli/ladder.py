@@ -19,15 +19,15 @@ _CHECKPOINT_FILE: Final = "looktwice.json"
 
 
 @dataclass(frozen=True)
-class Rung:
+class LadderEntry:
     """One checkpoint of the ladder.
 
     Attributes:
         name: its folder.
         recipe: that makes it.
-        source: the rung that it is trained from.
+        source: the entry that it is trained from.
         build: the build whose reflections it learns from; empty below them.
-        vision: the rung whose vision tower it takes; empty for that of its source.
+        vision: the entry whose vision tower it takes; empty for that of its source.
     """
 
     name: str
@@ -39,11 +39,11 @@ class Rung:
 
 @dataclass(frozen=True)
 class Build:
-    """A data set of the ladder: which rung is rolled out, what is kept to be labelled, what is added to be
+    """A data set of the ladder: which entry is rolled out, what is kept to be labelled, what is added to be
     acted on."""
 
     name: str
-    rung: str
+    entry: str
     keep: tuple[str, ...]
     right: tuple[str, ...] = ()
 
@@ -60,19 +60,19 @@ _BUILDS: Final = {
 }
 _UNTRAINED: Final = "untrained"
 _GROUNDWORK: Final = (
-    Rung("tracks", "read-tracks", _UNTRAINED),
-    Rung("language", "language", "tracks"),
-    Rung("ground", "ground", _UNTRAINED),
-    Rung("scene", "read-scene", "language", vision="ground"),
-    Rung(META_ACT, "meta-act", "scene"),
+    LadderEntry("tracks", "read-tracks", _UNTRAINED),
+    LadderEntry("language", "language", "tracks"),
+    LadderEntry("ground", "ground", _UNTRAINED),
+    LadderEntry("scene", "read-scene", "language", vision="ground"),
+    LadderEntry(META_ACT, "meta-act", "scene"),
 )
 _OF_RECIPES: Final = frozenset(("--learning-rate", "--vision-rate"))
-"""Options that are meant for the rungs above `META_ACT`: below it every recipe has its own."""
-_RUNGS: Final = (
-    Rung(COUNTERFACTUAL, "counterfactual", META_ACT, "round-1"),
-    Rung(MULTI_ROUND, "multi-round", META_ACT, "round-1"),
-    Rung(WHOLE_DATASET, "counterfactual", META_ACT, "whole"),
-    Rung(ROUND_2, "counterfactual", COUNTERFACTUAL, "round-2"),
+"""Options that are meant for the entries above `META_ACT`: below it every recipe has its own."""
+_LADDER: Final = (
+    LadderEntry(COUNTERFACTUAL, "counterfactual", META_ACT, "round-1"),
+    LadderEntry(MULTI_ROUND, "multi-round", META_ACT, "round-1"),
+    LadderEntry(WHOLE_DATASET, "counterfactual", META_ACT, "whole"),
+    LadderEntry(ROUND_2, "counterfactual", COUNTERFACTUAL, "round-2"),
 )
 _PLANS_PER_SCENE: Final = 6
 _ROWS: Final = 96
@@ -98,7 +98,7 @@ def climb(
         folder: where builds, checkpoints and plots go.
         scenes, test: to train on and to test on.
         meta_act: a checkpoint that writes meta-actions, to begin with; None to train that as well.
-        training: options of `looktwice train` for every rung, in pairs or alone.
+        training: options of `looktwice train` for every entry, in pairs or alone.
         every: so many-th scene is rolled out.
         processes: that train together.
 
@@ -115,14 +115,14 @@ def climb(
                 ["train", "create", "--to", str(folder / _UNTRAINED), "--scenes", str(scenes), *training],
             )
         own = _without(training, _OF_RECIPES)
-        for rung in _GROUNDWORK:
-            vision = ["--vision-from", str(folder / rung.vision)] if rung.vision else []
-            _train(rung, folder, scenes, [*vision, *own], processes)
-    for rung in _RUNGS:
-        reflections = folder / f"{rung.build}.parquet"
-        if not reflections.exists() and not _is_there(folder / rung.name):
-            _make(_BUILDS[rung.build], folder, scenes, every, reflections)
-        _train(rung, folder, scenes, ["--reflections", str(reflections), *training], processes)
+        for entry in _GROUNDWORK:
+            vision = ["--vision-from", str(folder / entry.vision)] if entry.vision else []
+            _train(entry, folder, scenes, [*vision, *own], processes)
+    for entry in _LADDER:
+        reflections = folder / f"{entry.build}.parquet"
+        if not reflections.exists() and not _is_there(folder / entry.name):
+            _make(_BUILDS[entry.build], folder, scenes, every, reflections)
+        _train(entry, folder, scenes, ["--reflections", str(reflections), *training], processes)
     _run(
         _LOOKTWICE,
         ["evaluate", "--preset", "ladder", "--checkpoint", str(folder / COUNTERFACTUAL)],
@@ -135,14 +135,14 @@ def _is_there(checkpoint: Path) -> bool:
     return (checkpoint / _CHECKPOINT_FILE).exists()
 
 
-def _train(rung: Rung, folder: Path, scenes: Path, options: Sequence[str], processes: int) -> None:
-    """Train one rung, unless it is there."""
-    if _is_there(folder / rung.name):
+def _train(entry: LadderEntry, folder: Path, scenes: Path, options: Sequence[str], processes: int) -> None:
+    """Train one entry, unless it is there."""
+    if _is_there(folder / entry.name):
         return
     _run(
         [sys.executable, "-m", "torch.distributed.run", "--standalone"],
-        ["--nproc-per-node", str(processes), "-m", "service.cli", "train", rung.recipe],
-        ["--from", str(folder / rung.source), "--to", str(folder / rung.name)],
+        ["--nproc-per-node", str(processes), "-m", "service.cli", "train", entry.recipe],
+        ["--from", str(folder / entry.source), "--to", str(folder / entry.name)],
         ["--scenes", str(scenes), *options],
     )
 
@@ -157,7 +157,7 @@ def _make(build: Build, folder: Path, scenes: Path, every: int, reflections: Pat
     """Everything from a checkpoint to a file of reflections on its plans."""
     place = str(folder / f"build-{build.name}")
     # Nobody waits for an answer here: the more at once the better.
-    options = ["--checkpoint", str(folder / build.rung), "--rows", str(_ROWS)]
+    options = ["--checkpoint", str(folder / build.entry), "--rows", str(_ROWS)]
     with served(options, {"LOOKTWICE_MAX_DRAWS": str(_ROWS)}) as (_, url):
         _run(
             _LOOKTWICE,

@@ -32,8 +32,7 @@ from model.training.batches import Item, ResponseDataset
 from model.training.examples import Examples
 from model.training.targets import make_target
 from service.metrics import Metrics
-from service.planning import Judged
-from service.planning import SceneEvent as Happened
+from service.planning import Judged, SceneEvent
 from service.settings import Settings
 from service.streaming import told_events
 from service.telling import PlanTeller
@@ -122,14 +121,14 @@ def test_it_plans_over_http_and_is_evaluated(checkpoint: Path) -> None:
 
 def test_it_is_streamed_in_the_words_of_the_wire(toy: Loaded) -> None:
     [draw] = planned(toy, n=1, thinking="always")
-    happened: list[Happened] = [
+    happened: list[SceneEvent] = [
         TextWritten(0, "why", "It"),
         SectionFinished(0, "why", " It rains.\n", ("It rains.",)),
         Judged(draw, agreement(None, "It rains.", None, draw.trajectory, noisy_scene(1).history)),
     ]
 
     async def told() -> list[Any]:
-        async def events() -> AsyncGenerator[Happened]:
+        async def events() -> AsyncGenerator[SceneEvent]:
             for event in happened:
                 yield event
 

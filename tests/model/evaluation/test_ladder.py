@@ -13,15 +13,15 @@ from model.driving.plan import parse_plan
 from model.engines.engine import Controls
 from model.evaluation.ladder import (
     COUNTERFACTUAL,
+    LADDER,
     META_ACT,
-    RUNGS,
     TEMPERATURES,
     THRESHOLDS,
     at_threshold,
     by_difficulty,
     hard_to_easy,
     ladder_report,
-    rung_variants,
+    ladder_variants,
     temperature_variants,
     threshold_results,
     threshold_variants,
@@ -45,14 +45,16 @@ def result(scene: int, error_m: float, think_rate: float | None = None, **more: 
 
 
 def test_a_rung_has_its_rows_with_and_without_the_route() -> None:
-    names = {rung: [each.name for each in rung_variants(rung, Controls(n=6), route=True)] for rung in RUNGS}
+    names = {
+        entry: [each.name for each in ladder_variants(entry, Controls(n=6), route=True)] for entry in LADDER
+    }
     assert names[META_ACT] == [
         "traj-only + route",
         "meta-act + route",
         "meta-act, expert plan + route",
     ]
     asked = [
-        each.controls for each in rung_variants(COUNTERFACTUAL, Controls(think_threshold=0.3), route=False)
+        each.controls for each in ladder_variants(COUNTERFACTUAL, Controls(think_threshold=0.3), route=False)
     ]
     assert [(each.thinking, each.think_threshold) for each in asked] == [
         ("adaptive", 0.3),
@@ -79,8 +81,8 @@ def test_difficulty_is_told_by_the_error_without_thinking() -> None:
 def test_the_ladder_compares_what_the_paper_compares() -> None:
     results = {
         each: [result(scene, 2.0, 0.2) for scene in range(40)]
-        for rung in (META_ACT, COUNTERFACTUAL)
-        for each in rung_variants(rung, Controls(n=6), route=False)
+        for entry in (META_ACT, COUNTERFACTUAL)
+        for each in ladder_variants(entry, Controls(n=6), route=False)
     }
     for variant, of in results.items():
         factor = {"counterfactual, adaptive": 0.9, "traj-only": 1.2}.get(variant.name, 1.0)
@@ -125,7 +127,7 @@ def test_thresholds_choose_between_the_two_ways() -> None:
     assert [variant.controls.think_threshold for variant in found] == list(THRESHOLDS)
     rates = [result.think_rate for [result] in found.values()]
     assert rates == [0.5 * (value < 0.35) + 0.5 * (value < 0.05) for value in THRESHOLDS]
-    [routed, *_] = rung_variants("round-2", Controls(think_threshold=0.1), route=True)
+    [routed, *_] = ladder_variants("round-2", Controls(think_threshold=0.1), route=True)
     draws = {(f"{row} + route", name): of for (row, name), of in draws.items()}
     assert [of.think_rate for of in threshold_results("round-2", [routed], [labelled], draws)[routed]] == [
         0.5

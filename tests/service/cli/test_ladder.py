@@ -64,7 +64,7 @@ def trained(commands: list[list[str]]) -> list[tuple[str, str, str]]:
     ]
 
 
-RUNGS = [
+LADDER = [
     ("counterfactual", "meta-act", "counterfactual"),
     ("multi-round", "meta-act", "multi-round"),
     ("counterfactual", "meta-act", "whole-dataset"),
@@ -80,7 +80,7 @@ def test_it_begins_with_nothing_but_scenes(commands: list[list[str]], tmp_path: 
         ("ground", "untrained", "ground"),
         ("read-scene", "language", "scene"),
         ("meta-act", "scene", "meta-act"),
-        *RUNGS,
+        *LADDER,
     ]
     of_rung = {command[command.index("train") + 1]: command for command in commands if "train" in command}
     assert of_rung["read-scene"][of_rung["read-scene"].index("--vision-from") + 1].endswith("ladder/ground")
@@ -95,7 +95,7 @@ def test_it_begins_with_a_checkpoint_and_goes_on_where_it_was(
 ) -> None:
     folder = tmp_path / "ladder"
     climbed(folder, "--from", str(untrained_checkpoint))
-    assert trained(commands) == RUNGS
+    assert trained(commands) == LADDER
     commands.clear()
     climbed(folder, "--from", str(untrained_checkpoint))
     assert [command[3] for command in commands] == ["evaluate"], "only the table is told again"
