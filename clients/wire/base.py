@@ -105,4 +105,4 @@ class ModelName(ResponseModel):
     """Which weights answered."""
 
     name: str
-    revision: str = Field(description="Changes with the weights.")
+    revision: str = Field(description="Changes with the weights, the codec and the codes of pictures.")

@@ -14,7 +14,7 @@ class ModelCard(ResponseModel):
     """What a loaded checkpoint is."""
 
     name: str
-    revision: str = Field(description="Changes with the weights.")
+    revision: str = Field(description="Changes with the weights, the codec and the codes of pictures.")
     engine: str = Field(description="torch or vllm.")
     formats: list[str] = Field(description="Response formats it writes.")
     refines: list[str] = Field(

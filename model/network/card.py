@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from model.network.codec import CODEC_FILE
 from model.network.settings import VlaSettings
 
 CARD_FILE: Final = "looktwice.json"
@@ -19,7 +20,7 @@ class CheckpointError(ValueError):
 
 
 def write_card(folder: Path, settings: VlaSettings, parameters: int, details: Mapping[str, Any]) -> None:
-    """Write the card of a folder whose weights are there already."""
+    """Write the card of a folder whose weights, codec and codes of pictures are there already."""
     card = {
         "version": CARD_VERSION,
         "name": settings.name,
@@ -34,9 +35,14 @@ def write_card(folder: Path, settings: VlaSettings, parameters: int, details: Ma
 
 
 def write_details(folder: Path, details: Mapping[str, Any]) -> None:
-    """Add to what the card tells beside the weights; raises `CheckpointError` as `read_card` does."""
+    """Add to what the card tells beside the weights, and renew its revision.
+
+    Raises:
+        CheckpointError: as `read_card` and `weights_revision` do.
+    """
     card = read_card(folder)
     card["details"] |= details
+    card["revision"] = weights_revision(folder)
     (folder / CARD_FILE).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
 
 
@@ -71,9 +77,25 @@ def weight_files(folder: Path) -> list[Path]:
 
 
 def weights_revision(folder: Path) -> str:
-    """12 hexadecimal digits that change with the weights: SHA-256 over all weight files."""
+    """12 hexadecimal digits that change with the weights: the network's, the codec's, those of picture codes.
+
+    Raises:
+        CheckpointError: the network's or the codec's are missing.
+    """
+    # Who only reads cards needs no torch.
+    from model.network.visual_codes import WEIGHTS_FILE
+
+    if not (folder / CODEC_FILE).is_file():
+        raise CheckpointError(f"{folder} has no {CODEC_FILE}")
+    parts = [folder / CODEC_FILE, folder / WEIGHTS_FILE]
+    return files_revision([*weight_files(folder), *(path for path in parts if path.is_file())])
+
+
+def files_revision(paths: Iterable[Path]) -> str:
+    """12 hexadecimal digits of SHA-256 over the names, sizes and contents of files, in this order."""
     digest = hashlib.sha256()
-    for path in weight_files(folder):
+    for path in paths:
+        digest.update(f"{path.name} {path.stat().st_size}\n".encode())
         with path.open("rb") as file:
             while block := file.read(1 << 22):
                 digest.update(block)

@@ -13,7 +13,7 @@ class ModelCard:
 
     Attributes:
         name: e.g. ``looktwice-nano``.
-        revision: changes with the weights.
+        revision: changes with the weights, the codec and the codes of pictures.
         engine: ``torch``, ``vllm`` or ``transformers``.
         formats: response formats it can write; the first is that of requests that name none.
         cameras: cameras it looks at; a scene must have these.

@@ -42,8 +42,7 @@ def write_repository(folder: Path, figures: Mapping[str, str] | None = None) -> 
     Raises:
         CheckpointError: the folder is no checkpoint.
     """
-    if figures is not None:
-        write_details(folder, {"figures": dict(figures)})
+    write_details(folder, {} if figures is None else {"figures": dict(figures)})
     card = read_card(folder)
     path = folder / "config.json"
     try:

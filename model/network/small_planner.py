@@ -8,7 +8,6 @@ worth to a plan, and drives nowhere. A checkpoint whose reader of tracks writes 
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,9 +23,9 @@ from torch import Tensor, nn
 from model.driving.facts import FACTS
 from model.driving.scene import Scene, SceneError
 from model.driving.trajectory import FUTURE_STEPS, FloatArray
-from model.network.card import CARD_FILE, weights_revision
+from model.network.card import CARD_FILE, files_revision, weights_revision
 from model.network.checkpoint import load
-from model.network.codec import CodecError, TrajectoryCodec
+from model.network.codec import CODEC_FILE, CodecError, TrajectoryCodec
 from model.network.intent import IntentTrunk, TrackPool, present_speeds
 from model.network.track_features import track_features
 from model.network.trajectory_head import Guesses, TrajectoryHead
@@ -178,8 +177,8 @@ def _reader_of_tracks(folder: Path) -> SmallPlanner:
 
 
 def small_revision(folder: Path) -> str:
-    """12 hexadecimal digits that change with a small planner's weights."""
+    """12 hexadecimal digits that change with a small planner's weights and codec."""
     path = folder / WEIGHTS_FILE
     if not path.is_file():
         return weights_revision(folder)
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    return files_revision([path, folder / CODEC_FILE])

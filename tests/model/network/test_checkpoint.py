@@ -19,12 +19,15 @@ from transformers import (
 )
 
 from model.families.family import Situation
-from model.network.card import CARD_FILE, CheckpointError, weights_revision
+from model.network.card import CARD_FILE, CheckpointError, read_card, weights_revision
 from model.network.checkpoint import Loaded, create_nano, expand_stock, load, save, with_formats
 from model.network.codec import CODEC_FILE, TrajectoryCodec
 from model.network.inputs import InputBuilder
+from model.network.repository import write_repository
 from model.network.settings import VlaSettings
-from model.network.visual_codes import levels_of
+from model.network.small_planner import SmallPlanner, small_revision
+from model.network.visual_codes import WEIGHTS_FILE as VISUAL_CODES_FILE
+from model.network.visual_codes import VisualCodes, levels_of
 from model.network.vocabulary import QWEN_TOKENS, Vocabulary, build_nano_tokenizer
 from tests.model.network.conftest import made_up_scene
 
@@ -288,3 +291,33 @@ def test_a_checkpoint_is_told_by_its_weights_whatever_its_card_says(
     others = {name: torch.zeros_like(tensor) for name, tensor in weights.items()}
     save_file(others, folder / "model.safetensors")
     assert load(folder).card.revision == weights_revision(folder) != load(nano_folder).card.revision
+
+
+def test_a_revision_covers_the_codec_and_the_codes_of_pictures(
+    nano: Loaded, nano_folder: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "other"
+    shutil.copytree(nano_folder, folder)
+    codec = nano.codec
+    replace(codec, mean=codec.mean + np.float32(0.1)).save(folder)
+    revisions = [nano.card.revision, load(folder).card.revision]
+    for seed in range(2):
+        torch.manual_seed(seed)
+        VisualCodes().save(folder, {})
+        revisions.append(load(folder).card.revision)
+    assert len(set(revisions)) == 4
+    write_repository(folder)
+    assert read_card(folder)["revision"] == revisions[-1], "cards are renewed"
+    codec.save(folder)
+    (folder / VISUAL_CODES_FILE).unlink()
+    assert weights_revision(folder) == revisions[0]
+    (folder / CODEC_FILE).unlink()
+    with pytest.raises(CheckpointError, match=CODEC_FILE):
+        weights_revision(folder)
+
+
+def test_a_small_planners_revision_covers_its_codec(small_codec: TrajectoryCodec, tmp_path: Path) -> None:
+    SmallPlanner("blind", small_codec).save(tmp_path, {})
+    before = small_revision(tmp_path)
+    replace(small_codec, mean=small_codec.mean + np.float32(0.1)).save(tmp_path)
+    assert small_revision(tmp_path) != before
