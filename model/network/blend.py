@@ -11,7 +11,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from model.network.checkpoint import CheckpointError, Loaded
+from model.network.card import CheckpointError
+from model.network.checkpoint import Loaded
 
 
 def blend(before: Loaded, after: Loaded, share: float) -> Loaded:

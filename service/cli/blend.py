@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import told
+from service.cli.options import reported_errors
 
 
 def blend(
@@ -17,7 +17,7 @@ def blend(
     share: Annotated[float, typer.Option(min=0, max=1, help="Of the second checkpoint.")] = 0.5,
 ) -> None:
     """Mix the decoders and small planners of two checkpoints; what sees is that of the second."""
-    with told():
+    with reported_errors():
         import torch
 
         from model.network.blend import blend as blend_of

@@ -8,7 +8,8 @@ import torch
 from typer.testing import CliRunner
 
 from model.network.blend import blend
-from model.network.checkpoint import CheckpointError, Loaded, load, save
+from model.network.card import CheckpointError
+from model.network.checkpoint import Loaded, load, save
 from service.cli.commands import app
 
 EYES = ("model.visual.", "resampler.facts.", "resampler.layers.", "resampler.queries")
