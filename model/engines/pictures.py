@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +18,8 @@ from model.engines.engine import EngineError
 _Result = TypeVar("_Result")
 THREADS: Final = 2
 LARGE_THREADS: Final = 1
+LARGE_NICENESS: Final = 10
+"""Of their thread, above that of the process: where processors are short, the engine goes before it."""
 LARGE_PIXELS: Final = 2_000_000
 """Of all pictures of a scene, one of full HD: scenes with more wait for each other, and hold up no others."""
 
@@ -50,8 +54,8 @@ class PictureThreads:
 
     async def _run(self, work: Callable[[], _Result], *, large: bool) -> _Result:
         if large not in self._pools:
-            threads = LARGE_THREADS if large else THREADS
-            self._pools[large] = ThreadPoolExecutor(threads, "looktwice-pictures")
+            threads, begin = (LARGE_THREADS, _give_way) if large else (THREADS, None)
+            self._pools[large] = ThreadPoolExecutor(threads, "looktwice-pictures", begin)
         pool, number, left = self._pools[large], next(self._numbers), threading.Event()
 
         def begun() -> _Result:
@@ -88,6 +92,14 @@ class PictureThreads:
         for pool in self._pools.values():
             pool.shutdown(wait=False, cancel_futures=True)
         self._pools.clear()
+
+
+def _give_way() -> None:
+    """Lower the priority of this thread; elsewhere than in Linux only whole processes have one."""
+    if sys.platform == "linux":
+        thread = threading.get_native_id()
+        niceness = os.getpriority(os.PRIO_PROCESS, thread) + LARGE_NICENESS
+        os.setpriority(os.PRIO_PROCESS, thread, niceness)
 
 
 def _pixels(pictures: Sequence[bytes]) -> int:

@@ -1,12 +1,19 @@
-"""What makes a run of `costly` count, on figures that are made up."""
+"""What makes a run of `costly` count, on figures that are made up; and what it sends."""
 
 from __future__ import annotations
 
+import base64
+import json
 from typing import Any
 
 import pytest
 
+from loadtests.attacks import costly_calls, never_seen
+from loadtests.bodies import make_call
+from loadtests.mix import Kind
 from loadtests.scenarios.hostile import missed_goals
+from model.driving.images import decode_image
+from tests.model.driving.drives import labelled_scene
 
 MET: dict[str, Any] = {
     "polite_p95_ratio": 1.5,
@@ -39,3 +46,17 @@ def test_what_was_not_measured_is_not_asked_for() -> None:
 def test_a_goal_that_is_missed_is_told(change: dict[str, Any], told: str) -> None:
     [missed] = missed_goals(MET | change)
     assert told in missed
+
+
+def test_pictures_of_dear_requests_were_never_seen_before() -> None:
+    polite = make_call(Kind("direct", 1), [labelled_scene(8.0, pictures=1)], seed=1)
+    large = costly_calls(polite)[2]
+    bodies = [json.loads(never_seen(large.body)) for _ in range(2)]
+    pictures = [
+        base64.b64decode(image)
+        for body in bodies
+        for clip in body["scene"]["clips"]
+        for image in clip["images"]
+    ]
+    assert len(set(pictures)) == len(pictures) > 2
+    assert len({decode_image(picture).tobytes() for picture in pictures[:3]}) == 1

@@ -34,7 +34,7 @@ from service.settings import Settings
 from tests.checkpoints import write_untrained
 from tests.service.scenes import scene
 from tests.service.scripted_engine import CARD, ScriptedEngine
-from tests.service.serving import Served, body, serve
+from tests.service.serving import PATIENCE_S, Served, body, serve
 from tests.service.test_errors import problem
 
 PATH = "/v1/imagine"
@@ -53,7 +53,9 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def served(checkpoint: Path) -> Iterator[Served[TorchEngine]]:
-    with serve(TorchEngine(checkpoint, TorchSettings(rows=4, products=None)), Settings()) as running:
+    with serve(
+        TorchEngine(checkpoint, TorchSettings(rows=4, products=None)), Settings(queue_timeout_s=PATIENCE_S)
+    ) as running:
         yield running
 
 
