@@ -18,10 +18,13 @@ def blend(
 ) -> None:
     """Mix the decoders and small planners of two checkpoints; what sees is that of the second."""
     with reported_errors():
+        import shutil
+
         import torch
 
         from model.network.blend import blend as blend_of
         from model.network.checkpoint import load, save
+        from model.training.trainer import LOG_FILE
 
         blended = blend_of(load(before), load(after), share)
         save(
@@ -33,4 +36,6 @@ def blend(
             details=blended.card.details,
             visual_codes=blended.visual_codes,
         )
+        if (after / LOG_FILE).exists():
+            shutil.copyfile(after / LOG_FILE, to / LOG_FILE)
         typer.echo(str(to))

@@ -49,6 +49,7 @@ TRIED: Final = {
     "build label": f"looktwice build label out/build {_SCENES}",
     "build export": "looktwice build export out/build --to out/reflections.parquet",
     "describe": "cp -r model/bundled/looktwice-nano out/nano && looktwice describe out/nano",
+    "blend": "looktwice blend model/bundled/looktwice-nano out/nano --to out/between",
     "keys new": "looktwice keys new somebody",
     "evaluate": "looktwice evaluate --limit 2 --n 1",
 }
