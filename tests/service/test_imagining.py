@@ -34,8 +34,9 @@ from service.settings import Settings
 from tests.checkpoints import write_untrained
 from tests.service.scenes import scene
 from tests.service.scripted_engine import CARD, ScriptedEngine
-from tests.service.serving import PATIENCE_S, Served, body, serve
+from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem
+from tests.sockets import PATIENCE_S
 
 PATH = "/v1/imagine"
 SEEN = ("front_wide_120", "front_tele_30")
