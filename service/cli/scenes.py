@@ -157,7 +157,8 @@ def import_(
             out.unlink()
             raise RecordingError(
                 f"{folder} holds no scene: that takes four pictures of each camera half a second apart, and "
-                "poses from 1.5 s before the last of them to 6.4 s after it"
+                "poses from 1.5 s before the last of them to 6.4 s after it. One is looked for every "
+                f"{stride:g} s from 1.5 s after the first pose on: try --stride 0.1 where pictures are few"
             )
         typer.echo(f"{count} {'scene' if count == 1 else 'scenes'} in {out}")
 
