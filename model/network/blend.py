@@ -13,6 +13,7 @@ from torch import Tensor
 
 from model.network.card import CheckpointError
 from model.network.checkpoint import Loaded
+from model.network.vla import is_vision
 
 
 def blend(before: Loaded, after: Loaded, share: float) -> Loaded:
@@ -38,17 +39,16 @@ def blend(before: Loaded, after: Loaded, share: float) -> Loaded:
         raise CheckpointError(f"{before.card.name} and {after.card.name} differ in more than their weights")
     with torch.no_grad():
         after.model.load_state_dict(
-            {name: value if _sees(name) else _between(old[name], value, share) for name, value in new.items()}
+            {
+                name: value if is_vision(name) else _between(old[name], value, share)
+                for name, value in new.items()
+            }
         )
     stages = [
         *after.card.details.get("stages", []),
         {"name": "blend", "share": share, "with": before.card.revision},
     ]
     return replace(after, card=replace(after.card, details={**after.card.details, "stages": stages}))
-
-
-def _sees(name: str) -> bool:
-    return name.startswith("model.visual.") or (name.startswith("resampler.") and ".intent." not in name)
 
 
 def _between(old: Tensor, new: Tensor, share: float) -> Tensor:

@@ -12,6 +12,8 @@ from model.network.codec import CODEC_FILE
 from model.network.settings import VlaSettings
 
 CARD_FILE: Final = "looktwice.json"
+LOG_FILE: Final = "log.jsonl"
+"""Beside it: how a trained checkpoint was learned, all stages, a row of JSON each."""
 CARD_VERSION: Final = 1
 
 

@@ -327,3 +327,13 @@ def nano_config(vocabulary: Vocabulary, settings: VlaSettings | None = None) -> 
 def parameters_of(model: nn.Module) -> int:
     """How many weights a network has, tied ones once."""
     return cast("int", sum(parameter.numel() for parameter in model.parameters()))
+
+
+def is_vision(name: str) -> bool:
+    """Whether a weight belongs to what sees: the tower, or the resampler but for its small planner.
+
+    Args:
+        name: within the network, or within a module that holds it.
+    """
+    name = f".{name}"
+    return ".visual." in name or (".resampler." in name and ".intent." not in name)

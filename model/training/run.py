@@ -21,6 +21,7 @@ from model.driving.scene import LabelledScene
 from model.driving.scene_store import read_scenes
 from model.families.registry import family_named
 from model.network.attention import MATMUL_ATTENTION
+from model.network.card import LOG_FILE
 from model.network.checkpoint import Loaded, create_nano, load, save, with_formats, with_sketches
 from model.network.codec import TrajectoryCodec
 from model.network.corpus import nano_corpus, nano_phrases
@@ -47,7 +48,7 @@ from model.training.outcomes import OutcomeLearner, ScenePlaces, collate_places
 from model.training.own_plans import OwnPlans
 from model.training.recipes import Recipe
 from model.training.reflections import OnExamples, reflections_on
-from model.training.trainer import LOG_FILE, LearnerTrainer, Validate
+from model.training.trainer import LearnerTrainer, Validate
 from model.training.validation import open_loop
 from model.training.vision_cache import open_vision
 

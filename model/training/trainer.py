@@ -14,11 +14,12 @@ from torch.utils.data import DataLoader, Dataset, Subset, get_worker_info
 from transformers import Trainer, TrainerCallback, TrainingArguments
 
 from model.network.allocator import FreedMemory
+from model.network.card import LOG_FILE
+from model.network.vla import is_vision
 from model.training.batches import TaskSampler
 from model.training.recipes import Recipe
 
 _STATE_FILE: Final = "learner.pt"
-LOG_FILE: Final = "log.jsonl"
 
 Validate = Callable[[], Mapping[str, float]]
 
@@ -149,11 +150,6 @@ def draw_apart(worker: int) -> None:
     while isinstance(dataset, Subset):
         dataset = dataset.dataset
     dataset.random = np.random.default_rng(info.seed)
-
-
-def is_vision(name: str) -> bool:
-    """Whether a weight of a response learner belongs to the tower or to the resampler's queries."""
-    return ".visual." in name or (".resampler." in name and ".intent." not in name)
 
 
 class _Frugal(TrainerCallback):

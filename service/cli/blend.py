@@ -23,8 +23,8 @@ def blend(
         import torch
 
         from model.network.blend import blend as blend_of
+        from model.network.card import LOG_FILE
         from model.network.checkpoint import load, save
-        from model.training.trainer import LOG_FILE
 
         blended = blend_of(load(before), load(after), share)
         save(

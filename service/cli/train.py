@@ -103,12 +103,12 @@ def train(
     from model.driving.scene_store import count_scenes, read_scenes
     from model.evaluation.curves import training_curves
     from model.network.allocator import keep_freed_memory
+    from model.network.card import LOG_FILE
     from model.network.precision import bfloat16_is_fast
     from model.network.small_planner import DRIVING_KINDS
     from model.training.recipes import NANO, PAPER, VISUAL_CODES, refining_with
     from model.training.run import RunSettings, create, run
     from model.training.small import SmallSettings
-    from model.training.trainer import LOG_FILE
     from model.training.visual_codes import train_visual_codes
     from service.cli.ladder import climb
     from service.cli.small_rounds import train_small_in_rounds
