@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -47,6 +48,18 @@ def test_reflect_on_another_plan(served: Served) -> None:
     printed = run("reflect_on_another_plan.py", served.url)
     assert printed.count("think probability") == 12
     assert "Accelerate -> " in printed
+
+
+def test_aiperf_inputs(served: Served, tmp_path: Path) -> None:
+    printed = run("aiperf_inputs.py", str(tmp_path / "inputs.json"), "3")
+    assert printed.endswith(": 3 requests\n")
+    sessions = json.loads((tmp_path / "inputs.json").read_text())["data"]
+    assert len({session["session_id"] for session in sessions}) == 3
+    for session in sessions:
+        (asked,) = session["payloads"]
+        answer = served.http.post("/v1/plan", json=asked)
+        assert answer.status_code == 200, answer.text
+        assert answer.json()["request_id"]  # what aiperf is told to look for
 
 
 @pytest.mark.skipif(not simulator.is_installed(), reason="MetaDrive is not installed (make sim)")
