@@ -5,6 +5,8 @@ import { timesOf } from "./times.js";
 
 const EGO = { length_m: 4.51, width_m: 1.85 };
 const BEHIND_M = 14;
+const BESIDE_M = 15; // at least, to either side; farther where somebody turns
+const AROUND_M = 4; // what lies beside the outermost point of a trajectory
 const NOW = 15; // row of the present in an agent's track
 const SECOND = 10; // rows
 
@@ -20,10 +22,12 @@ export function drawBirdseye(view, draws, chosen, judged = null) {
   const style = getComputedStyle(document.documentElement);
   const color = (name) => style.getPropertyValue(`--${name}`).trim();
 
-  const ahead = Math.max(35, ...[view.future, ...draws.map((draw) => draw.trajectory)]
-    .filter(Boolean).map((rows) => Math.max(...rows.map((row) => row[0])))) + 10;
-  const scale = Math.min(height / (ahead + BEHIND_M), width / 30);
-  const origin = [width / 2, height - BEHIND_M * scale];
+  const ways = [view.future, ...draws.flatMap((draw) => [draw.trajectory, draw.draft_trajectory])].filter(Boolean).flat();
+  const ahead = Math.max(35, ...ways.map(([x]) => x)) + 10;
+  const left = Math.max(BESIDE_M, ...ways.map(([, y]) => y + AROUND_M));
+  const right = Math.max(BESIDE_M, ...ways.map(([, y]) => AROUND_M - y));
+  const scale = Math.min(height / (ahead + BEHIND_M), width / (left + right));
+  const origin = [width * left / (left + right), height - BEHIND_M * scale];
   const at = ([x, y]) => [origin[0] - y * scale, origin[1] - x * scale];
   const map = { pen, color, scale, at, width, height };
 

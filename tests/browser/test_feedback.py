@@ -13,6 +13,7 @@ from model.driving.scene_store import write_scenes
 from model.driving.trajectory import TEN_HZ_S
 from service.settings import Settings
 from tests.browser.test_inspector import (
+    EXPERT_RGB,
     INSIDE_OF_DOTS_RGB,
     colours_drawn_and_named,
     near,
@@ -25,7 +26,6 @@ from tests.service.serving import Served, serve
 from tests.sockets import PATIENCE_S
 
 WRONG_RGB = (211, 32, 32)  # --wrong of the light theme
-TRUTH_RGB = (22, 128, 60)  # --expert
 WHY = "Is it right, and why?"
 
 
@@ -70,7 +70,7 @@ def test_a_wrong_first_plan_is_red_and_told_why_beside_what_came_of_it(inspector
     expect(inspector.locator("#birdseye")).to_have_attribute("aria-label", re.compile("by its score"))
     after = pixels(inspector, "#birdseye")
     assert near(after, WRONG_RGB).any()
-    assert near(after, TRUTH_RGB).sum() > near(before, TRUTH_RGB).sum()
+    assert near(after, EXPERT_RGB).sum() > near(before, EXPERT_RGB).sum()
 
 
 @pytest.mark.parametrize("thinking", ["always", "never"])
@@ -87,7 +87,7 @@ def test_the_legend_names_every_colour_of_a_draw_that_is_judged(inspector: Page,
 
     drawn, named = colours_drawn_and_named(inspector, judge)
     assert WRONG_RGB in drawn
-    assert TRUTH_RGB in drawn
+    assert EXPERT_RGB in drawn
     assert drawn - named == {INSIDE_OF_DOTS_RGB}
 
 

@@ -24,6 +24,7 @@ from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, Scripte
 from tests.service.serving import Served, body, serve
 
 CHOSEN_RGB = (29, 95, 209)  # --chosen of the light theme
+EXPERT_RGB = (22, 128, 60)  # --expert of the light theme
 DRAFT_RGB = (194, 24, 127)  # --draft of the light theme
 DARK_PAGE_RGB = (18, 22, 28)  # --page of the dark theme
 INSIDE_OF_DOTS_RGB = (255, 255, 255)  # --panel of the light theme
@@ -250,6 +251,22 @@ def test_the_birdseye_view_draws_ahead_upwards_and_left_to_the_left(inspector: P
     label = inspector.locator("#birdseye").get_attribute("aria-label") or ""
     assert "1 draws" in label
     assert "to the left" in label
+
+
+@pytest.mark.parametrize("side", [1, -1], ids=["left", "right"])
+def test_the_birdseye_view_shows_a_turn_to_its_end(inspector: Page, tmp_path: Path, side: int) -> None:
+    angles = np.linspace(0, np.pi / 2, 64)
+    future = np.zeros((64, 4), np.float32)
+    future[:, 0], future[:, 1] = 20 * np.sin(angles), side * 40 * (1 - np.cos(angles))
+    turn = replace(labelled("turn"), future=future)
+    write_scenes(tmp_path / "turn.parquet", [turn])
+    inspector.get_by_label("Open a scene file").set_input_files(tmp_path / "turn.parquet")
+    expect(inspector.get_by_role("status")).to_contain_text("Scene turn")
+    image = pixels(inspector, "#birdseye")
+    rows, columns = np.nonzero(near(image, EXPERT_RGB))
+    ends_px = columns.min() if side == 1 else image.shape[1] - columns.max()
+    assert 15 < ends_px < 60, "its end is in view, and not far from the edge"
+    assert rows.max() - rows.min() > 50
 
 
 def test_clips_can_be_scrubbed(inspector: Page) -> None:
