@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from clients.metadrive import simulator
+from model.bundled import SCENES
+from model.driving.images import decode_image
+from model.driving.scene_store import read_scenes
 from service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, serve
@@ -28,10 +34,21 @@ def served() -> Iterator[Served]:
 
 
 def run(name: str, *arguments: str) -> str:
-    command = [sys.executable, str(EXAMPLES / name), *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
-    assert done.returncode == 0, done.stderr
+    return finished([str(EXAMPLES / name), *arguments])
+
+
+def finished(arguments: list[str], folder: Path | None = None) -> str:
+    """What a Python command prints, warnings too."""
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=120,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        cwd=folder,
+    )
+    assert done.returncode == 0, done.stdout
     return done.stdout
 
 
@@ -48,6 +65,19 @@ def test_reflect_on_another_plan(served: Served) -> None:
     printed = run("reflect_on_another_plan.py", served.url)
     assert printed.count("think probability") == 12
     assert "Accelerate -> " in printed
+
+
+def test_the_drive_is_imported_by_the_figures_of_its_own_camera(tmp_path: Path) -> None:
+    run("drive_folder.py", str(tmp_path / "drive"))
+    page = (ROOT / "docs" / "own-cameras.md").read_text()
+    (command,) = re.findall(r"^looktwice (scenes import drive .*\\\n.*)$", page, re.MULTILINE)
+    told = finished(["-m", "service.cli", *shlex.split(command.replace("\\\n", " "))], tmp_path)
+    assert "grey" not in told
+    given, imported = (
+        decode_image(next(read_scenes(path, dense=False)).scene.clips[0].images[-1]).astype(float)
+        for path in (SCENES, tmp_path / "scenes.parquet")
+    )
+    assert np.abs(given - imported).mean() < 8, "as the model's own camera takes it"
 
 
 def test_aiperf_inputs(served: Served, tmp_path: Path) -> None:
