@@ -19,9 +19,9 @@ from clients.metadrive.roads import Array
 from clients.metadrive.stage import Stage
 from clients.metadrive.tracking import FreeVehicle, world_trajectory
 from clients.metadrive.tracks import tracks_at
-from clients.metadrive.windows import PICTURE_STEPS, history_at
+from clients.metadrive.windows import PICTURE_STEPS, blank_clips, history_at
 from model.driving.cameras import FRONT_CAMERAS, CameraSpec
-from model.driving.scene import CLIP_FRAMES, NO_PICTURE, Clip, Scene
+from model.driving.scene import CLIP_FRAMES, Clip, Scene
 
 TAKE_OVER: Final = PICTURE_STEPS * (CLIP_FRAMES - 1)
 """The expert drives so many steps, until there are clips and a history."""
@@ -191,10 +191,12 @@ def _driver(world: World, way: Array | None, age_s: float) -> Callable[[list[Bod
 def _scene(world: World, step: int, shots: dict[int, list[Picture]], cameras: Sequence[CameraSpec]) -> Scene:
     """What the car sees now; nothing of the world but through its cameras, its motion and its way."""
     times = [step - PICTURE_STEPS * k for k in reversed(range(CLIP_FRAMES))]
-    clips = tuple(
-        Clip(spec.name, tuple(shots[at][index].jpeg if shots else NO_PICTURE for at in times))
-        for index, spec in enumerate(cameras)
-    )
+    clips = blank_clips(cameras)
+    if shots:
+        clips = tuple(
+            Clip(spec.name, tuple(shots[at][index].jpeg for at in times))
+            for index, spec in enumerate(cameras)
+        )
     log = world.live
     name = f"{log.seed:06d}-{step:04d}"
     return Scene(name, clips, history_at(log, step), route_ahead(log, step), tracks_at(log, step))

@@ -28,9 +28,9 @@ from clients.metadrive.drive import DriveConfig
 from clients.metadrive.episode import run_episode
 from clients.metadrive.maps import MapError
 from clients.metadrive.own_states import own_states
-from clients.metadrive.pilots import Pilot
+from clients.metadrive.pilots import Careless, Pilot
 from clients.metadrive.rig import Rig
-from clients.metadrive.windows import labelled_scenes, window_steps
+from clients.metadrive.windows import labelled_scenes, unpictured_scenes, window_steps
 from model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS
 from model.driving.scene import LabelledScene, split_of_seed
 from model.driving.scene_store import MANIFEST, SCENE_VERSION, write_scenes
@@ -61,8 +61,10 @@ class GenerateConfig:
         driver: name and revision of the model that drives; scenes are then of its own states, with what the
             expert would do from there (`own_states`). None for the expert.
         tracks: whether that model is told the tracks of the objects around.
+        careless: that model overlooks everybody around for up to two seconds now and then; scenes show how
+            to brake then.
         pictures: whether scenes have any; without, they are made many times as fast, for planners that read
-            tracks. Only scenes of a model's own states can lack them.
+            tracks.
     """
 
     stride_s: float = 0.5
@@ -76,6 +78,7 @@ class GenerateConfig:
     width_px: int = 224
     driver: str | None = None
     tracks: bool = False
+    careless: bool = False
     pictures: bool = True
 
     def __post_init__(self) -> None:
@@ -85,8 +88,12 @@ class GenerateConfig:
                 "scenes of a model's own drives have no dense targets, no surround cameras and no next "
                 "frames, and its expert neither drifts nor lapses"
             )
-        if self.driver is None and not self.pictures:
-            raise GenerationError("only scenes of a model's own drives can do without pictures")
+        if self.driver is None and self.careless:
+            raise GenerationError("only a model that drives can be careless; the expert has lapses")
+        if filmed and not self.pictures:
+            raise GenerationError(
+                "without pictures there are no dense targets, cameras around or next frames"
+            )
 
 
 @dataclass(frozen=True)
@@ -257,15 +264,18 @@ def run_seed(
 
 
 def _of_expert(seed: int, rig: Rig | None, config: GenerateConfig) -> _Made:
-    assert rig is not None, "the expert's scenes have pictures"
     log = run_episode(seed, config.duration_s, drifts=config.drifts, lapses=config.lapses)
-    scenes = list(labelled_scenes(log, rig, config.stride_s, config.dense, with_next=config.next_frames))
+    if rig is None:
+        scenes = list(unpictured_scenes(log, config.stride_s))
+    else:
+        scenes = list(labelled_scenes(log, rig, config.stride_s, config.dense, with_next=config.next_frames))
     return _Made(scenes, log.outcome, log.road_map.blocks, len(window_steps(log, config.stride_s)))
 
 
 def _of_pilot(seed: int, pilot: Pilot, rig: Rig | None, config: GenerateConfig) -> _Made:
     every = max(1, round(config.stride_s / DriveConfig().replan_s))
-    scenes, drove = own_states(seed, pilot, rig, DriveConfig(config.duration_s), every)
+    driver = Careless(pilot, seed) if config.careless else pilot
+    scenes, drove = own_states(seed, driver, rig, DriveConfig(config.duration_s), every)
     return _Made(scenes, drove.ended, "", drove.plans // every)
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import base64
+import random
 import time
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -14,6 +15,11 @@ from clients.planner import PlannerClient, imagine_request
 from clients.wire_imagine import ImagineControls
 from model.driving.scene import Scene
 from model.driving.trajectory import FloatArray, constant_velocity
+
+_OVERLOOKED_SHARES: Final = (0.0, 0.0, 0.04, 0.08)
+"""Shares of plans at which carelessness begins; an episode has one of them."""
+_OVERLOOKED_PLANS: Final = 4
+"""Plans in a row that overlook everybody, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +74,32 @@ class ConstantVelocity:
     def plan(self, scene: Scene) -> Planned:
         """See `Pilot.plan`."""
         return Planned(constant_velocity(scene.history), np.zeros((0, 64, 4), np.float32))
+
+
+class Careless:
+    """A pilot that overlooks everybody around for up to two seconds now and then.
+
+    So it meets what reading pictures wrongly leads to, without any pictures.
+
+    Args:
+        pilot: who drives; it has to plan from tracks.
+        seed: of the episode: it decides how often, and when. In half of the episodes nobody is overlooked.
+    """
+
+    def __init__(self, pilot: Pilot, seed: int) -> None:
+        self._pilot, self._random = pilot, random.Random(seed)
+        self._share = self._random.choice(_OVERLOOKED_SHARES)
+        self._plans_left = 0
+        self.name, self.needs_pictures = pilot.name, pilot.needs_pictures
+
+    def plan(self, scene: Scene) -> Planned:
+        """See `Pilot.plan`."""
+        if not self._plans_left and self._random.random() < self._share:
+            self._plans_left = self._random.randint(1, _OVERLOOKED_PLANS)
+        if self._plans_left:
+            self._plans_left -= 1
+            scene = replace(scene, tracks=())
+        return self._pilot.plan(scene)
 
 
 class ServicePilot:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -15,11 +15,13 @@ from clients.metadrive.lane_maps import LaneMaps
 from clients.metadrive.rig import Picture, Rig
 from clients.metadrive.roads import Array
 from clients.metadrive.stage import Stage
+from model.driving.cameras import FRONT_CAMERAS, CameraSpec
 from model.driving.lane_map import LaneMap
 from model.driving.metrics import collides, leaves_road
 from model.driving.scene import (
     CLIP_FRAMES,
     CLIP_PERIOD_S,
+    NO_PICTURE,
     Agent,
     Clip,
     DenseTarget,
@@ -91,6 +93,20 @@ def labelled_scenes(
             yield moment.labelled(clips, tagger.tags(step), lane_maps.at(step), dense, next_frames)
     finally:
         stage.close()
+
+
+def unpictured_scenes(log: EpisodeLog, stride_s: float) -> Iterator[LabelledScene]:
+    """As `labelled_scenes`, without pictures: nothing is rendered."""
+    lane_maps, clips = LaneMaps(log), blank_clips(FRONT_CAMERAS)
+    for step in window_steps(log, stride_s):
+        labelled = labelled_scene(log, step, clips, lane_maps.at(step))
+        if labelled is not None:
+            yield labelled
+
+
+def blank_clips(cameras: Sequence[CameraSpec]) -> tuple[Clip, ...]:
+    """Clips of cameras that nobody looked through."""
+    return tuple(Clip(spec.name, (NO_PICTURE,) * CLIP_FRAMES) for spec in cameras)
 
 
 def labelled_scene(

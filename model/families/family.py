@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from model.driving.perceived import Perceived
 from model.driving.phrases import ReflectionLanguage
@@ -100,6 +100,9 @@ class Actions:
     groups: tuple[tuple[str, ...], ...]
     of: Callable[[FloatArray], tuple[str, ...]]
 
+
+LessonPart = Literal["thoughts", "perceived"]
+"""What annotations of a scene may tell, or not; see `Lesson`."""
 
 Decode = Callable[[Sequence[int]], FloatArray]
 """Makes a trajectory float32 [64, 4] of codes, with the checkpoint's codec and the scene's history."""
@@ -245,6 +248,8 @@ class Family:
             the section has one value, which is a text.
         revised_plan: the section of the plan that takes the first one's place.
         teach: the values of the response that a labelled scene teaches; None where nothing is trained.
+        lesson_needs: parts of a `Lesson` that ``teach`` cannot do without; scenes whose annotations do not
+            tell them are left out of training.
         title: what tables of measures call it; its name without one.
         dialects: other formats of the same name, for checkpoints whose reflections are written otherwise.
         refines: whether its prompts hold an `Attempt`, which every request then has to bring.
@@ -268,6 +273,7 @@ class Family:
     reflection_text: Callable[[tuple[Value, ...]], str | None] | None = None
     revised_plan: str | None = None
     teach: Callable[[Lesson], Values] | None = None
+    lesson_needs: tuple[LessonPart, ...] = ()
     title: str | None = None
     dialects: Mapping[ReflectionLanguage, Format] = field(default_factory=dict)
     refines: bool = False

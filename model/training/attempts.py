@@ -22,20 +22,29 @@ class AttemptsOn(NamedTuple):
     attempts: list[JudgedAttempt]
 
 
-def attempts_on(examples: Examples, rows: Iterable[FeedbackRow], times_s: Sequence[float]) -> AttemptsOn:
+def attempts_on(
+    examples: Examples,
+    rows: Iterable[FeedbackRow],
+    times_s: Sequence[float],
+    taught: npt.NDArray[np.bool_],
+) -> AttemptsOn:
     """Answers with their feedback, in plain punctuation, with the examples of their scenes.
+
+    Wrong answers are taught by the expert's response, so those in scenes that tell none are left out.
 
     Args:
         examples: to look in.
         rows: of a file.
         times_s: of the poses of drafts.
+        taught: bool [N], of which examples the expert's response is known.
 
     Raises:
         ValueError: a scene is missing, or a right answer does not say what led to it.
     """
     told = list(rows)
     places = places_of(examples, (row.scene_id for row in told), "feedback")
-    return AttemptsOn(places, [_attempt(row, times_s) for row in told])
+    kept = [number for number, row in enumerate(told) if row.correct or taught[places[number]]]
+    return AttemptsOn(places[kept], [_attempt(told[number], times_s) for number in kept])
 
 
 def _attempt(row: FeedbackRow, times_s: Sequence[float]) -> JudgedAttempt:

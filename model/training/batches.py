@@ -293,6 +293,7 @@ class TaskSampler(BatchSampler):
         tracks_share, mirror_share, blur_share: shares of the examples that are given their tracks, mirrored,
             and given no history but the present speed; see `Item`.
         pictured: bool [m], which examples have pictures; all by default.
+        taught: bool [m], which examples have responses to be learned; all by default.
         mirror_reflected: whether reflections are mirrored too: those in phrases can be.
         next_cameras: of each example, the cameras whose picture half a second later can be taught; none
             without it.
@@ -324,6 +325,7 @@ class TaskSampler(BatchSampler):
         mirror_share: float = 0.0,
         blur_share: float = 0.0,
         pictured: npt.NDArray[np.bool_] | None = None,
+        taught: npt.NDArray[np.bool_] | None = None,
         mirror_reflected: bool = False,
         next_cameras: Sequence[tuple[str, ...]] = (),
         picture_share: float = 0.0,
@@ -335,6 +337,7 @@ class TaskSampler(BatchSampler):
         self._attempted, self._attempting = attempted, attempting or ""
         self._attempts_a_batch = max(1, batch_size // _PLAIN_AN_ATTEMPT)
         self._pictured = np.ones(len(has_route), np.bool_) if pictured is None else pictured
+        self._taught = np.arange(len(has_route)) if taught is None else np.flatnonzero(taught)
         self._next_cameras, self._picture_share = next_cameras, picture_share
         self._mirror_reflected = mirror_reflected
         self._shares = {"tracks": tracks_share, "mirror": mirror_share, "blur": blur_share}
@@ -360,7 +363,7 @@ class TaskSampler(BatchSampler):
         self._epoch = epoch
 
     def __len__(self) -> int:
-        plain = len(self._has_route) + len(self._again)
+        plain = len(self._taught) + len(self._again)
         return (
             plain // self._batch_size
             + len(self._reflections) // self._scenes_a_batch
@@ -379,8 +382,8 @@ class TaskSampler(BatchSampler):
 
     def _plain(self, random: np.random.Generator) -> list[Item]:
         """The expert's own responses, in a new order; those on ``again`` with a plan."""
-        count = len(self._has_route)
-        example = np.concatenate([np.arange(count), self._again])
+        count = len(self._taught)
+        example = np.concatenate([self._taught, self._again])
         names = list(self._tasks)
         drawn = random.choice(len(names), len(example), p=list(self._tasks.values()))
         given = self._given(example, random)

@@ -27,6 +27,7 @@ from model.driving.thoughts import Thoughts, read_thoughts
 from model.driving.tracks import tracks_of
 from model.driving.trajectory import FloatArray
 from model.driving.whole_files import written_whole
+from model.families.family import LessonPart
 from model.network.inputs import InputBuilder
 from model.network.track_features import track_features
 from model.training.dense import coarse, no_target, relative_motion
@@ -107,6 +108,12 @@ class Examples:
     def perception(self, index: int) -> Perceived | None:
         """What there is to perceive; None where it is not known."""
         return perceived_of_row(self.perceived[index])
+
+    def tell(self, part: LessonPart) -> npt.NDArray[np.bool_]:
+        """Of which examples that part of a lesson is known, bool [N]."""
+        if part == "thoughts":
+            return np.asarray(self.thoughts != "")
+        return np.asarray(~np.isnan(self.perceived[:, 0]))
 
     def plan(self, index: int) -> Plan:
         """The expert's plan."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import nn
 from torch.utils.data import Dataset, Subset
@@ -167,13 +168,14 @@ def run(
     validate: Validate | None = None
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
+    taught = taught_by(recipe, examples)
     on_examples = None if reflections is None else reflections_on(examples, read_reflections(reflections))
     tried = None
     if failures is not None and recipe.attempting is not None:
         times_s = family_named(recipe.attempting).times_s
-        tried = attempts_on(examples, read_feedback(failures), times_s)
+        tried = attempts_on(examples, read_feedback(failures), times_s, taught)
     learner, dataset, sampler, collator = _prepare(
-        recipe, loaded, scenes, examples, on_examples, tried, settings
+        recipe, loaded, scenes, examples, taught, on_examples, tried, settings
     )
     if isinstance(learner, IntentLearner) and validation:
         held_out = Examples.from_scenes(validation, loaded.settings.cameras)
@@ -215,7 +217,7 @@ def run(
             loaded.vocabulary,
             loaded.codec,
             dtype=torch.bfloat16,
-            details={"stages": [*stages, _about(recipe, examples, on_examples, tried)]},
+            details={"stages": [*stages, _about(recipe, examples, taught, on_examples, tried)]},
             visual_codes=loaded.visual_codes,
         )
     # gloo's threads drop what they gathered a moment later, and need the interpreter for it: a process that
@@ -252,6 +254,17 @@ def _check_pictures(recipe: Recipe, examples: Examples, loaded: Loaded) -> None:
         )
 
 
+def taught_by(recipe: Recipe, examples: Examples) -> npt.NDArray[np.bool_]:
+    """Which examples tell all that a recipe's responses say, bool [N]; raises ValueError where none does."""
+    taught = np.ones(len(examples), np.bool_)
+    for task in recipe.tasks:
+        for part in family_named(task).lesson_needs:
+            taught &= examples.tell(part)
+    if not taught.any():
+        raise ValueError(f"no scene tells what recipe {recipe.name} teaches: all lack agents, lanes or road")
+    return taught
+
+
 def vision_parts(vla: LookTwiceVla) -> list[nn.Module]:
     """What stands between pictures and the decoder: the tower and, where there is one, the resampler."""
     return [vla.model.visual, *([vla.resampler] if vla.resampler is not None else [])]
@@ -282,6 +295,7 @@ def _prepare(
     loaded: Loaded,
     scenes: Path,
     examples: Examples,
+    taught: npt.NDArray[np.bool_],
     on_examples: OnExamples | None,
     tried: AttemptsOn | None,
     settings: RunSettings,
@@ -353,7 +367,8 @@ def _prepare(
             route_share=recipe.route_share,
             tracks_share=recipe.tracks_share if loaded.settings.with_tracks else 0.0,
         )
-        return judging, ScenePlaces(np.flatnonzero(examples.pictured).tolist()), None, collate_places
+        places = np.flatnonzero(examples.pictured & taught).tolist()
+        return judging, ScenePlaces(places), None, collate_places
     has_route = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
     sampler = TaskSampler(
         has_route,
@@ -369,6 +384,7 @@ def _prepare(
         mirror_share=recipe.mirror_share,
         blur_share=recipe.blur_share,
         pictured=examples.pictured,
+        taught=taught,
         mirror_reflected=loaded.settings.reflection == "phrases",
         next_cameras=[examples.next_cameras(index) for index in range(len(examples))]
         if recipe.picture_share
@@ -392,7 +408,11 @@ def _inherit_log(log: Path, sources: Sequence[Path]) -> None:
 
 
 def _about(
-    recipe: Recipe, examples: Examples, on_examples: OnExamples | None, tried: AttemptsOn | None
+    recipe: Recipe,
+    examples: Examples,
+    taught: npt.NDArray[np.bool_],
+    on_examples: OnExamples | None,
+    tried: AttemptsOn | None,
 ) -> Mapping[str, Any]:
     about = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     about |= {"tasks": dict(recipe.tasks), "weights": dict(recipe.weights)}
@@ -403,4 +423,5 @@ def _about(
     if tried is not None:
         right = sum(each.correct for each in tried.attempts)
         about |= {"failures_count": len(tried.attempts) - right, "right_answers_count": right}
-    return about | {"examples": len(examples), "episodes": len(np.unique(examples.episode))}
+    episodes = len(np.unique(examples.episode[taught]))
+    return about | {"examples": int(taught.sum()), "episodes": episodes}

@@ -58,9 +58,13 @@ def generate(
         typer.Option(help="Folder of a small planner (`train teacher`) that drives; else as --service."),
     ] = None,
     tracks: Annotated[bool, typer.Option(help="Tell that model the tracks of the objects around.")] = False,
+    careless: Annotated[
+        bool,
+        typer.Option(help="--small overlooks everybody for up to two seconds now and then."),
+    ] = False,
     pictures: Annotated[
         bool,
-        typer.Option(help="Without, --small makes scenes in no time; readers of tracks learn from them."),
+        typer.Option(help="Without, with --no-dense, scenes are made many times as fast."),
     ] = True,
 ) -> None:
     """Drive episodes in MetaDrive and store their scenes; run again after a kill, it resumes."""
@@ -78,6 +82,7 @@ def generate(
             width_px=width,
             driver=driver,
             tracks=tracks,
+            careless=careless,
             pictures=pictures,
         )
         seeds = range(first_seed, first_seed + episodes)

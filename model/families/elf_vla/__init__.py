@@ -27,6 +27,7 @@ def _family(name: str, task: str, inputs: TextInputs, title: str, *, refines: bo
         read=read,
         times_s=its.TIMES_S,
         teach=teach,
+        lesson_needs=("thoughts",),
         title=title,
         refines=refines,
     )

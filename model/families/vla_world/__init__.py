@@ -27,6 +27,7 @@ VLA_WORLD: Final = Family(
     read=read,
     times_s=its.TIMES_S,
     teach=teach,
+    lesson_needs=("perceived",),
     title="perceive-think-answer",
     imagination=Imagination(
         *(its.IMAGINE, its.IMAGINED, its.UNSEEN, its.CAMERA),

@@ -14,7 +14,7 @@ from PIL import Image
 from clients.metadrive.drive import TAKE_OVER, DriveConfig
 from clients.metadrive.generate import GenerateConfig, GenerationError, generate
 from clients.metadrive.own_states import own_states
-from clients.metadrive.pilots import ConstantVelocity, Planned
+from clients.metadrive.pilots import Careless, ConstantVelocity, Planned
 from clients.metadrive.replay import ReplayError, setting_of
 from model.driving.metrics import collides, leaves_road
 from model.driving.scene import Scene
@@ -97,10 +97,50 @@ def test_a_pilot_without_eyes_has_pictures_where_they_are_wanted(tmp_path: Path)
         asked = replace(config, pictures=pictures)
         assert generate(folder, range(4, 5), workers=1, config=asked, pilot=ConstantVelocity).scenes > 0
         assert {labelled.scene.has_pictures for labelled in read_scenes(folder)} == {pictures}
-    with pytest.raises(GenerationError, match="can do without pictures"):
-        GenerateConfig(pictures=False)
+
+
+def test_the_expert_s_scenes_are_the_same_without_pictures(tmp_path: Path) -> None:
+    config = GenerateConfig(
+        stride_s=1.0, duration_s=16.0, block=1, dense=False, width_px=112, drifts=True, lapses=True
+    )
+    for pictures in (True, False):
+        asked = replace(config, pictures=pictures)
+        generate(tmp_path / str(pictures), range(7, 8), workers=1, config=asked)
+    seen, blind = (list(read_scenes(tmp_path / str(pictures))) for pictures in (True, False))
+    assert len(seen) == len(blind) > 0
+    for one, other in zip(seen, blind, strict=True):
+        assert one.scene.has_pictures
+        assert not other.scene.has_pictures
+        assert one.scene.scene_id == other.scene.scene_id
+        np.testing.assert_array_equal(one.scene.history, other.scene.history)
+        np.testing.assert_array_equal(one.future, other.future)
+        assert len(one.agents) == len(other.agents)
+
+
+def test_a_careless_pilot_overlooks_everybody_for_a_while(tmp_path: Path) -> None:
+    scene = own_states(SEED, ConstantVelocity(), config=CONFIG)[0][0].given(route=True, tracks=True)
+    assert scene.tracks
+    runs: list[list[bool]] = []
+    for seed in range(40):
+        pilot = Remembering()
+        careless, overlooked = Careless(pilot, seed), list[bool]()
+        for _ in range(80):
+            careless.plan(scene)
+            overlooked.append(not pilot.shown[scene.scene_id].tracks)
+        runs.append(overlooked)
+    assert 10 < sum(not any(run) for run in runs) < 30
+    lengths = [len(each) for run in runs for each in "".join("x" if one else " " for one in run).split()]
+    assert min(lengths) == 1
+    again = Careless(pilot := Remembering(), 3)
+    for told in runs[3]:
+        again.plan(scene)
+        assert told == (not pilot.shown[scene.scene_id].tracks)
+    with pytest.raises(GenerationError, match="the expert has lapses"):
+        GenerateConfig(dense=False, careless=True)
 
 
 def test_what_only_the_expert_s_drives_have_is_refused() -> None:
     with pytest.raises(GenerationError, match="no dense targets"):
         GenerateConfig(driver="scripted 1")
+    with pytest.raises(GenerationError, match="without pictures there are no dense targets"):
+        GenerateConfig(pictures=False)

@@ -29,6 +29,7 @@ EXAMPLES = Examples.from_scenes(SCENES, (FRONT_WIDE,))
 EIGHT = [[4.0 * step, 0.5, 0.02] for step in range(1, 9)]
 SECTIONS = "<feedback>\n**1. Meta action analysis:** It\u2019s too fast.\n</feedback>"
 FORMATS = ("elf_vla", "elf_vla_refine")
+ALL = np.ones(len(EXAMPLES), np.bool_)
 
 
 def row(scene_id: str, *, correct: bool = False, think: str | None = str(SOME)) -> FeedbackRow:
@@ -62,7 +63,7 @@ def elf(resampling_checkpoint: Path) -> Loaded:
 
 def dataset(elf: Loaded, rows: list[FeedbackRow]) -> ResponseDataset:
     examples = Examples.from_scenes(SCENES, elf.settings.cameras)
-    found = attempts_on(examples, rows, HALF_SECONDS_S)
+    found = attempts_on(examples, rows, HALF_SECONDS_S, ALL)
     return ResponseDataset(
         examples,
         elf.codec,
@@ -77,15 +78,23 @@ def dataset(elf: Loaded, rows: list[FeedbackRow]) -> ResponseDataset:
 
 def test_answers_find_their_scenes_and_times() -> None:
     dense = [[0.8 * step, 0.5, 0.02] for step in range(1, 65)]
-    found = attempts_on(EXAMPLES, [row("scene-4"), replace(row("scene-0"), trajectory=dense)], HALF_SECONDS_S)
+    found = attempts_on(
+        EXAMPLES, [row("scene-4"), replace(row("scene-0"), trajectory=dense)], HALF_SECONDS_S, ALL
+    )
     assert found.examples.tolist() == [4, 0]
     for each in found.attempts:
         np.testing.assert_allclose(each.attempt.trajectory[:, [0, 1, 3]], EIGHT, rtol=1e-6)
         assert "It's too fast." in each.attempt.feedback
     with pytest.raises(ValueError, match="feedback on scene nowhere, which is not among"):
-        attempts_on(EXAMPLES, [row("nowhere")], HALF_SECONDS_S)
+        attempts_on(EXAMPLES, [row("nowhere")], HALF_SECONDS_S, ALL)
     with pytest.raises(ValueError, match="draw 1 in scene scene-4 is right and has no thoughts"):
-        attempts_on(EXAMPLES, [row("scene-4", correct=True, think=None)], HALF_SECONDS_S)
+        attempts_on(EXAMPLES, [row("scene-4", correct=True, think=None)], HALF_SECONDS_S, ALL)
+
+
+def test_wrong_answers_are_left_out_where_the_expert_tells_no_thoughts() -> None:
+    rows = [row("scene-4"), row("scene-4", correct=True), row("scene-0")]
+    found = attempts_on(EXAMPLES, rows, HALF_SECONDS_S, np.arange(len(EXAMPLES)) != 4)
+    assert [(int(place), each.correct) for place, each in zip(*found, strict=True)] == [(4, True), (0, False)]
 
 
 def test_what_was_wrong_is_corrected_and_what_was_right_is_said_again(elf: Loaded) -> None:
@@ -104,7 +113,7 @@ def test_what_was_wrong_is_corrected_and_what_was_right_is_said_again(elf: Loade
 
 def test_training_reads_the_prompts_that_the_engine_reads(elf: Loaded) -> None:
     rows = [row("scene-4")]
-    [tried] = attempts_on(EXAMPLES, rows, HALF_SECONDS_S).attempts
+    [tried] = attempts_on(EXAMPLES, rows, HALF_SECONDS_S, ALL).attempts
     built = elf.inputs.build(SCENES[4].scene, "elf_vla_refine", tried.attempt)
     assert dataset(elf, rows)[Item(4, "elf_vla_refine", True, attempt=0)].prompt == built.prompt.ids.tolist()
 
@@ -179,6 +188,6 @@ def test_a_run_learns_to_refine_and_tells_so(resampling_checkpoint: Path, tmp_pa
 
 
 def test_a_right_answer_is_told_as_it_was(elf: Loaded) -> None:
-    [tried] = attempts_on(EXAMPLES, [row("scene-4", correct=True)], HALF_SECONDS_S).attempts
+    [tried] = attempts_on(EXAMPLES, [row("scene-4", correct=True)], HALF_SECONDS_S, ALL).attempts
     assert isinstance(tried, JudgedAttempt)
     assert tried.thinking == str(SOME)

@@ -279,6 +279,16 @@ def test_each_chance_is_taken_as_often_as_asked() -> None:
     assert len(mixed) <= 8
 
 
+def test_examples_that_teach_nothing_are_left_out_of_all_epochs() -> None:
+    taught = np.arange(40) % 5 > 0
+    sampler = TaskSampler(np.ones(40, np.bool_), 4, {"elf_vla": 1.0}, 0.5, seed=0, taught=taught)
+    for epoch in range(2):
+        sampler.set_epoch(epoch)
+        batches = list(sampler)
+        assert len(batches) == len(sampler) == 8
+        assert sorted(item.index for batch in batches for item in batch) == np.flatnonzero(taught).tolist()
+
+
 def test_examples_without_pictures_are_learned_by_their_tracks(resampling_checkpoint: Path) -> None:
     pictured = np.arange(len(EXAMPLES)) % 2 == 0
     tasks = {"traj_only": 0.5, "cf_vla": 0.5}

@@ -84,6 +84,23 @@ def test_a_checkpoint_learns_a_format_that_it_did_not_write(
     assert [row["step"] for row in rows if f"min_ade_m/{format}+route" in row] == [4]
 
 
+def test_scenes_that_do_not_tell_what_is_taught_are_left_out(
+    resampling_checkpoint: Path, tmp_path: Path
+) -> None:
+    settings = RunSettings(tmp_path / "cache", bf16=False)
+    # Without the road's surface nothing is perceived; that leaves no thoughts either.
+    silent = [replace(each, drivable=(), lane_map=None) for each in SCENES[:6]]
+    write_scenes(tmp_path / "some" / "a.parquet", [*silent, *SCENES[6:12]])
+    write_scenes(tmp_path / "none" / "a.parquet", silent)
+    for recipe in ("elf-sft", "world-sft"):
+        run(short(recipe), tmp_path / "some", resampling_checkpoint, tmp_path / recipe, settings)
+        [stage] = load(tmp_path / recipe).card.details["stages"][-1:]
+        assert stage["examples"] == 6
+        with pytest.raises(ValueError, match=f"no scene tells what recipe {recipe} teaches"):
+            run(short(recipe), tmp_path / "none", resampling_checkpoint, tmp_path / "no", settings)
+    assert not (tmp_path / "no").exists()
+
+
 def test_pictures_are_learned_with_codes_that_the_checkpoint_keeps(
     resampling_checkpoint: Path, scenes: Path, tmp_path: Path
 ) -> None:
