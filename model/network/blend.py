@@ -13,14 +13,15 @@ from torch import Tensor
 
 from model.network.card import CheckpointError
 from model.network.checkpoint import Loaded
-from model.network.vla import is_vision
+from model.network.vla import is_planner, is_vision
 
 
 def blend(before: Loaded, after: Loaded, share: float) -> Loaded:
-    """``after`` with the weights of its decoder and small planners moved back towards those of ``before``.
+    """``after`` with the weights of its decoder moved back towards those of ``before``.
 
     What sees (the vision tower, what gathers its tokens and reads facts from them) stays as it is in
-    ``after``: between two readings of pictures lies none.
+    ``after``: between two readings of pictures lies none. So do the small planners: they learn from enough
+    scenes not to know them by heart, and what lies between two of them plans worse than the second.
 
     Args:
         before, after: checkpoints of one architecture, the second trained from the first.
@@ -40,7 +41,7 @@ def blend(before: Loaded, after: Loaded, share: float) -> Loaded:
     with torch.no_grad():
         after.model.load_state_dict(
             {
-                name: value if is_vision(name) else _between(old[name], value, share)
+                name: value if is_vision(name) or is_planner(name) else _between(old[name], value, share)
                 for name, value in new.items()
             }
         )

@@ -337,3 +337,9 @@ def is_vision(name: str) -> bool:
     """
     name = f".{name}"
     return ".visual." in name or (".resampler." in name and ".intent." not in name)
+
+
+def is_planner(name: str) -> bool:
+    """Whether a weight belongs to a small planner; ``name`` as in `is_vision`."""
+    name = f".{name}"
+    return ".track_reader." in name or ".resampler.intent." in name

@@ -12,7 +12,10 @@ from model.network.card import CheckpointError
 from model.network.checkpoint import Loaded, load, save
 from service.cli.commands import app
 
-EYES = ("model.visual.", "resampler.facts.", "resampler.layers.", "resampler.queries")
+KEPT = (
+    *("model.visual.", "resampler.facts.", "resampler.layers.", "resampler.queries"),
+    *("resampler.intent.", "track_reader."),
+)
 
 
 @pytest.fixture
@@ -30,12 +33,12 @@ def after(resampling_checkpoint: Path) -> Loaded:
     return loaded
 
 
-def test_decoder_and_planners_go_back_and_what_sees_stays(before: Loaded, after: Loaded) -> None:
+def test_the_decoder_goes_back_and_what_sees_and_the_planners_stay(before: Loaded, after: Loaded) -> None:
     old = {name: value.clone() for name, value in before.model.named_parameters()}
     blended = blend(before, after, 0.25)
     for name, value in blended.model.named_parameters():
-        moved = 1.0 if name.startswith(EYES) else 0.25
-        if name.startswith(("model.language_model.", "resampler.intent.", "track_reader.", *EYES)):
+        moved = 1.0 if name.startswith(KEPT) else 0.25
+        if name.startswith(("model.language_model.", *KEPT)):
             torch.testing.assert_close(value, old[name] + moved, atol=1e-5, rtol=0)
     assert blended.card.details["stages"][-1] == {
         "name": "blend",
