@@ -132,7 +132,7 @@ def _seconds(work: Callable[[], object], repeats: int) -> float:
 
 def _navsim_seconds(repeats: int, folders: Sequence[Path], python: Path | None) -> float:
     command = [str(python or sys.executable), "-m", "model.bench.scoring", str(repeats), *map(str, folders)]
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[__name__.count(".")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=root, check=False)
     if done.returncode:
         raise RuntimeError(f"NAVSIM does not run: {done.stderr.strip()[-2000:]}")

@@ -279,9 +279,9 @@ def follow_without_network(folder: Path, port: int) -> None:
     listed_files = ("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard")
     names = subprocess.run(listed_files, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in filter(None, names.split("\0")):
-        if (ROOT / name).is_file():
+        if (ROOT / name).is_file() or (ROOT / name).is_symlink():
             (newcomer.folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / name, newcomer.folder / name)
+            shutil.copy(ROOT / name, newcomer.folder / name, follow_symlinks=False)
     _installed(newcomer.folder)
     follow_readme(newcomer)
     follow_own_cameras(newcomer)

@@ -45,7 +45,7 @@ def finished(arguments: list[str], folder: Path | None = None) -> str:
         stderr=subprocess.STDOUT,
         text=True,
         timeout=120,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         cwd=folder,
     )
     assert done.returncode == 0, done.stdout

@@ -31,7 +31,8 @@ def _fail_halfway(path: Path) -> None:
 def test_what_a_killed_process_left_goes_and_what_another_writes_stays(tmp_path: Path) -> None:
     path = tmp_path / "file"
     killed = (
-        "import os, sys; from pathlib import Path; from model.driving.whole_files import written_whole\n"
+        "import os, sys; from pathlib import Path\n"
+        "from model.driving.whole_files import written_whole\n"
         "with written_whole(Path(sys.argv[1])) as temporary:\n"
         "    temporary.write_text('half'); os.kill(os.getpid(), 9)"
     )

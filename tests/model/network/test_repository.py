@@ -33,7 +33,6 @@ from service.cli.commands import app
 from tests.checkpoints import write_untrained
 from tests.sockets import listening
 
-ROOT = Path(__file__).parents[3]
 # In a process of its own: `transformers` keeps what it loads from a folder's code for the whole process.
 LOADED_BY_NAME = """
 import sys
@@ -57,7 +56,7 @@ def run(
     code: str, *arguments: object, home: Path, hub: str | None = None
 ) -> subprocess.CompletedProcess[str]:
     """Run code, or a module, with ``home`` for the hub's client; offline, or with a ``hub`` at that URL."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "HF_HOME": str(home)}
+    environment = {**os.environ, "HF_HOME": str(home)}
     environment |= {"HF_HUB_OFFLINE": "1"} if hub is None else {"HF_HUB_OFFLINE": "0", "HF_ENDPOINT": hub}
     command = [sys.executable, *(["-c", code] if code else []), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, check=False)

@@ -155,8 +155,9 @@ def test_help_needs_neither_torch_nor_the_service() -> None:
 def ran_bare(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """A command where only `looktwice[serve]` is installed: neither the simulator nor other extras."""
     extras = ("accelerate", "cv2", "gltf", "hdrh", "metadrive", "panda3d", "psutil", "ray", "shapely")
-    code = f"import sys; sys.modules.update(dict.fromkeys({extras!r})); from service.cli import main; main()"
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    missing = f"import sys; sys.modules.update(dict.fromkeys({extras!r}))"
+    code = f"{missing}; from service.cli import main; main()"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(
         command, capture_output=True, text=True, cwd=folder, env=environment, check=False, timeout=300
