@@ -13,9 +13,9 @@ from typing import Final, TypeVar
 import httpx
 from pydantic import BaseModel, JsonValue, ValidationError
 
-from clients import wire
-from model.driving.plan import Plan, PlanError, parse_plan
-from model.driving.trajectory import (
+from looktwice.clients import wire
+from looktwice.model.driving.plan import Plan, PlanError, parse_plan
+from looktwice.model.driving.trajectory import (
     TEN_HZ_S,
     FloatArray,
     GeometryError,

@@ -24,8 +24,8 @@ import msgpack
 from httpx_sse import EventSource
 from pydantic import BaseModel
 
-from clients import wire, wire_feedback, wire_imagine, wire_refine, wire_scores
-from clients.answers import (
+from looktwice.clients import wire, wire_feedback, wire_imagine, wire_refine, wire_scores
+from looktwice.clients.answers import (
     BUSY_STATUSES,
     BadAnswer,
     LookedAt,
@@ -47,7 +47,7 @@ from clients.answers import (
     retry_after_s,
     unreachable,
 )
-from clients.requests import (
+from looktwice.clients.requests import (
     attempt_at,
     imagine_request,
     label_request,
@@ -55,7 +55,7 @@ from clients.requests import (
     refine_request,
     reflect_request,
 )
-from clients.streams import (
+from looktwice.clients.streams import (
     ImagineEvent,
     PlanEvent,
     RefineEvent,
@@ -64,11 +64,11 @@ from clients.streams import (
     plan_event,
     refine_event,
 )
-from clients.wire_values import with_pictures
-from model.driving.outcome import Outcome
-from model.driving.plan import Plan
-from model.driving.scene import Scene
-from model.driving.view import Surroundings
+from looktwice.clients.wire_values import with_pictures
+from looktwice.model.driving.outcome import Outcome
+from looktwice.model.driving.plan import Plan
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.view import Surroundings
 
 __all__ = [
     "Access",
@@ -187,7 +187,8 @@ class PlannerClient:
         return batch_results(self._ask("/v1/plan/batch", batch))
 
     def stream(self, asked: wire.PlanRequest | wire.ReflectRequest) -> Iterator[tuple[str, PlanEvent]]:
-        """What a draw writes, as it is written: names and data of `clients.wire.EVENTS`, at last ``done``.
+        """What a draw writes, as it is written: names and data of `looktwice.clients.wire.EVENTS`, at last
+        ``done``.
 
         Args:
             asked: see `plan_request` and `reflect_request`.
@@ -198,7 +199,8 @@ class PlannerClient:
         return self._stream(_path_of(asked), asked, plan_event)
 
     def stream_imagine(self, asked: wire_imagine.ImagineRequest) -> Iterator[tuple[str, ImagineEvent]]:
-        """Pictures as they are written: names and data of `clients.wire_imagine.EVENTS`, at last ``done``.
+        """Pictures as they are written: names and data of `looktwice.clients.wire_imagine.EVENTS`, at last
+        ``done``.
 
         Args:
             asked: see `imagine_request`.
@@ -209,7 +211,8 @@ class PlannerClient:
         return self._stream("/v1/imagine", asked, imagine_event)
 
     def stream_refine(self, asked: wire_refine.RefineRequest) -> Iterator[tuple[str, RefineEvent]]:
-        """Refinements as they are written: names and data of `clients.wire_refine.EVENTS`, at last ``done``.
+        """Refinements as they are written: names and data of `looktwice.clients.wire_refine.EVENTS`, at last
+        ``done``.
 
         Args:
             asked: see `refine_request`.

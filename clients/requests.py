@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from clients import wire, wire_imagine, wire_refine
-from clients.wire_values import rows, wire_agents, wire_scene
-from model.driving.outcome import Outcome
-from model.driving.plan import Plan
-from model.driving.scene import Scene
-from model.driving.trajectory import TEN_HZ_S, FloatArray
-from model.driving.view import Surroundings
+from looktwice.clients import wire, wire_imagine, wire_refine
+from looktwice.clients.wire_values import rows, wire_agents, wire_scene
+from looktwice.model.driving.outcome import Outcome
+from looktwice.model.driving.plan import Plan
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray
+from looktwice.model.driving.view import Surroundings
 
 
 def plan_request(

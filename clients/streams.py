@@ -9,8 +9,8 @@ import httpx
 from httpx_sse import ServerSentEvent
 from pydantic import BaseModel, ValidationError
 
-from clients import wire, wire_imagine, wire_refine
-from clients.answers import BadAnswer, PlanResult, ReflectResult, planned, reflected, typed
+from looktwice.clients import wire, wire_imagine, wire_refine
+from looktwice.clients.answers import BadAnswer, PlanResult, ReflectResult, planned, reflected, typed
 
 PlanEvent = (
     wire.PlanWritten
@@ -21,7 +21,7 @@ PlanEvent = (
     | PlanResult
     | ReflectResult
 )
-"""What a stream of plans or reflections tells; see `clients.wire.EVENTS`."""
+"""What a stream of plans or reflections tells; see `looktwice.clients.wire.EVENTS`."""
 ImagineEvent = (
     wire_imagine.PerceptionWritten
     | wire_imagine.PredictionWritten
@@ -29,7 +29,7 @@ ImagineEvent = (
     | wire_imagine.Picture
     | wire_imagine.ImagineResponse
 )
-"""What a stream of pictures tells; see `clients.wire_imagine.EVENTS`."""
+"""What a stream of pictures tells; see `looktwice.clients.wire_imagine.EVENTS`."""
 RefineEvent = (
     wire_refine.DraftJudged
     | wire.PlanWritten
@@ -39,7 +39,7 @@ RefineEvent = (
     | wire.TrajectoryWritten
     | wire_refine.RefineResponse
 )
-"""What a stream of refinements tells; see `clients.wire_refine.EVENTS`."""
+"""What a stream of refinements tells; see `looktwice.clients.wire_refine.EVENTS`."""
 
 _Event = TypeVar("_Event")
 Tell = Callable[[ServerSentEvent, httpx.Response], _Event | None]

@@ -9,8 +9,8 @@ from typing import Annotated, Final, Literal
 
 from pydantic import FailFast, Field, model_validator
 
-from clients.wire import RequestModel, ResponseModel, TeacherName
-from clients.wire_scores import ScoreRequest, ScoreTrajectory, ScoreVersion
+from looktwice.clients.wire import RequestModel, ResponseModel, TeacherName
+from looktwice.clients.wire_scores import ScoreRequest, ScoreTrajectory, ScoreVersion
 
 MAX_FEEDBACK: Final = 64
 """Trajectories of one request."""

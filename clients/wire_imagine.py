@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from clients.wire import (
+from looktwice.clients.wire import (
     MAX_SEED,
     AgentKind,
     Camera,

@@ -10,8 +10,8 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Discriminator, Field, Tag
 
-import clients.wire as wire
-from clients.wire import (
+import looktwice.clients.wire as wire
+from looktwice.clients.wire import (
     MAX_FEEDBACK_CHARACTERS,
     Deadline,
     Draw,
@@ -24,7 +24,7 @@ from clients.wire import (
     Scene,
     Timing,
 )
-from clients.wire_scores import ScoreVersion, TrajectoryScore
+from looktwice.clients.wire_scores import ScoreVersion, TrajectoryScore
 
 AUTO: Final = "auto"
 MAX_SECTION_CHARACTERS: Final = 700

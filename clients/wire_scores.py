@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import FailFast, Field, SkipValidation, model_validator
 
-from clients.wire import Length, Nearby, NearbyPoint, Problem, RequestModel, ResponseModel
+from looktwice.clients.wire import Length, Nearby, NearbyPoint, Problem, RequestModel, ResponseModel
 
 MAX_TRAJECTORIES: Final = 4096
 MAX_SCORED_TOGETHER: Final = 64

@@ -1,4 +1,4 @@
-"""Scenes and what is known about them, as `clients.wire` carries them."""
+"""Scenes and what is known about them, as `looktwice.clients.wire` carries them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from clients import wire
-from model.driving.scene import Agent, Scene, Track
+from looktwice.clients import wire
+from looktwice.model.driving.scene import Agent, Scene, Track
 
 
 def wire_scene(scene: Scene, decimals: int | None = None) -> wire.Scene:

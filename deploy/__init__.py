@@ -1,1 +1,1 @@
-"""Where the service runs; `deploy.ray` is the one part that is code."""
+"""Where the service runs; `looktwice.deploy.ray` is the one part that is code."""

@@ -10,8 +10,8 @@ from typing import Any, Final, Literal
 
 from hdrh.histogram import HdrHistogram
 
-from loadtests.exchange import BRANCHES, OUTCOMES, Exchange
-from loadtests.loads import Window
+from looktwice.loadtests.exchange import BRANCHES, OUTCOMES, Exchange
+from looktwice.loadtests.loads import Window
 
 _US_PER_S: Final = 1e6
 _LONGEST_US: Final = 3_600_000_000

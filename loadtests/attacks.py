@@ -23,11 +23,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from clients.wire import MSGPACK_MEDIA_TYPE
-from loadtests.exchange import Call
-from loadtests.mix import Kind
-from loadtests.sending import Target
-from model.driving.scene_store import SCENE_VERSION
+from looktwice.clients.wire import MSGPACK_MEDIA_TYPE
+from looktwice.loadtests.exchange import Call
+from looktwice.loadtests.mix import Kind
+from looktwice.loadtests.sending import Target
+from looktwice.model.driving.scene_store import SCENE_VERSION
 
 _DRIP_S: Final = 0.5
 """Between two bytes of a body that never ends, and between two looks at readiness."""

@@ -11,18 +11,18 @@ from typing import Any, Final, cast
 import httpx
 import msgpack
 
-from clients import wire
-from clients.planner import imagine_request, label_request, plan_request, reflect_request
-from clients.wire_imagine import ImagineControls
-from loadtests.exchange import Call
-from loadtests.mix import BATCH_SCENES, Kind, Mix, Payload, Work
-from model.driving.images import media_type
-from model.driving.labeller import expert_plan
-from model.driving.plan import Plan, parse_plan
-from model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, Clip, LabelledScene, Scene
-from model.driving.trajectory import STEP_S
-from model.driving.variations import fresh, moved
-from model.driving.view import Surroundings
+from looktwice.clients import wire
+from looktwice.clients.planner import imagine_request, label_request, plan_request, reflect_request
+from looktwice.clients.wire_imagine import ImagineControls
+from looktwice.loadtests.exchange import Call
+from looktwice.loadtests.mix import BATCH_SCENES, Kind, Mix, Payload, Work
+from looktwice.model.driving.images import media_type
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.plan import Plan, parse_plan
+from looktwice.model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, Clip, LabelledScene, Scene
+from looktwice.model.driving.trajectory import STEP_S
+from looktwice.model.driving.variations import fresh, moved
+from looktwice.model.driving.view import Surroundings
 
 PATHS: Final[dict[Work, str]] = {
     "plan": "/v1/plan",

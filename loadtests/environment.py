@@ -14,9 +14,9 @@ import psutil
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 
-from clients import wire
-from loadtests.mix import Mix
-from loadtests.sending import Target
+from looktwice.clients import wire
+from looktwice.loadtests.mix import Mix
+from looktwice.loadtests.sending import Target
 
 _ANSWER_WITHIN_S: Final = 10.0
 

@@ -7,8 +7,8 @@ from typing import Final, Literal, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from clients.wire import Deadline
-from loadtests.mix import Kind
+from looktwice.clients.wire import Deadline
+from looktwice.loadtests.mix import Kind
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from typing import Final, Protocol, Self
 import numpy as np
 import numpy.typing as npt
 
-from loadtests.exchange import MISSED, Call, Exchange
-from loadtests.sending import Sender, Target, connected
+from looktwice.loadtests.exchange import MISSED, Call, Exchange
+from looktwice.loadtests.sending import Sender, Target, connected
 
 Times = npt.NDArray[np.float64]
 

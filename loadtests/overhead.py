@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import httpx
 
-from clients.wire import PlanResponse
-from loadtests.bodies import make_calls
-from loadtests.mix import Payload, parse_mix
-from model.driving.scene import LabelledScene
+from looktwice.clients.wire import PlanResponse
+from looktwice.loadtests.bodies import make_calls
+from looktwice.loadtests.mix import Payload, parse_mix
+from looktwice.model.driving.scene import LabelledScene
 
 PAYLOADS: tuple[Payload, ...] = ("json", "msgpack", "multipart")
 

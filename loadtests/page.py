@@ -13,10 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from loadtests.accounting import PERCENTILES, Latencies, Summary
-from loadtests.exchange import BRANCHES, OUTCOMES, Exchange
-from loadtests.report import Report, latency_rows
-from loadtests.run import Result
+from looktwice.loadtests.accounting import PERCENTILES, Latencies, Summary
+from looktwice.loadtests.exchange import BRANCHES, OUTCOMES, Exchange
+from looktwice.loadtests.report import Report, latency_rows
+from looktwice.loadtests.run import Result
 
 _COLOURS: Final = {
     "direct": "#2b6cb0",

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from loadtests.accounting import PERCENTILES, Latencies, Summary
-from loadtests.exchange import BRANCHES, OUTCOMES
-from loadtests.run import Result, Setup
+from looktwice.loadtests.accounting import PERCENTILES, Latencies, Summary
+from looktwice.loadtests.exchange import BRANCHES, OUTCOMES
+from looktwice.loadtests.run import Result, Setup
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class Report:
 
     Attributes:
         began: date and time, ISO 8601.
-        client, service, versions: see `loadtests.environment`.
+        client, service, versions: see `looktwice.loadtests.environment`.
     """
 
     setup: Setup

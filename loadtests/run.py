@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from loadtests.accounting import Summary, faults, summarise
-from loadtests.exchange import Exchange
-from loadtests.loads import Crew, Load, Phase, Window, windows
-from loadtests.mix import Mix
-from loadtests.sending import Target
-from model.driving.scene import LabelledScene
+from looktwice.loadtests.accounting import Summary, faults, summarise
+from looktwice.loadtests.exchange import Exchange
+from looktwice.loadtests.loads import Crew, Load, Phase, Window, windows
+from looktwice.loadtests.mix import Mix
+from looktwice.loadtests.sending import Target
+from looktwice.model.driving.scene import LabelledScene
 
 WARM_UP = "warm-up"
 
@@ -135,7 +135,7 @@ def run(
 
 
 def check(summary: Summary, setup: Setup) -> list[str]:
-    """See `loadtests.accounting.faults`."""
+    """See `looktwice.loadtests.accounting.faults`."""
     return faults(summary, setup.lag_limit_s)
 
 

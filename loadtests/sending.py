@@ -13,7 +13,7 @@ from typing import Final
 import httpx
 from httpx_sse import EventSource, SSEError
 
-from loadtests.exchange import BAD_ANSWER, Call, Exchange, Verdict, read_answer, refusal
+from looktwice.loadtests.exchange import BAD_ANSWER, Call, Exchange, Verdict, read_answer, refusal
 
 _FIRST: Final = ("plan", "picture")
 """Events that somebody waits for; a stream has one of the two."""

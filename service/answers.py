@@ -7,16 +7,16 @@ from typing import Final, get_args
 
 import numpy as np
 
-import clients.wire as wire
-from model.driving.agreement import Agreement
-from model.driving.plan import Plan, plan_changes, plan_iou
-from model.driving.trajectory import TEN_HZ_S, agreed
-from model.engines.engine import Draw
-from model.families.registry import family_named
-from model.formats.pieces import Plain
-from model.network.model_card import ModelCard
-from service.planning import Planned
-from service.problems import REFUSED, ProblemError
+import looktwice.clients.wire as wire
+from looktwice.model.driving.agreement import Agreement
+from looktwice.model.driving.plan import Plan, plan_changes, plan_iou
+from looktwice.model.driving.trajectory import TEN_HZ_S, agreed
+from looktwice.model.engines.engine import Draw
+from looktwice.model.families.registry import family_named
+from looktwice.model.formats.pieces import Plain
+from looktwice.model.network.model_card import ModelCard
+from looktwice.service.planning import Planned
+from looktwice.service.problems import REFUSED, ProblemError
 
 _DECIMALS: Final = 4
 """Of poses on the wire: a tenth of a millimetre."""

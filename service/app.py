@@ -13,29 +13,29 @@ from fastapi_offline import FastAPIOffline
 from prometheus_client import CollectorRegistry
 from starlette.middleware.cors import CORSMiddleware
 
-from clients.labelling.teachers.rules import RuleTeacher
-from clients.labelling.teachers.teacher import Teacher
-from clients.wire import IDEMPOTENCY_KEY_HEADER, REQUEST_ID_HEADER
-from model.engines.engine import Engine
-from service.admission import Admission
-from service.auth import Guard
-from service.body_limit import BodyLimit
-from service.dependencies import Dependencies
-from service.errors import install_error_handlers
-from service.idempotency import Idempotency
-from service.inspector.page import add_inspector
-from service.lifecycle import Lifecycle
-from service.logs import configure_logging
-from service.metrics import Metrics
-from service.middleware import Around
-from service.openapi import describe
-from service.planning import Limits, Planning
-from service.pulse import Pulse
-from service.rates import Rates
-from service.routes import make_router
-from service.scorer import Scorer
-from service.settings import Settings
-from service.traces import Traces, traces_from_environment
+from looktwice.clients.labelling.teachers.rules import RuleTeacher
+from looktwice.clients.labelling.teachers.teacher import Teacher
+from looktwice.clients.wire import IDEMPOTENCY_KEY_HEADER, REQUEST_ID_HEADER
+from looktwice.model.engines.engine import Engine
+from looktwice.service.admission import Admission
+from looktwice.service.auth import Guard
+from looktwice.service.body_limit import BodyLimit
+from looktwice.service.dependencies import Dependencies
+from looktwice.service.errors import install_error_handlers
+from looktwice.service.idempotency import Idempotency
+from looktwice.service.inspector.page import add_inspector
+from looktwice.service.lifecycle import Lifecycle
+from looktwice.service.logs import configure_logging
+from looktwice.service.metrics import Metrics
+from looktwice.service.middleware import Around
+from looktwice.service.openapi import describe
+from looktwice.service.planning import Limits, Planning
+from looktwice.service.pulse import Pulse
+from looktwice.service.rates import Rates
+from looktwice.service.routes import make_router
+from looktwice.service.scorer import Scorer
+from looktwice.service.settings import Settings
+from looktwice.service.traces import Traces, traces_from_environment
 
 DESCRIPTION = """Planning for driving models that look twice before they act.
 

@@ -9,10 +9,10 @@ from typing import Final
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.errors import problem_response
-from service.keys import Keys
-from service.metrics import Metrics
-from service.problems import MISDIRECTED, UNAUTHORIZED, ProblemError
+from looktwice.service.errors import problem_response
+from looktwice.service.keys import Keys
+from looktwice.service.metrics import Metrics
+from looktwice.service.problems import MISDIRECTED, UNAUTHORIZED, ProblemError
 
 OPEN_PATHS: Final = frozenset({"/healthz", "/readyz"})
 """Probes: whoever runs a service asks them without a key, and under its address of the moment."""

@@ -6,15 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from clients.labelling.teachers.teacher import Teacher
-from model.engines.engine import Engine
-from service.idempotency import Idempotency
-from service.lifecycle import Lifecycle
-from service.metrics import Metrics
-from service.planning import Planning
-from service.pulse import Pulse
-from service.scorer import Scorer
-from service.settings import Settings
+from looktwice.clients.labelling.teachers.teacher import Teacher
+from looktwice.model.engines.engine import Engine
+from looktwice.service.idempotency import Idempotency
+from looktwice.service.lifecycle import Lifecycle
+from looktwice.service.metrics import Metrics
+from looktwice.service.planning import Planning
+from looktwice.service.pulse import Pulse
+from looktwice.service.scorer import Scorer
+from looktwice.service.settings import Settings
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import msgpack
 
-from service.problems import BODY_TOO_LARGE, INVALID_BODY, INVALID_JSON, ProblemError
+from looktwice.service.problems import BODY_TOO_LARGE, INVALID_BODY, INVALID_JSON, ProblemError
 
 MAX_VALUES: Final = 250_000
 """Numbers, texts, lists and objects together: a batch of 64 scenes has 30,000, a label's annotations of a

@@ -12,11 +12,11 @@ from pydantic import BaseModel, ValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from clients.wire import PROBLEM_MEDIA_TYPE, Fault, Problem
-from service import openai_errors
-from service.callers import CALLER_LEFT_STATUS, CallerLeft
-from service.metrics import Metrics
-from service.problems import (
+from looktwice.clients.wire import PROBLEM_MEDIA_TYPE, Fault, Problem
+from looktwice.service import openai_errors
+from looktwice.service.callers import CALLER_LEFT_STATUS, CallerLeft
+from looktwice.service.metrics import Metrics
+from looktwice.service.problems import (
     BODY_TIMEOUT,
     BODY_TOO_LARGE,
     INTERNAL,

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from model.driving.images import encode_jpeg
-from model.driving.scene import CLIP_FRAMES
-from model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS, ROUTE_SPACING_M
+from looktwice.model.driving.images import encode_jpeg
+from looktwice.model.driving.scene import CLIP_FRAMES
+from looktwice.model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS, ROUTE_SPACING_M
 
 
 def example_request(cameras: tuple[str, ...]) -> dict[str, Any]:

@@ -9,34 +9,34 @@ from typing import Final, Literal
 
 import structlog
 
-import clients.wire_feedback as wire_feedback
-from clients.labelling.retries import with_retries
-from clients.labelling.teachers.feedback import (
+import looktwice.clients.wire_feedback as wire_feedback
+from looktwice.clients.labelling.retries import with_retries
+from looktwice.clients.labelling.teachers.feedback import (
     FeedbackQuestion,
     FeedbackTeacher,
     ask_feedback,
     check_feedback,
     question_of,
 )
-from clients.labelling.teachers.teacher import (
+from looktwice.clients.labelling.teachers.teacher import (
     Answer,
     ReflectionRefused,
     TeacherBusy,
     TeacherClosed,
     TeacherError,
 )
-from clients.wire import TeacherName
-from model.driving.hashing import hash_of
-from model.driving.pdm.course import Course
-from model.driving.pdm.failures import Fact
-from model.driving.pdm.feedback import Feedback, FeedbackError, RuleFeedback, parse_feedback
-from model.driving.pdm.judged import JudgedPlan, Number
-from model.driving.pdm.judging import Said, judged_plans
-from model.driving.pdm.rule_teacher import NAME, REVISION, feedback_on
-from model.driving.pdm.world import ScoreError
-from service.inspector_scenes import BundledScenes
-from service.metrics import Metrics
-from service.problems import (
+from looktwice.clients.wire import TeacherName
+from looktwice.model.driving.hashing import hash_of
+from looktwice.model.driving.pdm.course import Course
+from looktwice.model.driving.pdm.failures import Fact
+from looktwice.model.driving.pdm.feedback import Feedback, FeedbackError, RuleFeedback, parse_feedback
+from looktwice.model.driving.pdm.judged import JudgedPlan, Number
+from looktwice.model.driving.pdm.judging import Said, judged_plans
+from looktwice.model.driving.pdm.rule_teacher import NAME, REVISION, feedback_on
+from looktwice.model.driving.pdm.world import ScoreError
+from looktwice.service.inspector_scenes import BundledScenes
+from looktwice.service.metrics import Metrics
+from looktwice.service.problems import (
     FEEDBACK_REFUSED,
     INVALID_FEEDBACK,
     INVALID_LABELS,
@@ -46,7 +46,7 @@ from service.problems import (
     ProblemError,
     at,
 )
-from service.scoring import rounded, scores_of, trajectory_of
+from looktwice.service.scoring import rounded, scores_of, trajectory_of
 
 log = structlog.stdlib.get_logger()
 
@@ -90,8 +90,8 @@ def feedback_given(asked: wire_feedback.FeedbackRequest, bundled: BundledScenes,
     """The answer to one request, the built-in teacher having written.
 
     Raises:
-        ProblemError: what `service.scoring.scored` refuses; labels that no trajectory can be judged by;
-            written feedback that is for another plan, or tells what is no fact.
+        ProblemError: what `looktwice.service.scoring.scored` refuses; labels that no trajectory can be judged
+            by; written feedback that is for another plan, or tells what is no fact.
     """
     truth = None if asked.ground_truth is None else trajectory_of(asked.ground_truth, "/ground_truth")
     if truth is not None and asked.reference is None:

@@ -7,25 +7,25 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Body, Request
 from fastapi.openapi.models import Example
 
-import clients.wire_feedback as wire_feedback
-from clients.labelling.teachers.feedback import FeedbackTeacher
-from service.admission import Admission
-from service.callers import while_connected
-from service.dependencies import Dependencies
-from service.examples import example_feedback
-from service.feedback import taught
-from service.openapi import PACKED, payloads, problems
-from service.payloads import payload_route
-from service.planning import full_as_problem, let_in
-from service.planning_routes import arrival_of, respond
-from service.problems import (
+import looktwice.clients.wire_feedback as wire_feedback
+from looktwice.clients.labelling.teachers.feedback import FeedbackTeacher
+from looktwice.service.admission import Admission
+from looktwice.service.callers import while_connected
+from looktwice.service.dependencies import Dependencies
+from looktwice.service.examples import example_feedback
+from looktwice.service.feedback import taught
+from looktwice.service.openapi import PACKED, payloads, problems
+from looktwice.service.payloads import payload_route
+from looktwice.service.planning import full_as_problem, let_in
+from looktwice.service.planning_routes import arrival_of, respond
+from looktwice.service.problems import (
     FEEDBACK_REFUSED,
     INVALID_FEEDBACK,
     OTHER_PLAN,
     TEACHER_AWAY,
     TEACHER_REFUSED,
 )
-from service.scoring_routes import SCORING_REFUSALS
+from looktwice.service.scoring_routes import SCORING_REFUSALS
 
 EXAMPLES: Final[dict[str, Example]] = {"why one of two trajectories is wrong": {"value": example_feedback()}}
 

@@ -10,7 +10,7 @@ from typing import Final
 
 from starlette.responses import Response
 
-from service.problems import IDEMPOTENCY_KEY_REUSED, ProblemError
+from looktwice.service.problems import IDEMPOTENCY_KEY_REUSED, ProblemError
 
 REPLAYED_HEADER: Final = "Idempotency-Replayed"
 _KEPT: Final = 1024

@@ -8,18 +8,18 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Body, Request
 from fastapi.openapi.models import Example
 
-import clients.wire_imagine as wire_imagine
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
-from service.callers import while_connected
-from service.dependencies import Dependencies
-from service.examples import example_imagining
-from service.imagining import ImagineTeller, imagine_answer, imagining_of
-from service.openapi import answers_and_stream, payloads, problems
-from service.payloads import payload_route
-from service.planning import Planned, last
-from service.planning_routes import REFUSALS, arrival_of, respond
-from service.problems import CANNOT_IMAGINE
-from service.streaming import server_sent, streamed
+import looktwice.clients.wire_imagine as wire_imagine
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
+from looktwice.service.callers import while_connected
+from looktwice.service.dependencies import Dependencies
+from looktwice.service.examples import example_imagining
+from looktwice.service.imagining import ImagineTeller, imagine_answer, imagining_of
+from looktwice.service.openapi import answers_and_stream, payloads, problems
+from looktwice.service.payloads import payload_route
+from looktwice.service.planning import Planned, last
+from looktwice.service.planning_routes import REFUSALS, arrival_of, respond
+from looktwice.service.problems import CANNOT_IMAGINE
+from looktwice.service.streaming import server_sent, streamed
 
 EXAMPLES: Final[dict[str, Example]] = {
     "what the left camera will see": {"value": example_imagining((FRONT_WIDE, FRONT_TELE))},

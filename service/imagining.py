@@ -8,16 +8,16 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import clients.wire as wire
-import clients.wire_imagine as wire_imagine
-from model.driving.images import encode_png
-from model.driving.perceived import Perceived, PerceivedAgent
-from model.engines.engine import CodesWritten, Draw, SectionFinished
-from model.families.family import Imagination, Predicted
-from model.families.registry import family_named
-from model.network.model_card import ModelCard
-from service.planning import Arrival, Begun, Paint, Planned, SceneEvent
-from service.problems import CANNOT_IMAGINE, UNKNOWN_FORMAT, ProblemError
+import looktwice.clients.wire as wire
+import looktwice.clients.wire_imagine as wire_imagine
+from looktwice.model.driving.images import encode_png
+from looktwice.model.driving.perceived import Perceived, PerceivedAgent
+from looktwice.model.engines.engine import CodesWritten, Draw, SectionFinished
+from looktwice.model.families.family import Imagination, Predicted
+from looktwice.model.families.registry import family_named
+from looktwice.model.network.model_card import ModelCard
+from looktwice.service.planning import Arrival, Begun, Paint, Planned, SceneEvent
+from looktwice.service.problems import CANNOT_IMAGINE, UNKNOWN_FORMAT, ProblemError
 
 _DECIMALS = 4
 
@@ -101,7 +101,7 @@ class ImagineTeller:
         self._rows: dict[int, int] = {}
 
     async def __call__(self, event: SceneEvent) -> list[tuple[str, Written]]:
-        """Events of `clients.wire_imagine.EVENTS` with their data."""
+        """Events of `looktwice.clients.wire_imagine.EVENTS` with their data."""
         imagination = self._imagination
         match event:
             case Begun(paint):

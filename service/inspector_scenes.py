@@ -11,12 +11,12 @@ from typing import Final, cast
 
 import pyarrow.parquet as pq
 
-import clients.wire as wire
-from clients.wire_values import rows, wire_agents, wire_scene, wire_tracks
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import SceneFileError, count_scenes, read_scenes
-from model.driving.tracks import tracks_of
-from service.problems import INVALID_SCENE_FILE, SCENES_UNREADABLE, UNKNOWN_SCENE, ProblemError
+import looktwice.clients.wire as wire
+from looktwice.clients.wire_values import rows, wire_agents, wire_scene, wire_tracks
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import SceneFileError, count_scenes, read_scenes
+from looktwice.model.driving.tracks import tracks_of
+from looktwice.service.problems import INVALID_SCENE_FILE, SCENES_UNREADABLE, UNKNOWN_SCENE, ProblemError
 
 MAX_SCENES_SHOWN: Final = 64
 MAX_SCENES_IN_FILE: Final = 1000

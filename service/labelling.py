@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 import structlog
 
-import clients.wire as wire
-from clients.labelling.retries import with_retries
-from clients.labelling.teachers.teacher import (
+import looktwice.clients.wire as wire
+from looktwice.clients.labelling.retries import with_retries
+from looktwice.clients.labelling.teachers.teacher import (
     AnnotationsMissing,
     Answer,
     NothingInView,
@@ -22,12 +22,12 @@ from clients.labelling.teachers.teacher import (
     TeacherError,
     ask,
 )
-from model.driving.outcome import Outcome
-from model.driving.scene import AGENT_KINDS, Agent, SceneError
-from model.driving.tracks import track_of
-from model.driving.view import Surroundings
-from service.metrics import Metrics
-from service.problems import (
+from looktwice.model.driving.outcome import Outcome
+from looktwice.model.driving.scene import AGENT_KINDS, Agent, SceneError
+from looktwice.model.driving.tracks import track_of
+from looktwice.model.driving.view import Surroundings
+from looktwice.service.metrics import Metrics
+from looktwice.service.problems import (
     INVALID_REQUEST,
     LABEL_REFUSED,
     NEEDS_ANNOTATIONS,
@@ -37,7 +37,7 @@ from service.problems import (
     ProblemError,
     at,
 )
-from service.validation import plan_of, scene_of
+from looktwice.service.validation import plan_of, scene_of
 
 log = structlog.stdlib.get_logger()
 

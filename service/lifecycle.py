@@ -9,10 +9,10 @@ from typing import Final
 
 import structlog
 
-from model.engines.engine import Engine, Load
-from model.network.model_card import ModelCard
-from service.metrics import Metrics
-from service.problems import (
+from looktwice.model.engines.engine import Engine, Load
+from looktwice.model.network.model_card import ModelCard
+from looktwice.service.metrics import Metrics
+from looktwice.service.problems import (
     CHECKPOINT_FAILED,
     DRAINING,
     ENGINE_FAILED,

@@ -16,13 +16,13 @@ from prometheus_client import (
 from prometheus_client.core import CounterMetricFamily
 from prometheus_client.registry import Collector
 
-from model.driving.agreement import PARTS, Agreement
-from model.driving.plan import plan_iou
-from model.engines.engine import Draw, Load, Thinking
-from model.network.model_card import ModelCard
-from service.admission import Admission
-from service.logs import lines_lost
-from service.problems import REJECTIONS, Kind
+from looktwice.model.driving.agreement import PARTS, Agreement
+from looktwice.model.driving.plan import plan_iou
+from looktwice.model.engines.engine import Draw, Load, Thinking
+from looktwice.model.network.model_card import ModelCard
+from looktwice.service.admission import Admission
+from looktwice.service.logs import lines_lost
+from looktwice.service.problems import REJECTIONS, Kind
 
 LATENCY_BUCKETS_S: Final = (
     *(0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.75),

@@ -13,11 +13,11 @@ import structlog
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from clients.wire import REQUEST_ID_HEADER
-from service.errors import problem_response
-from service.metrics import Metrics
-from service.problems import DRAINING, ProblemError, unforeseen
-from service.traces import Traces
+from looktwice.clients.wire import REQUEST_ID_HEADER
+from looktwice.service.errors import problem_response
+from looktwice.service.metrics import Metrics
+from looktwice.service.problems import DRAINING, ProblemError, unforeseen
+from looktwice.service.traces import Traces
 
 _SANE_REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._:-]{1,128}")
 _QUIET: Final = frozenset({"/healthz", "/readyz", "/metrics"})

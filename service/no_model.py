@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.engine import Event, Load, PlanRequest, RequestError
-from model.network.model_card import ModelCard
+from looktwice.model.engines.engine import Event, Load, PlanRequest, RequestError
+from looktwice.model.network.model_card import ModelCard
 
 CARD: Final = ModelCard(
     name="no-model",
@@ -25,7 +25,8 @@ CARD: Final = ModelCard(
 
 
 class NoModel:
-    """`model.engines.engine.Engine` without a model: it is always ready, and refuses every scene."""
+    """`looktwice.model.engines.engine.Engine` without a model: it is always ready, and refuses every
+    scene."""
 
     def __init__(self) -> None:
         self._stopped = asyncio.Event()

@@ -14,12 +14,19 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-import clients.wire as wire
-from model.driving.scene import CLIP_FRAMES
-from model.network.model_card import ModelCard
-from service.answers import plan_answer, wire_branch
-from service.planning import Planned
-from service.problems import INVALID_CLIP, INVALID_IMAGE, INVALID_REQUEST, UNKNOWN_MODEL, ProblemError, at
+import looktwice.clients.wire as wire
+from looktwice.model.driving.scene import CLIP_FRAMES
+from looktwice.model.network.model_card import ModelCard
+from looktwice.service.answers import plan_answer, wire_branch
+from looktwice.service.planning import Planned
+from looktwice.service.problems import (
+    INVALID_CLIP,
+    INVALID_IMAGE,
+    INVALID_REQUEST,
+    UNKNOWN_MODEL,
+    ProblemError,
+    at,
+)
 
 THINKING: Final = f"{wire_branch(looked_twice=True)} "
 _EVERY: Final = 5

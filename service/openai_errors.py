@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from service.problems import ProblemError
+from looktwice.service.problems import ProblemError
 
 _LIST: Final = "/v1/models"
 _BELOW: Final = ("/v1/chat/", f"{_LIST}/")

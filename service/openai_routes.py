@@ -10,12 +10,12 @@ from typing import Any, Final
 from fastapi import APIRouter, Request
 from starlette.responses import JSONResponse
 
-import clients.wire as wire
-from service.answers import wire_branch
-from service.callers import while_connected
-from service.dependencies import Dependencies
-from service.errors import validated
-from service.openai_chat import (
+import looktwice.clients.wire as wire
+from looktwice.service.answers import wire_branch
+from looktwice.service.callers import while_connected
+from looktwice.service.dependencies import Dependencies
+from looktwice.service.errors import validated
+from looktwice.service.openai_chat import (
     THINKING,
     ChatPlaces,
     ChatRequest,
@@ -24,15 +24,22 @@ from service.openai_chat import (
     plan_document,
     trajectory_text,
 )
-from service.openai_errors import dialect_error
-from service.openapi import Responses, event_stream, problems
-from service.payloads import payload_route
-from service.planning import Planned, last
-from service.planning_routes import REFUSALS, arrival_of
-from service.problems import DRAINING, ENGINE_FAILED, NOT_READY, UNAUTHORIZED, UNKNOWN_MODEL, ProblemError
-from service.streaming import streamed
-from service.telling import PlanTeller, Written
-from service.validation import format_of
+from looktwice.service.openai_errors import dialect_error
+from looktwice.service.openapi import Responses, event_stream, problems
+from looktwice.service.payloads import payload_route
+from looktwice.service.planning import Planned, last
+from looktwice.service.planning_routes import REFUSALS, arrival_of
+from looktwice.service.problems import (
+    DRAINING,
+    ENGINE_FAILED,
+    NOT_READY,
+    UNAUTHORIZED,
+    UNKNOWN_MODEL,
+    ProblemError,
+)
+from looktwice.service.streaming import streamed
+from looktwice.service.telling import PlanTeller, Written
+from looktwice.service.validation import format_of
 
 _ANSWERS: Final[Responses] = {
     200: {

@@ -7,7 +7,7 @@ from typing import Any
 from fastapi import FastAPI
 from pydantic import BaseModel
 
-from clients.wire import (
+from looktwice.clients.wire import (
     MSGPACK_MEDIA_TYPE,
     MULTIPART_MEDIA_TYPE,
     PROBLEM_MEDIA_TYPE,
@@ -15,9 +15,9 @@ from clients.wire import (
     SSE_MEDIA_TYPE,
     Problem,
 )
-from service.auth import OPEN_PATHS
-from service.openai_errors import dialect_error, dialect_status
-from service.problems import INTERNAL, MISDIRECTED, Kind, ProblemError
+from looktwice.service.auth import OPEN_PATHS
+from looktwice.service.openai_errors import dialect_error, dialect_status
+from looktwice.service.problems import INTERNAL, MISDIRECTED, Kind, ProblemError
 
 Responses = dict[int | str, dict[str, Any]]
 

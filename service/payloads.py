@@ -15,16 +15,16 @@ from starlette.datastructures import Headers, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from clients.wire import (
+from looktwice.clients.wire import (
     MSGPACK_MEDIA_TYPE,
     MULTIPART_MEDIA_TYPE,
     PART_SCHEME,
     REQUEST_PART,
 )
-from clients.wire_values import with_pictures
-from service.body_limit import LARGE_BYTES
-from service.documents import read_json, read_msgpack
-from service.problems import INVALID_BODY, INVALID_IMAGE, INVALID_JSON, ProblemError
+from looktwice.clients.wire_values import with_pictures
+from looktwice.service.body_limit import LARGE_BYTES
+from looktwice.service.documents import read_json, read_msgpack
+from looktwice.service.problems import INVALID_BODY, INVALID_IMAGE, INVALID_JSON, ProblemError
 
 _JSON: Final = b"application/json"
 _MAX_PARTS: Final = 2048

@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 import structlog
 
-import clients.wire as wire
-from model.driving.agreement import Agreement, agreement
-from model.driving.images import ImageError
-from model.driving.plan import PlanError
-from model.driving.scene import SceneError
-from model.engines.engine import (
+import looktwice.clients.wire as wire
+from looktwice.model.driving.agreement import Agreement, agreement
+from looktwice.model.driving.images import ImageError
+from looktwice.model.driving.plan import PlanError
+from looktwice.model.driving.scene import SceneError
+from looktwice.model.engines.engine import (
     DraftFinished,
     Draw,
     DrawFinished,
@@ -31,11 +31,11 @@ from model.engines.engine import (
     RequestError,
     Started,
 )
-from model.network.model_card import ModelCard
-from service.admission import Admission, Full, Place, whole_seconds
-from service.lifecycle import Lifecycle
-from service.metrics import Metrics
-from service.problems import (
+from looktwice.model.network.model_card import ModelCard
+from looktwice.service.admission import Admission, Full, Place, whole_seconds
+from looktwice.service.lifecycle import Lifecycle
+from looktwice.service.metrics import Metrics
+from looktwice.service.problems import (
     DECODE_TIMEOUT,
     ENGINE_FAILED,
     INVALID_IMAGE,
@@ -45,9 +45,9 @@ from service.problems import (
     REFUSED,
     ProblemError,
 )
-from service.rates import RateLimited, Rates
-from service.traces import Traces
-from service.validation import Geometry, engine_request
+from looktwice.service.rates import RateLimited, Rates
+from looktwice.service.traces import Traces
+from looktwice.service.validation import Geometry, engine_request
 
 _ANSWERING_MS: Final = 3
 """Of a deadline, left for writing the answer."""

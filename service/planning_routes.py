@@ -13,18 +13,18 @@ from fastapi.openapi.models import Example
 from pydantic import BaseModel
 from starlette.responses import Response
 
-import clients.wire as wire
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
-from service.answers import plan_answer, reflect_answer
-from service.callers import while_connected
-from service.dependencies import Dependencies
-from service.errors import problem_document, validated
-from service.examples import example_reflection, example_request
-from service.idempotency import NotCached
-from service.openapi import PACKED, answers_and_stream, payloads, problems
-from service.payloads import packed, payload_route
-from service.planning import AnyPlanRequest, Arrival, Planned, last
-from service.problems import (
+import looktwice.clients.wire as wire
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
+from looktwice.service.answers import plan_answer, reflect_answer
+from looktwice.service.callers import while_connected
+from looktwice.service.dependencies import Dependencies
+from looktwice.service.errors import problem_document, validated
+from looktwice.service.examples import example_reflection, example_request
+from looktwice.service.idempotency import NotCached
+from looktwice.service.openapi import PACKED, answers_and_stream, payloads, problems
+from looktwice.service.payloads import packed, payload_route
+from looktwice.service.planning import AnyPlanRequest, Arrival, Planned, last
+from looktwice.service.problems import (
     BODY_TIMEOUT,
     BODY_TOO_LARGE,
     DECODE_TIMEOUT,
@@ -57,9 +57,9 @@ from service.problems import (
     at,
     unforeseen,
 )
-from service.streaming import server_sent, streamed
-from service.telling import PlanTeller
-from service.validation import format_of
+from looktwice.service.streaming import server_sent, streamed
+from looktwice.service.telling import PlanTeller
+from looktwice.service.validation import format_of
 
 log = structlog.stdlib.get_logger()
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from clients.wire import Fault
+from looktwice.clients.wire import Fault
 
 TYPE_BASE: Final = "https://looktwice.dev/problems/"
 

@@ -9,15 +9,15 @@ from fastapi import APIRouter, Body, Request
 from fastapi.openapi.models import Example
 from starlette.responses import Response
 
-import clients.wire_refine as wire_refine
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
-from service.callers import while_connected
-from service.dependencies import Dependencies
-from service.examples import example_refinement
-from service.openapi import answers_and_stream, payloads, problems
-from service.payloads import payload_route
-from service.planning import Planned, last
-from service.planning_routes import (
+import looktwice.clients.wire_refine as wire_refine
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
+from looktwice.service.callers import while_connected
+from looktwice.service.dependencies import Dependencies
+from looktwice.service.examples import example_refinement
+from looktwice.service.openapi import answers_and_stream, payloads, problems
+from looktwice.service.payloads import payload_route
+from looktwice.service.planning import Planned, last
+from looktwice.service.planning_routes import (
     REFUSALS,
     IdempotencyKey,
     arrival_of,
@@ -26,9 +26,9 @@ from service.planning_routes import (
     refuse_key,
     respond,
 )
-from service.problems import INVALID_FEEDBACK, INVALID_TRAJECTORY, NEEDS_TRACKS
-from service.refining import RefineTeller, Refining, refine_answer, refining_of
-from service.streaming import server_sent, streamed
+from looktwice.service.problems import INVALID_FEEDBACK, INVALID_TRAJECTORY, NEEDS_TRACKS
+from looktwice.service.refining import RefineTeller, Refining, refine_answer, refining_of
+from looktwice.service.streaming import server_sent, streamed
 
 _DRAFT: Final = example_refinement((FRONT_WIDE, FRONT_TELE))
 EXAMPLES: Final[dict[str, Example]] = {

@@ -8,20 +8,20 @@ from typing import Final
 
 import numpy as np
 
-import clients.wire as wire
-import clients.wire_refine as wire_refine
-from clients.wire_scores import TrajectoryScore
-from clients.wire_values import rows
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.feedback import Feedback, FeedbackError
-from model.driving.pdm.foresight import CONSTANT_VELOCITY, world_ahead
-from model.driving.pdm.judging import judged_plans
-from model.driving.pdm.labelled import plans_of
-from model.driving.pdm.profiles import SolveError
-from model.driving.pdm.rule_teacher import NAME, feedback_on
-from model.driving.pdm.scoring import Others, Scores, score
-from model.driving.pdm.world import STEP_S, STEPS, ScoreError, World
-from model.driving.trajectory import (
+import looktwice.clients.wire as wire
+import looktwice.clients.wire_refine as wire_refine
+from looktwice.clients.wire_scores import TrajectoryScore
+from looktwice.clients.wire_values import rows
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.feedback import Feedback, FeedbackError
+from looktwice.model.driving.pdm.foresight import CONSTANT_VELOCITY, world_ahead
+from looktwice.model.driving.pdm.judging import judged_plans
+from looktwice.model.driving.pdm.labelled import plans_of
+from looktwice.model.driving.pdm.profiles import SolveError
+from looktwice.model.driving.pdm.rule_teacher import NAME, feedback_on
+from looktwice.model.driving.pdm.scoring import Others, Scores, score
+from looktwice.model.driving.pdm.world import STEP_S, STEPS, ScoreError, World
+from looktwice.model.driving.trajectory import (
     HALF_SECONDS_S,
     TEN_HZ_S,
     TIMES_OF,
@@ -30,13 +30,13 @@ from model.driving.trajectory import (
     at_times,
     check_trajectory,
 )
-from model.engines.engine import Draw
-from model.families.registry import family_named
-from model.network.model_card import ModelCard
-from service.answers import plan_answer
-from service.feedback import CALLER
-from service.planning import Arrival, Begun, Planned, SceneEvent
-from service.problems import (
+from looktwice.model.engines.engine import Draw
+from looktwice.model.families.registry import family_named
+from looktwice.model.network.model_card import ModelCard
+from looktwice.service.answers import plan_answer
+from looktwice.service.feedback import CALLER
+from looktwice.service.planning import Arrival, Begun, Planned, SceneEvent
+from looktwice.service.problems import (
     INVALID_FEEDBACK,
     INVALID_TRACKS,
     INVALID_TRAJECTORY,
@@ -45,9 +45,9 @@ from service.problems import (
     ProblemError,
     at,
 )
-from service.scoring import answer as score_answer
-from service.telling import PlanTeller, Written
-from service.validation import Geometry, geometry_of
+from looktwice.service.scoring import answer as score_answer
+from looktwice.service.telling import PlanTeller, Written
+from looktwice.service.validation import Geometry, geometry_of
 
 VERSION: Final[Version] = "v1.1"
 """PDMS, which the paper judges by."""
@@ -178,7 +178,7 @@ class RefineTeller:
         self._tell = PlanTeller(refining.format)
 
     async def __call__(self, event: SceneEvent) -> list[tuple[str, Written | wire_refine.DraftJudged]]:
-        """Events of `clients.wire_refine.EVENTS` with their data."""
+        """Events of `looktwice.clients.wire_refine.EVENTS` with their data."""
         if isinstance(event, Begun):
             return [("feedback", self._judged)]
         return [*await self._tell(event)]

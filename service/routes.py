@@ -10,22 +10,22 @@ from fastapi import APIRouter, Request
 from prometheus_client.exposition import choose_encoder
 from starlette.responses import Response
 
-import clients.wire as wire
-from service.admission import Admission
-from service.answers import model_card
-from service.auth import NOBODY
-from service.callers import while_connected
-from service.dependencies import Dependencies
-from service.feedback_routes import feedback_router
-from service.imagine_routes import imagine_router
-from service.inspector_scenes import BundledScenes, view
-from service.labelling import label, teacher_name
-from service.openai_routes import openai_router
-from service.openapi import PACKED, Responses, payloads, problems
-from service.payloads import LARGE_BODIES, payload_route
-from service.planning import full_as_problem, let_in
-from service.planning_routes import arrival_of, planning_router, respond
-from service.problems import (
+import looktwice.clients.wire as wire
+from looktwice.service.admission import Admission
+from looktwice.service.answers import model_card
+from looktwice.service.auth import NOBODY
+from looktwice.service.callers import while_connected
+from looktwice.service.dependencies import Dependencies
+from looktwice.service.feedback_routes import feedback_router
+from looktwice.service.imagine_routes import imagine_router
+from looktwice.service.inspector_scenes import BundledScenes, view
+from looktwice.service.labelling import label, teacher_name
+from looktwice.service.openai_routes import openai_router
+from looktwice.service.openapi import PACKED, Responses, payloads, problems
+from looktwice.service.payloads import LARGE_BODIES, payload_route
+from looktwice.service.planning import full_as_problem, let_in
+from looktwice.service.planning_routes import arrival_of, planning_router, respond
+from looktwice.service.problems import (
     BODY_TIMEOUT,
     BODY_TOO_LARGE,
     CHECKPOINT_FAILED,
@@ -59,9 +59,9 @@ from service.problems import (
     UNSUPPORTED_MEDIA_TYPE,
     ProblemError,
 )
-from service.refine_routes import refine_router
-from service.scene_files import read_scene_file
-from service.scoring_routes import scoring_router
+from looktwice.service.refine_routes import refine_router
+from looktwice.service.scene_files import read_scene_file
+from looktwice.service.scoring_routes import scoring_router
 
 _FILES_AT_ONCE: Final = 1
 """Scene files that are unpacked, which may take much memory; others wait."""

@@ -14,9 +14,9 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-import clients.wire as wire
-from service.inspector_scenes import scenes_of_file
-from service.problems import INVALID_SCENE_FILE, ProblemError
+import looktwice.clients.wire as wire
+from looktwice.service.inspector_scenes import scenes_of_file
+from looktwice.service.problems import INVALID_SCENE_FILE, ProblemError
 
 MAX_MEMORY_BYTES: Final = 512_000_000
 """Of data; about 150 MB are taken by libraries, and 130 MB more by 60 scenes."""
@@ -30,7 +30,7 @@ REFUSED: Final = 3
 
 # Planning goes first: what a file takes is what nobody else wants.
 _READ: Final = (
-    "import os, sys; os.nice(19); from pathlib import Path; from service.scene_files import main; "
+    "import os, sys; os.nice(19); from pathlib import Path; from looktwice.service.scene_files import main; "
     "sys.exit(main(Path(sys.argv[1])))"
 )
 

@@ -20,13 +20,13 @@ from typing import BinaryIO, Final
 
 from pydantic import BaseModel
 
-import clients.wire_feedback as wire_feedback
-import clients.wire_scores as wire_scores
-from clients.wire import Fault
-from service.feedback import Given, feedback_given
-from service.inspector_scenes import BundledScenes
-from service.problems import INVALID_LABELS, KINDS, ProblemError
-from service.scoring import scored
+import looktwice.clients.wire_feedback as wire_feedback
+import looktwice.clients.wire_scores as wire_scores
+from looktwice.clients.wire import Fault
+from looktwice.service.feedback import Given, feedback_given
+from looktwice.service.inspector_scenes import BundledScenes
+from looktwice.service.problems import INVALID_LABELS, KINDS, ProblemError
+from looktwice.service.scoring import scored
 
 MAX_MEMORY_BYTES: Final = 768_000_000
 """Of data; about 150 MB are taken by libraries."""
@@ -37,7 +37,9 @@ _PATIENCE_S: Final = 3 * MAX_CPU_S
 _LENGTH: Final = struct.Struct(">I")
 _DONE, _REFUSED, _FAILED = b"d", b"r", b"f"
 _SCORE, _FEEDBACK = "score", "feedback"
-_RUN: Final = "import sys; from pathlib import Path; from service.scorer import main; main(Path(sys.argv[1]))"
+_RUN: Final = (
+    "import sys; from pathlib import Path; from looktwice.service.scorer import main; main(Path(sys.argv[1]))"
+)
 
 
 class Scorer:

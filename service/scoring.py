@@ -9,14 +9,14 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-import clients.wire_scores as wire_scores
-from model.driving.pdm.failures import failures_of
-from model.driving.pdm.geometry import crosses_itself
-from model.driving.pdm.labelled import first_speed_mps, plans_of, world_of
-from model.driving.pdm.profiles import SolveError
-from model.driving.pdm.scoring import Others, Scores, score
-from model.driving.pdm.simulator import reference_poses, simulate
-from model.driving.pdm.world import (
+import looktwice.clients.wire_scores as wire_scores
+from looktwice.model.driving.pdm.failures import failures_of
+from looktwice.model.driving.pdm.geometry import crosses_itself
+from looktwice.model.driving.pdm.labelled import first_speed_mps, plans_of, world_of
+from looktwice.model.driving.pdm.profiles import SolveError
+from looktwice.model.driving.pdm.scoring import Others, Scores, score
+from looktwice.model.driving.pdm.simulator import reference_poses, simulate
+from looktwice.model.driving.pdm.world import (
     ACCELERATION,
     ACCELERATION_Y,
     HEADING,
@@ -37,8 +37,8 @@ from model.driving.pdm.world import (
     Vehicle,
     World,
 )
-from service.inspector_scenes import BundledScenes
-from service.problems import INVALID_LABELS, INVALID_TRAJECTORY, at
+from looktwice.service.inspector_scenes import BundledScenes
+from looktwice.service.problems import INVALID_LABELS, INVALID_TRAJECTORY, at
 
 _Asked = TypeVar("_Asked")
 _Made = TypeVar("_Made")

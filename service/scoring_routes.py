@@ -9,17 +9,17 @@ import structlog
 from fastapi import APIRouter, Body, Request
 from fastapi.openapi.models import Example
 
-import clients.wire_scores as wire_scores
-from service.admission import Admission
-from service.callers import while_connected
-from service.dependencies import Dependencies
-from service.errors import problem_document, validated
-from service.examples import example_score
-from service.openapi import PACKED, payloads, problems
-from service.payloads import payload_route
-from service.planning import Arrival, full_as_problem, let_in
-from service.planning_routes import arrival_of, respond
-from service.problems import (
+import looktwice.clients.wire_scores as wire_scores
+from looktwice.service.admission import Admission
+from looktwice.service.callers import while_connected
+from looktwice.service.dependencies import Dependencies
+from looktwice.service.errors import problem_document, validated
+from looktwice.service.examples import example_score
+from looktwice.service.openapi import PACKED, payloads, problems
+from looktwice.service.payloads import payload_route
+from looktwice.service.planning import Arrival, full_as_problem, let_in
+from looktwice.service.planning_routes import arrival_of, respond
+from looktwice.service.problems import (
     BODY_TIMEOUT,
     BODY_TOO_LARGE,
     DRAINING,

@@ -14,9 +14,9 @@ import structlog
 import uvicorn
 from fastapi import FastAPI
 
-from service.auth import OPEN_PATHS
-from service.connection import guarded_connection
-from service.settings import Settings
+from looktwice.service.auth import OPEN_PATHS
+from looktwice.service.connection import guarded_connection
+from looktwice.service.settings import Settings
 
 _LAST_WORDS_S: Final = 5
 """For answers that are made to reach their callers."""

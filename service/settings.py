@@ -8,12 +8,12 @@ from typing import Any, Final, Literal
 from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
-from clients.labelling.teachers.rules import RuleTeacher
-from clients.labelling.teachers.teacher import Teacher
-from model.bundled import SCENES
-from model.driving.phrases import ReflectionLanguage
-from service.keys import Keys
+from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from looktwice.clients.labelling.teachers.rules import RuleTeacher
+from looktwice.clients.labelling.teachers.teacher import Teacher
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.phrases import ReflectionLanguage
+from looktwice.service.keys import Keys
 
 LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 

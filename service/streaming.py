@@ -12,12 +12,12 @@ from pydantic import BaseModel
 from starlette.requests import Request
 from starlette.responses import StreamingResponse
 
-import clients.wire as wire
-from service.callers import CallerLeft, while_connected
-from service.errors import problem_document
-from service.metrics import Metrics
-from service.planning import Planned, SceneEvent
-from service.problems import ProblemError, unforeseen
+import looktwice.clients.wire as wire
+from looktwice.service.callers import CallerLeft, while_connected
+from looktwice.service.errors import problem_document
+from looktwice.service.metrics import Metrics
+from looktwice.service.planning import Planned, SceneEvent
+from looktwice.service.problems import ProblemError, unforeseen
 
 log = structlog.stdlib.get_logger()
 

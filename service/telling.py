@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import clients.wire as wire
-from model.driving.plan import Plan
-from model.engines.engine import DraftFinished, SectionFinished, TextWritten
-from model.families.family import Family
-from model.families.registry import family_named
-from model.formats.pieces import Values
-from service.answers import wire_branch, wire_plan, wire_sections, wire_times, wire_trajectory
-from service.planning import Judged, SceneEvent
+import looktwice.clients.wire as wire
+from looktwice.model.driving.plan import Plan
+from looktwice.model.engines.engine import DraftFinished, SectionFinished, TextWritten
+from looktwice.model.families.family import Family
+from looktwice.model.families.registry import family_named
+from looktwice.model.formats.pieces import Values
+from looktwice.service.answers import wire_branch, wire_plan, wire_sections, wire_times, wire_trajectory
+from looktwice.service.planning import Judged, SceneEvent
 
 Written = (
     wire.PlanWritten | wire.BranchTaken | wire.ThinkingWritten | wire.SectionWritten | wire.TrajectoryWritten
@@ -31,7 +31,7 @@ class PlanTeller:
         self._told: dict[int, str] = {}
 
     async def __call__(self, event: SceneEvent) -> list[tuple[str, Written]]:
-        """Events of `clients.wire.EVENTS` with their data."""
+        """Events of `looktwice.clients.wire.EVENTS` with their data."""
         family = self._family
         match event:
             case TextWritten(index, section, text) if section == family.reflection:

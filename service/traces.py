@@ -10,10 +10,10 @@ from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Final, Protocol
 
-import clients.wire as wire
-from model.engines.engine import Draw
-from model.network.model_card import ModelCard
-from service.problems import ProblemError
+import looktwice.clients.wire as wire
+from looktwice.model.engines.engine import Draw
+from looktwice.model.network.model_card import ModelCard
+from looktwice.service.problems import ProblemError
 
 _SYSTEM: Final = "looktwice"
 

@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 
-import clients.wire as wire
-from model.driving.images import ImageError, check_image
-from model.driving.plan import GROUPS, TICKS, MetaAction, Plan, PlanError, parse_plan
-from model.driving.scene import Clip, Scene, SceneError, Track
-from model.driving.trajectory import (
+import looktwice.clients.wire as wire
+from looktwice.model.driving.images import ImageError, check_image
+from looktwice.model.driving.plan import GROUPS, TICKS, MetaAction, Plan, PlanError, parse_plan
+from looktwice.model.driving.scene import Clip, Scene, SceneError, Track
+from looktwice.model.driving.trajectory import (
     TEN_HZ_S,
     FloatArray,
     GeometryError,
@@ -23,11 +23,11 @@ from model.driving.trajectory import (
     check_trajectory,
     wrap_angle,
 )
-from model.engines.engine import Controls, PlanRequest, RequestError
-from model.families.family import Attempt
-from model.families.registry import family_named
-from model.network.model_card import ModelCard
-from service.problems import (
+from looktwice.model.engines.engine import Controls, PlanRequest, RequestError
+from looktwice.model.families.family import Attempt
+from looktwice.model.families.registry import family_named
+from looktwice.model.network.model_card import ModelCard
+from looktwice.service.problems import (
     CANNOT_IMAGINE,
     INVALID_ATTEMPT,
     INVALID_CLIP,

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from model.driving.images import encode_jpeg
-from model.driving.scene import CLIP_FRAMES, FRONT_TELE, FRONT_WIDE, Clip, Scene, Track
-from model.network.checkpoint import save, write_code_embeddings
-from model.network.codec import TrajectoryCodec
-from model.network.corpus import nano_corpus, nano_phrases
-from model.network.numbers import needed_numbers, write_number_embeddings
-from model.network.settings import VlaSettings
-from model.network.vla import LookTwiceVla, nano_config
-from model.network.vocabulary import Vocabulary, build_nano_tokenizer
+from looktwice.model.driving.images import encode_jpeg
+from looktwice.model.driving.scene import CLIP_FRAMES, FRONT_TELE, FRONT_WIDE, Clip, Scene, Track
+from looktwice.model.network.checkpoint import save, write_code_embeddings
+from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.network.corpus import nano_corpus, nano_phrases
+from looktwice.model.network.numbers import needed_numbers, write_number_embeddings
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla import LookTwiceVla, nano_config
+from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from tests.model.network.motions import made_up_motions
 
 CODEC_SIZE = 16

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from clients.importers.comma2k19 import read_segments
-from clients.importers.recording import Array
-from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
+from looktwice.clients.importers.comma2k19 import read_segments
+from looktwice.clients.importers.recording import Array
+from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
 
 SEGMENT = Path(__file__).parent / "data" / "comma2k19" / "segment_40"
 

@@ -26,7 +26,7 @@ def untrained_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def resampling_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As `untrained_checkpoint`, but with a resampler and tracks, as the shipped model's recipe makes it."""
-    from model.network.settings import NANO_SETTINGS
+    from looktwice.model.network.settings import NANO_SETTINGS
     from tests.checkpoints import write_untrained
 
     folder = tmp_path_factory.mktemp("checkpoint") / "resampling"
@@ -38,7 +38,7 @@ def refining_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Untrained, thinks and refines: its only formats are those of ELF-VLA."""
     from dataclasses import replace
 
-    from model.network.settings import NANO_SETTINGS
+    from looktwice.model.network.settings import NANO_SETTINGS
     from tests.checkpoints import write_untrained
 
     folder = tmp_path_factory.mktemp("checkpoint") / "refining"
@@ -48,7 +48,7 @@ def refining_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def toy_family(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """The family `toy` is there, as an installed package declares it."""
-    from model.families.registry import GROUP, family_named
+    from looktwice.model.families.registry import GROUP, family_named
 
     installed = tmp_path_factory.mktemp("installed")
     about = installed / "toy-1.0.dist-info"

@@ -108,12 +108,12 @@ def test_the_planner_client_needs_none_of_the_heavy_packages() -> None:
         "shapely",
         "typer",
     )
-    blocked = f"import sys; sys.modules.update(dict.fromkeys({heavy!r})); import clients.planner"
+    blocked = f"import sys; sys.modules.update(dict.fromkeys({heavy!r})); import looktwice.clients.planner"
     subprocess.run([sys.executable, "-c", blocked], check=True, cwd=ROOT)
 
 
 def test_the_command_says_what_to_install_where_only_the_client_is() -> None:
-    script = "import sys; sys.modules['typer'] = None; from service.cli import main; main()"
+    script = "import sys; sys.modules['typer'] = None; from looktwice.service.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 1
     assert "pip install 'looktwice[serve]'" in done.stderr

@@ -5,9 +5,9 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 
-from model.families.cf_vla import CF_VLA
-from model.families.elf_vla import ELF_VLA
-from model.families.vla_world import VLA_WORLD
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.elf_vla import ELF_VLA
+from looktwice.model.families.vla_world import VLA_WORLD
 from tests.test_architecture import ROOT, modules
 
 assert CF_VLA.branch is not None

@@ -10,8 +10,8 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from clients import wire
-from clients.alpasim.errors import (
+from looktwice.clients import wire
+from looktwice.clients.alpasim.errors import (
     Draining,
     EgodriverError,
     SessionExists,
@@ -19,25 +19,25 @@ from clients.alpasim.errors import (
     TooManySessions,
     UnknownSession,
 )
-from clients.alpasim.frames import fitted
-from clients.alpasim.session import CAMERAS, Moment, Session
-from clients.answers import PlanResult
-from model.driving.scene import Scene
-from model.driving.trajectory import FloatArray
+from looktwice.clients.alpasim.frames import fitted
+from looktwice.clients.alpasim.session import CAMERAS, Moment, Session
+from looktwice.clients.answers import PlanResult
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.trajectory import FloatArray
 
 TRANSPORT_MS: Final = 10
 """Of a drive's time, kept back for the way to the planner and back."""
 
 
 class Planner(Protocol):
-    """Who plans: `clients.planner.AsyncPlannerClient`, over a socket or in this process."""
+    """Who plans: `looktwice.clients.planner.AsyncPlannerClient`, over a socket or in this process."""
 
     async def plan(self, scene: Scene, controls: wire.Controls) -> PlanResult:
-        """Plan for ``scene``; raises `clients.answers.PlannerError`."""
+        """Plan for ``scene``; raises `looktwice.clients.answers.PlannerError`."""
         ...
 
     async def models(self) -> list[wire.ModelCard]:
-        """The models that plan; raises `clients.answers.PlannerError`."""
+        """The models that plan; raises `looktwice.clients.answers.PlannerError`."""
         ...
 
 

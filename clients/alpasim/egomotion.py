@@ -8,8 +8,8 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from clients.alpasim.errors import BadHistory, TooEarly
-from model.driving.trajectory import HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
+from looktwice.clients.alpasim.errors import BadHistory, TooEarly
+from looktwice.model.driving.trajectory import HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
 
 Array = npt.NDArray[np.float64]
 

@@ -1,4 +1,5 @@
-"""What can be wrong with an egodriver call; `clients.alpasim.servicer` gives each kind its gRPC status."""
+"""What can be wrong with an egodriver call; `looktwice.clients.alpasim.servicer` gives each kind its gRPC
+status."""
 
 from __future__ import annotations
 

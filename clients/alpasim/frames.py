@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from PIL import Image
 
-from clients.alpasim.errors import BadHistory, BadObservation, TooEarly
-from model.driving.images import ImageError, check_image, encode_jpeg
-from model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S
+from looktwice.clients.alpasim.errors import BadHistory, BadObservation, TooEarly
+from looktwice.model.driving.images import ImageError, check_image, encode_jpeg
+from looktwice.model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S
 
 PERIOD_US: Final = round(CLIP_PERIOD_S * 1e6)
 SPAN_US: Final = (CLIP_FRAMES - 1) * PERIOD_US

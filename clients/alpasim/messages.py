@@ -19,10 +19,10 @@ from carla_driver_interface.protocol import (
     Vec3,
 )
 
-from clients.alpasim.driver import Driven
-from clients.alpasim.egomotion import STEP_US, Observed
-from clients.alpasim.errors import BadObservation
-from model.driving.trajectory import FloatArray, from_ego_frame
+from looktwice.clients.alpasim.driver import Driven
+from looktwice.clients.alpasim.egomotion import STEP_US, Observed
+from looktwice.clients.alpasim.errors import BadObservation
+from looktwice.model.driving.trajectory import FloatArray, from_ego_frame
 
 DebugFormat = Literal["json", "pickle"]
 _NO_ROTATION: Final = (0.0, 0.0, 0.0, 1.0)

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.trajectory import ROUTE_POINTS, ROUTE_SPACING_M, FloatArray
+from looktwice.model.driving.trajectory import ROUTE_POINTS, ROUTE_SPACING_M, FloatArray
 
 SHORTEST_M: Final = 10.0
 """A route with less left than this says nothing about the way."""

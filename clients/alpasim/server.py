@@ -11,9 +11,9 @@ import structlog
 from carla_driver_interface.protocol import add_EgodriverServiceServicer_to_server, channel_options
 from carla_driver_interface.server import UNIX_SCHEMES, bind_address
 
-from clients.alpasim.driver import Egodriver
-from clients.alpasim.messages import DebugFormat
-from clients.alpasim.servicer import EgodriverServicer
+from looktwice.clients.alpasim.driver import Egodriver
+from looktwice.clients.alpasim.messages import DebugFormat
+from looktwice.clients.alpasim.servicer import EgodriverServicer
 
 log = structlog.stdlib.get_logger()
 

@@ -27,8 +27,8 @@ from carla_driver_interface.protocol import (
     VersionId,
 )
 
-from clients.alpasim.driver import Egodriver
-from clients.alpasim.errors import (
+from looktwice.clients.alpasim.driver import Egodriver
+from looktwice.clients.alpasim.errors import (
     BadHistory,
     BadObservation,
     BadSession,
@@ -38,8 +38,8 @@ from clients.alpasim.errors import (
     TooManySessions,
     UnknownSession,
 )
-from clients.alpasim.messages import DebugFormat, drive_response, observed, waypoints
-from clients.answers import (
+from looktwice.clients.alpasim.messages import DebugFormat, drive_response, observed, waypoints
+from looktwice.clients.answers import (
     PlannerError,
     PlannerProblem,
     PlannerTimeout,

@@ -9,12 +9,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from clients.alpasim.egomotion import EgoLog, Observed
-from clients.alpasim.errors import BadObservation, BadSession
-from clients.alpasim.frames import FrameLog
-from clients.alpasim.route import route_ahead
-from model.driving.scene import FRONT_TELE, FRONT_WIDE, Clip, Scene
-from model.driving.trajectory import FloatArray, from_ego_frame, to_ego_frame
+from looktwice.clients.alpasim.egomotion import EgoLog, Observed
+from looktwice.clients.alpasim.errors import BadObservation, BadSession
+from looktwice.clients.alpasim.frames import FrameLog
+from looktwice.clients.alpasim.route import route_ahead
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, Clip, Scene
+from looktwice.model.driving.trajectory import FloatArray, from_ego_frame, to_ego_frame
 
 CAMERAS: Final[Mapping[str, str]] = {
     FRONT_WIDE: "camera_front_wide_120fov",

@@ -28,11 +28,11 @@ from carla_driver_interface.protocol import (
     channel_options,
 )
 
-from clients.alpasim.egomotion import STEP_US
-from clients.alpasim.frames import PERIOD_US
-from clients.alpasim.session import CAMERAS
-from model.driving.scene import CLIP_FRAMES, Scene
-from model.driving.trajectory import present_speed
+from looktwice.clients.alpasim.egomotion import STEP_US
+from looktwice.clients.alpasim.frames import PERIOD_US
+from looktwice.clients.alpasim.session import CAMERAS
+from looktwice.model.driving.scene import CLIP_FRAMES, Scene
+from looktwice.model.driving.trajectory import present_speed
 
 _SEEN_FIRST: Final = CLIP_FRAMES - 1
 """Steps of observations before the first drive."""

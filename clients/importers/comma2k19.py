@@ -16,10 +16,10 @@ from typing import Final
 import numpy as np
 from cachetools import FIFOCache
 
-from clients.importers.recording import Array, Recording, RecordingError
-from clients.importers.resampling import OneCamera, Source, View, fov_of
-from clients.importers.rotations import matrices
-from model.driving.cameras import CameraSpec
+from looktwice.clients.importers.recording import Array, Recording, RecordingError
+from looktwice.clients.importers.resampling import OneCamera, Source, View, fov_of
+from looktwice.clients.importers.rotations import matrices
+from looktwice.model.driving.cameras import CameraSpec
 
 POSES_FOLDER: Final = "global_pose"
 FILM: Final = "video.hevc"

@@ -14,9 +14,9 @@ from typing import Final
 
 import numpy as np
 
-from clients.importers.recording import Array, Recording, RecordingError
-from clients.importers.resampling import OneCamera, PictureFiles, Source
-from model.driving.cameras import CameraSpec
+from looktwice.clients.importers.recording import Array, Recording, RecordingError
+from looktwice.clients.importers.resampling import OneCamera, PictureFiles, Source
+from looktwice.model.driving.cameras import CameraSpec
 
 POSES_FILE: Final = "poses.csv"
 _COLUMNS: Final = ("time_s", "x_m", "y_m", "heading_rad")

@@ -19,12 +19,12 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from clients.importers.recording import Array, Recording, RecordingError
-from clients.importers.resampling import JPEG_QUALITY, PictureFiles, nearest
-from clients.importers.rotations import matrices
-from clients.navsim.reprojection import seen_as
-from model.driving.cameras import CameraSpec
-from model.driving.images import encode_jpeg
+from looktwice.clients.importers.recording import Array, Recording, RecordingError
+from looktwice.clients.importers.resampling import JPEG_QUALITY, PictureFiles, nearest
+from looktwice.clients.importers.rotations import matrices
+from looktwice.clients.navsim.reprojection import seen_as
+from looktwice.model.driving.cameras import CameraSpec
+from looktwice.model.driving.images import encode_jpeg
 
 VERSIONS: Final = "v1.0-*"
 FRONT: Final = "CAM_FRONT"

@@ -9,9 +9,9 @@ from typing import Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.cameras import CameraSpec
-from model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, Clip, LabelledScene, Scene
-from model.driving.trajectory import (
+from looktwice.model.driving.cameras import CameraSpec
+from looktwice.model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, Clip, LabelledScene, Scene
+from looktwice.model.driving.trajectory import (
     FUTURE_STEPS,
     HISTORY_STEPS,
     ROUTE_POINTS,

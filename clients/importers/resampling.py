@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from clients.importers.recording import Array, RecordingError
-from model.driving.cameras import CameraSpec
-from model.driving.images import ImageError, decode_image, encode_jpeg
+from looktwice.clients.importers.recording import Array, RecordingError
+from looktwice.model.driving.cameras import CameraSpec
+from looktwice.model.driving.images import ImageError, decode_image, encode_jpeg
 
 _GREY: Final = (128, 128, 128)
 _MUCH_GREY: Final = 0.1

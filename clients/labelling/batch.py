@@ -11,11 +11,11 @@ from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from clients.labelling.label import LabelTask, record, refused
-from clients.labelling.ledger import Ledger, Run
-from clients.labelling.pipeline import Job, Tally
-from clients.labelling.teachers.openai import OpenAiSettings, completion_answer, completion_request
-from clients.labelling.teachers.teacher import Answer, Reflection, ReflectionRefused, judge
+from looktwice.clients.labelling.label import LabelTask, record, refused
+from looktwice.clients.labelling.ledger import Ledger, Run
+from looktwice.clients.labelling.pipeline import Job, Tally
+from looktwice.clients.labelling.teachers.openai import OpenAiSettings, completion_answer, completion_request
+from looktwice.clients.labelling.teachers.teacher import Answer, Reflection, ReflectionRefused, judge
 
 _URL: Final = "/v1/chat/completions"
 

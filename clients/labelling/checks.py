@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from typing import Final, Literal, NamedTuple
 
-from clients.labelling.leaks import find_leaks
-from model.driving.direction import CORRECTION, agrees, group_of, track_changes, wanted_changes
-from model.driving.phrases import Facts, facts_of
-from model.driving.plan import Plan
+from looktwice.clients.labelling.leaks import find_leaks
+from looktwice.model.driving.direction import CORRECTION, agrees, group_of, track_changes, wanted_changes
+from looktwice.model.driving.phrases import Facts, facts_of
+from looktwice.model.driving.plan import Plan
 
 MOST_WORDS: Final = 80
 """CF-VLA section 8: one short paragraph."""

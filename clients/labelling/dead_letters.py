@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Final, get_args
 
-from clients.labelling.ledger import Ledger, Stage
-from model.driving.whole_files import written_whole
+from looktwice.clients.labelling.ledger import Ledger, Stage
+from looktwice.model.driving.whole_files import written_whole
 
 FILE: Final = "dead_letters.jsonl"
 _STAGES: Final[tuple[Stage, ...]] = get_args(Stage)

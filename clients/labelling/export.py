@@ -7,18 +7,18 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final, get_args
 
-from clients import wire
-from clients.labelling.ledger import Entry, Ledger, LedgerError, Run
-from clients.labelling.outcomes import followed_plans, plans_that_hold
-from clients.labelling.teachers.prompt import camera_line
-from model.driving.images import media_type
-from model.driving.phrases import corrected, facts_of
-from model.driving.plan import parse_plan
-from model.driving.reflection_store import LabelledReflection
-from model.driving.scene import Scene
-from model.driving.scene_store import read_scenes
-from model.driving.trajectory import present_speed
-from model.driving.whole_files import written_whole
+from looktwice.clients import wire
+from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError, Run
+from looktwice.clients.labelling.outcomes import followed_plans, plans_that_hold
+from looktwice.clients.labelling.teachers.prompt import camera_line
+from looktwice.model.driving.images import media_type
+from looktwice.model.driving.phrases import corrected, facts_of
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.reflection_store import LabelledReflection
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.trajectory import present_speed
+from looktwice.model.driving.whole_files import written_whole
 
 MESSAGES_FILE: Final = "messages.jsonl"
 PARTS_FILE: Final = "trl.jsonl"

@@ -16,33 +16,33 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from clients import wire
-from clients.answers import PlannedDraw
-from clients.labelling.ledger import Entry, Ledger, Record, Run
-from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
-from clients.labelling.rollout import key_of, of_the_service
-from clients.labelling.teachers.feedback import FeedbackTeacher, ask_feedback, question_of
-from clients.labelling.teachers.teacher import (
+from looktwice.clients import wire
+from looktwice.clients.answers import PlannedDraw
+from looktwice.clients.labelling.ledger import Entry, Ledger, Record, Run
+from looktwice.clients.labelling.pipeline import CannotBeDone, Job, StageStopped
+from looktwice.clients.labelling.rollout import key_of, of_the_service
+from looktwice.clients.labelling.teachers.feedback import FeedbackTeacher, ask_feedback, question_of
+from looktwice.clients.labelling.teachers.teacher import (
     ATTEMPTS,
     ReflectionRefused,
     TeacherBusy,
     TeacherClosed,
     TeacherError,
 )
-from clients.planner import AsyncPlannerClient
-from model.driving.feedback_store import FeedbackRow
-from model.driving.hashing import hash_of, judged_hash
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.feedback import RuleFeedback
-from model.driving.pdm.judged import THRESHOLD, JudgedPlan
-from model.driving.pdm.judging import Said, judged_in_scene
-from model.driving.pdm.labelled import plans_of
-from model.driving.pdm.profiles import SolveError
-from model.driving.pdm.rule_teacher import NAME, REVISION, critique
-from model.driving.pdm.world import Array, ScoreError
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import read_scenes
-from model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S
+from looktwice.clients.planner import AsyncPlannerClient
+from looktwice.model.driving.feedback_store import FeedbackRow
+from looktwice.model.driving.hashing import hash_of, judged_hash
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.feedback import RuleFeedback
+from looktwice.model.driving.pdm.judged import THRESHOLD, JudgedPlan
+from looktwice.model.driving.pdm.judging import Said, judged_in_scene
+from looktwice.model.driving.pdm.labelled import plans_of
+from looktwice.model.driving.pdm.profiles import SolveError
+from looktwice.model.driving.pdm.rule_teacher import NAME, REVISION, critique
+from looktwice.model.driving.pdm.world import Array, ScoreError
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S
 
 FACTS_VERSION: Final = 1
 """Of scores and facts; raised when the same trajectory comes to be judged otherwise."""

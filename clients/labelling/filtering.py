@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from clients.labelling.ledger import Entry
-from clients.labelling.outcomes import Followed, plans_that_fail
-from clients.labelling.rollout import min_ade_m
+from looktwice.clients.labelling.ledger import Entry
+from looktwice.clients.labelling.outcomes import Followed, plans_that_fail
+from looktwice.clients.labelling.rollout import min_ade_m
 
 QUIET = "quiet"
 """The tag of scenes that have none."""

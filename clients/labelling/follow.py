@@ -1,7 +1,8 @@
-"""Follow: the free draws of a rollout in the simulator, scene by scene (`clients.metadrive.outcomes`).
+"""Follow: the free draws of a rollout in the simulator, scene by scene
+(`looktwice.clients.metadrive.outcomes`).
 
-Worker processes do it (`clients.metadrive.workers`). The ledger stays with whoever gave the command; what is
-entered there is not done again.
+Worker processes do it (`looktwice.clients.metadrive.workers`). The ledger stays with whoever gave the
+command; what is entered there is not done again.
 """
 
 from __future__ import annotations
@@ -13,15 +14,15 @@ from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
-from clients.labelling.ledger import Entry, Ledger, Run
-from clients.labelling.pipeline import Limits, StageStopped, Tally
-from clients.labelling.rollout import key_of, unpacked
-from clients.metadrive.outcomes import MomentOutcomes
-from clients.metadrive.replay import EpisodeSetting, Moment, setting_of
-from clients.metadrive.workers import FollowTask, WorkerDied, follow_episodes
-from model.driving.hashing import hash_of
-from model.driving.scene_store import read_scenes
-from model.driving.trajectory import FloatArray
+from looktwice.clients.labelling.ledger import Entry, Ledger, Run
+from looktwice.clients.labelling.pipeline import Limits, StageStopped, Tally
+from looktwice.clients.labelling.rollout import key_of, unpacked
+from looktwice.clients.metadrive.outcomes import MomentOutcomes
+from looktwice.clients.metadrive.replay import EpisodeSetting, Moment, setting_of
+from looktwice.clients.metadrive.workers import FollowTask, WorkerDied, follow_episodes
+from looktwice.model.driving.hashing import hash_of
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.trajectory import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

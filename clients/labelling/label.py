@@ -7,12 +7,12 @@ from collections.abc import Awaitable, Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from clients.labelling.checks import FailedCheck
-from clients.labelling.ledger import Entry, Ledger, Record, Run
-from clients.labelling.outcomes import Followed, failure_of, followed_entries
-from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
-from clients.labelling.rollout import key_of
-from clients.labelling.teachers.teacher import (
+from looktwice.clients.labelling.checks import FailedCheck
+from looktwice.clients.labelling.ledger import Entry, Ledger, Record, Run
+from looktwice.clients.labelling.outcomes import Followed, failure_of, followed_entries
+from looktwice.clients.labelling.pipeline import CannotBeDone, Job, StageStopped
+from looktwice.clients.labelling.rollout import key_of
+from looktwice.clients.labelling.teachers.teacher import (
     ATTEMPTS,
     NothingInView,
     Question,
@@ -24,15 +24,16 @@ from clients.labelling.teachers.teacher import (
     TeacherError,
     ask,
 )
-from model.driving.hashing import annotations_hash, hash_of
-from model.driving.outcome import Outcome, in_words
-from model.driving.plan import parse_plan
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import read_scenes
-from model.driving.view import Surroundings
+from looktwice.model.driving.hashing import annotations_hash, hash_of
+from looktwice.model.driving.outcome import Outcome, in_words
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.view import Surroundings
 
 CHECKS_VERSION: Final = 3
-"""Of `clients.labelling.checks` and what they are made of; raised when they ask for something else."""
+"""Of `looktwice.clients.labelling.checks` and what they are made of; raised when they ask for something
+else."""
 
 
 class LabelTask(NamedTuple):

@@ -16,8 +16,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Literal, NamedTuple, Self
 
-from clients.labelling.teachers.teacher import Answer
-from model.driving.hashing import hash_of
+from looktwice.clients.labelling.teachers.teacher import Answer
+from looktwice.model.driving.hashing import hash_of
 
 Stage = Literal["rollout", "outcomes", "label", "inference", "feedback"]
 State = Literal["done", "dead"]

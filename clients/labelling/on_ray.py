@@ -16,14 +16,14 @@ from typing import Any, Protocol
 
 import ray
 
-from clients import wire
-from clients.labelling import label, outcomes, rollout
-from clients.labelling.ledger import Entered, Entry, Ledger, Run
-from clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
-from clients.labelling.rollout import RETRY_POLICY, Sampling, roll_out
-from clients.labelling.teachers.teacher import Teacher, TeacherError
-from clients.planner import Access, AsyncPlannerClient
-from model.driving.scene_store import row_groups, scene_files
+from looktwice.clients import wire
+from looktwice.clients.labelling import label, outcomes, rollout
+from looktwice.clients.labelling.ledger import Entered, Entry, Ledger, Run
+from looktwice.clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
+from looktwice.clients.labelling.rollout import RETRY_POLICY, Sampling, roll_out
+from looktwice.clients.labelling.teachers.teacher import Teacher, TeacherError
+from looktwice.clients.planner import Access, AsyncPlannerClient
+from looktwice.model.driving.scene_store import row_groups, scene_files
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Work(Protocol):
 
 @dataclass(frozen=True)
 class RolloutWork:
-    """See `clients.labelling.rollout`."""
+    """See `looktwice.clients.labelling.rollout`."""
 
     run: Run
     service: str
@@ -86,7 +86,8 @@ class RolloutWork:
 
 @dataclass(frozen=True)
 class LabelWork:
-    """See `clients.labelling.label`; ``connect`` is called for every chunk, where it is worked on."""
+    """See `looktwice.clients.labelling.label`; ``connect`` is called for every chunk, where it is worked
+    on."""
 
     run: Run
     rollout: Run

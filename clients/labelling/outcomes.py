@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from clients.labelling.ledger import Entry, Ledger, LedgerError, Record, Run
-from model.driving.direction import wanted_changes
-from model.driving.outcome import OUTCOMES_VERSION, Outcome
-from model.driving.plan import parse_plan
+from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError, Record, Run
+from looktwice.model.driving.direction import wanted_changes
+from looktwice.model.driving.outcome import OUTCOMES_VERSION, Outcome
+from looktwice.model.driving.plan import parse_plan
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
-from clients.labelling.concurrency import ConcurrencyLimit
-from clients.labelling.ledger import Ledger, Record, Run
-from clients.labelling.retries import TryLater, with_retries
+from looktwice.clients.labelling.concurrency import ConcurrencyLimit
+from looktwice.clients.labelling.ledger import Ledger, Record, Run
+from looktwice.clients.labelling.retries import TryLater, with_retries
 
 _Subject = TypeVar("_Subject")
 

@@ -11,8 +11,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from clients import wire
-from clients.answers import (
+from looktwice.clients import wire
+from looktwice.clients.answers import (
     BadAnswer,
     PlannerProblem,
     PlannerUnreachable,
@@ -20,17 +20,17 @@ from clients.answers import (
     RequestRefused,
     ServiceBusy,
 )
-from clients.labelling.ledger import Record, Run
-from clients.labelling.pipeline import CannotBeDone, Job, StageStopped
-from clients.labelling.retries import TryLater
-from clients.planner import AsyncPlannerClient, RetryPolicy
-from model.driving.hashing import hash_of, scene_hash
-from model.driving.labeller import expert_plan
-from model.driving.metrics import displacement_errors
-from model.driving.plan import Plan, plan_iou
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import read_scenes
-from model.driving.trajectory import FUTURE_STEPS, FloatArray
+from looktwice.clients.labelling.ledger import Record, Run
+from looktwice.clients.labelling.pipeline import CannotBeDone, Job, StageStopped
+from looktwice.clients.labelling.retries import TryLater
+from looktwice.clients.planner import AsyncPlannerClient, RetryPolicy
+from looktwice.model.driving.hashing import hash_of, scene_hash
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.metrics import displacement_errors
+from looktwice.model.driving.plan import Plan, plan_iou
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray
 
 RETRY_POLICY = RetryPolicy(timeout_s=120.0, attempts=1)
 """Who waits how long is the pipeline's to say."""

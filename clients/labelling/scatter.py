@@ -8,7 +8,7 @@ from typing import Final
 
 from matplotlib.figure import Figure
 
-from clients.labelling.filtering import Filtered, Thresholds
+from looktwice.clients.labelling.filtering import Filtered, Thresholds
 
 _RANGE_M: Final = (0.05, 30.0)
 

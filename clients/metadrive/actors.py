@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from clients.metadrive.roads import Array, Rail
-from model.driving.scene import AgentKind
+from looktwice.clients.metadrive.roads import Array, Rail
+from looktwice.model.driving.scene import AgentKind
 
 STEP_S: Final = 0.1
 BODY_SIZES: Final[dict[str, tuple[float, float, float]]] = {

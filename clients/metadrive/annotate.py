@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from clients.metadrive.episode_log import ActorLog, EpisodeLog
-from clients.metadrive.roads import Array, Rail
-from model.driving.cameras import CameraSpec
-from model.driving.scene import SEMANTIC_CLASSES, DenseTarget, Tag
-from model.driving.trajectory import FUTURE_STEPS, ROUTE_POINTS, ROUTE_SPACING_M
+from looktwice.clients.metadrive.episode_log import ActorLog, EpisodeLog
+from looktwice.clients.metadrive.roads import Array, Rail
+from looktwice.model.driving.cameras import CameraSpec
+from looktwice.model.driving.scene import SEMANTIC_CLASSES, DenseTarget, Tag
+from looktwice.model.driving.trajectory import FUTURE_STEPS, ROUTE_POINTS, ROUTE_SPACING_M
 
 LEAD_WITHIN_M: Final = 40.0
 LEAD_OFFSET_M: Final = 1.6

@@ -8,20 +8,20 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from clients.metadrive.actors import STEP_S, Body
-from clients.metadrive.annotate import route_ahead
-from clients.metadrive.episode import World, make_world
-from clients.metadrive.episode_log import EpisodeLog
-from clients.metadrive.fork import kind_of
-from clients.metadrive.pilots import Pilot, Planned
-from clients.metadrive.rig import Picture, Rig
-from clients.metadrive.roads import Array
-from clients.metadrive.stage import Stage
-from clients.metadrive.tracking import FreeVehicle, world_trajectory
-from clients.metadrive.tracks import tracks_at
-from clients.metadrive.windows import PICTURE_STEPS, blank_clips, history_at
-from model.driving.cameras import FRONT_CAMERAS, CameraSpec
-from model.driving.scene import CLIP_FRAMES, Clip, Scene
+from looktwice.clients.metadrive.actors import STEP_S, Body
+from looktwice.clients.metadrive.annotate import route_ahead
+from looktwice.clients.metadrive.episode import World, make_world
+from looktwice.clients.metadrive.episode_log import EpisodeLog
+from looktwice.clients.metadrive.fork import kind_of
+from looktwice.clients.metadrive.pilots import Pilot, Planned
+from looktwice.clients.metadrive.rig import Picture, Rig
+from looktwice.clients.metadrive.roads import Array
+from looktwice.clients.metadrive.stage import Stage
+from looktwice.clients.metadrive.tracking import FreeVehicle, world_trajectory
+from looktwice.clients.metadrive.tracks import tracks_at
+from looktwice.clients.metadrive.windows import PICTURE_STEPS, blank_clips, history_at
+from looktwice.model.driving.cameras import FRONT_CAMERAS, CameraSpec
+from looktwice.model.driving.scene import CLIP_FRAMES, Clip, Scene
 
 TAKE_OVER: Final = PICTURE_STEPS * (CLIP_FRAMES - 1)
 """The expert drives so many steps, until there are clips and a history."""

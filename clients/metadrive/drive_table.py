@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from clients.metadrive.drive import EXPERT, Drive
-from model.driving.columns import Columns, aligned, cells, titles
-from model.driving.intervals import ratio_interval
+from looktwice.clients.metadrive.drive import EXPERT, Drive
+from looktwice.model.driving.columns import Columns, aligned, cells, titles
+from looktwice.model.driving.intervals import ratio_interval
 
 _COLUMNS: Final[Columns] = {
     "episodes": ("episodes", "{:d}"),

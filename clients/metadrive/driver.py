@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from clients.metadrive.actors import STEP_S, Body, Obstacle, Pedestrian, Vehicle
-from clients.metadrive.roads import RAIL_SPACING_M, Array, Rail, RoadMap
+from looktwice.clients.metadrive.actors import STEP_S, Body, Obstacle, Pedestrian, Vehicle
+from looktwice.clients.metadrive.roads import RAIL_SPACING_M, Array, Rail, RoadMap
 
 COMFORT_BRAKE: Final = 3.5
 EMERGENCY_BRAKE: Final = 6.0

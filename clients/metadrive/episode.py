@@ -12,18 +12,18 @@ from typing import Final
 import numpy as np
 import shapely
 
-from clients.metadrive.actors import STEP_S, VEHICLE_MODELS, Body, Pedestrian, Vehicle
-from clients.metadrive.drifts import Drifter
-from clients.metadrive.driver import SpeedLimits, Style
-from clients.metadrive.episode_log import EpisodeLog, Outcome, Recorder
-from clients.metadrive.expert import Expert, varied
-from clients.metadrive.hazards import Director
-from clients.metadrive.late_braking import LateBraking
-from clients.metadrive.maps import make_map
-from clients.metadrive.roads import Array, RoadMap
-from clients.metadrive.tracking import FreeVehicle
-from model.driving.metrics import box_corners
-from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
+from looktwice.clients.metadrive.actors import STEP_S, VEHICLE_MODELS, Body, Pedestrian, Vehicle
+from looktwice.clients.metadrive.drifts import Drifter
+from looktwice.clients.metadrive.driver import SpeedLimits, Style
+from looktwice.clients.metadrive.episode_log import EpisodeLog, Outcome, Recorder
+from looktwice.clients.metadrive.expert import Expert, varied
+from looktwice.clients.metadrive.hazards import Director
+from looktwice.clients.metadrive.late_braking import LateBraking
+from looktwice.clients.metadrive.maps import make_map
+from looktwice.clients.metadrive.roads import Array, RoadMap
+from looktwice.clients.metadrive.tracking import FreeVehicle
+from looktwice.model.driving.metrics import box_corners
+from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
 
 _AHEAD_M: Final = 170.0
 _BEHIND_M: Final = 80.0

@@ -9,10 +9,10 @@ from typing import Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from clients.metadrive.actors import Body, Vehicle
-from clients.metadrive.drifts import strays
-from clients.metadrive.roads import Array, RoadMap
-from model.driving.scene import AgentKind, Light
+from looktwice.clients.metadrive.actors import Body, Vehicle
+from looktwice.clients.metadrive.drifts import strays
+from looktwice.clients.metadrive.roads import Array, RoadMap
+from looktwice.model.driving.scene import AgentKind, Light
 
 Outcome = Literal["time", "route_end", "collision"]
 
@@ -50,7 +50,8 @@ class EpisodeLog:
         lanes: int64 [steps] the lane the ego's centre is in.
         lane_offsets: float64 [steps] metres to the left of that lane's centre.
         rails, progress: the rail followed and the place along the route.
-        strays: bool [steps], whether the ego is on its way off its line (`clients.metadrive.drifts`).
+        strays: bool [steps], whether the ego is on its way off its line
+            (`looktwice.clients.metadrive.drifts`).
     """
 
     seed: int

@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from clients.metadrive.actors import Body, Vehicle
-from clients.metadrive.driver import (
+from looktwice.clients.metadrive.actors import Body, Vehicle
+from looktwice.clients.metadrive.driver import (
     SpeedLimits,
     Style,
     View,
@@ -20,8 +20,8 @@ from clients.metadrive.driver import (
     smoothed,
     wanted_acceleration,
 )
-from clients.metadrive.late_braking import LateBraking
-from clients.metadrive.roads import RoadMap
+from looktwice.clients.metadrive.late_braking import LateBraking
+from looktwice.clients.metadrive.roads import RoadMap
 
 _ROUND_M: Final = 11.0
 """Room needed ahead to steer round an obstacle from standstill."""

@@ -10,14 +10,14 @@ from typing import Final
 import numpy as np
 from PIL import Image, ImageDraw
 
-from clients.metadrive.actors import STEP_S
-from clients.metadrive.annotate import to_ego
-from clients.metadrive.drive import Shot
-from clients.metadrive.lettering import Colour, write_in_box
-from clients.metadrive.windows import PICTURE_STEPS
-from model.driving.cameras import FRONT_CAMERAS, CameraSpec
-from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, FRONT_WIDE
-from model.driving.trajectory import FloatArray
+from looktwice.clients.metadrive.actors import STEP_S
+from looktwice.clients.metadrive.annotate import to_ego
+from looktwice.clients.metadrive.drive import Shot
+from looktwice.clients.metadrive.lettering import Colour, write_in_box
+from looktwice.clients.metadrive.windows import PICTURE_STEPS
+from looktwice.model.driving.cameras import FRONT_CAMERAS, CameraSpec
+from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, FRONT_WIDE
+from looktwice.model.driving.trajectory import FloatArray
 
 _CAMERA_PX: Final = 560
 _ABOVE_PX: Final = 300

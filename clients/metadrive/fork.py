@@ -14,13 +14,13 @@ from typing import Final
 
 import numpy as np
 
-from clients.metadrive.actors import STEP_S, Body, Drift, Obstacle, Pedestrian, Vehicle
-from clients.metadrive.episode import World
-from clients.metadrive.episode_log import EpisodeLog
-from clients.metadrive.roads import Array, RoadMap
-from clients.metadrive.tracking import FreeVehicle, world_trajectory
-from model.driving.outcome import HitKind
-from model.driving.trajectory import FUTURE_STEPS, FloatArray, to_ego_frame
+from looktwice.clients.metadrive.actors import STEP_S, Body, Drift, Obstacle, Pedestrian, Vehicle
+from looktwice.clients.metadrive.episode import World
+from looktwice.clients.metadrive.episode_log import EpisodeLog
+from looktwice.clients.metadrive.roads import Array, RoadMap
+from looktwice.clients.metadrive.tracking import FreeVehicle, world_trajectory
+from looktwice.model.driving.outcome import HitKind
+from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray, to_ego_frame
 
 _RETURN_S: Final = 2.2
 _SHORTEST_RETURN_M: Final = 12.0

@@ -23,17 +23,17 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from clients.metadrive import simulator
-from clients.metadrive.drive import DriveConfig
-from clients.metadrive.episode import run_episode
-from clients.metadrive.maps import MapError
-from clients.metadrive.own_states import own_states
-from clients.metadrive.pilots import Careless, Pilot
-from clients.metadrive.rig import Rig
-from clients.metadrive.windows import labelled_scenes, unpictured_scenes, window_steps
-from model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS
-from model.driving.scene import LabelledScene, split_of_seed
-from model.driving.scene_store import MANIFEST, SCENE_VERSION, write_scenes
+from looktwice.clients.metadrive import simulator
+from looktwice.clients.metadrive.drive import DriveConfig
+from looktwice.clients.metadrive.episode import run_episode
+from looktwice.clients.metadrive.maps import MapError
+from looktwice.clients.metadrive.own_states import own_states
+from looktwice.clients.metadrive.pilots import Careless, Pilot
+from looktwice.clients.metadrive.rig import Rig
+from looktwice.clients.metadrive.windows import labelled_scenes, unpictured_scenes, window_steps
+from looktwice.model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS
+from looktwice.model.driving.scene import LabelledScene, split_of_seed
+from looktwice.model.driving.scene_store import MANIFEST, SCENE_VERSION, write_scenes
 
 GENERATOR_VERSION: Final = "1"
 _EPISODES_KEY: Final = "looktwice.episodes"

@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from clients.metadrive.actors import Body, Obstacle, Pedestrian, Vehicle
-from clients.metadrive.driver import look
-from clients.metadrive.roads import Rail, RoadMap
+from looktwice.clients.metadrive.actors import Body, Obstacle, Pedestrian, Vehicle
+from looktwice.clients.metadrive.driver import look
+from looktwice.clients.metadrive.roads import Rail, RoadMap
 
 PLACED: Final = {"breakdown": 0.22, "closure": 0.26, "queue": 0.16, "pedestrian": 0.36}
 _SPACING_M: Final = (130.0, 290.0)

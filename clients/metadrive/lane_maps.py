@@ -8,11 +8,11 @@ from typing import Any, Final
 import numpy as np
 import shapely
 
-from clients.metadrive.annotate import route_line, to_ego
-from clients.metadrive.episode_log import EpisodeLog
-from clients.metadrive.roads import Array, RoadMap
-from model.driving.lane_map import LaneArea, LaneMap
-from model.driving.trajectory import FloatArray
+from looktwice.clients.metadrive.annotate import route_line, to_ego
+from looktwice.clients.metadrive.episode_log import EpisodeLog
+from looktwice.clients.metadrive.roads import Array, RoadMap
+from looktwice.model.driving.lane_map import LaneArea, LaneMap
+from looktwice.model.driving.trajectory import FloatArray
 
 REACH_M: Final = 80.0
 AHEAD_M: Final = 45.0

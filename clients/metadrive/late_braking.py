@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from clients.metadrive.actors import STEP_S, Vehicle
+from looktwice.clients.metadrive.actors import STEP_S, Vehicle
 
 _APART_S: Final = (8.5, 11.0)
 """Longer than a scene's future, so that scenes lie between two of them."""

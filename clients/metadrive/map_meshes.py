@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from clients.metadrive import simulator
-from clients.metadrive.meshes import Mesh, box, flat_mesh, joined, spike, strip
-from clients.metadrive.roads import Lane, RoadMap
+from looktwice.clients.metadrive import simulator
+from looktwice.clients.metadrive.meshes import Mesh, box, flat_mesh, joined, spike, strip
+from looktwice.clients.metadrive.roads import Lane, RoadMap
 
 _MARK_M: Final = 0.16
 _DASH_M: Final = (3.0, 6.0)

@@ -7,9 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from clients.metadrive import simulator
-from clients.metadrive.roads import Lane, LineMark, Road, RoadMap, Turn, with_rails
-from clients.metadrive.y_flip import centre_line_from_metadrive
+from looktwice.clients.metadrive import simulator
+from looktwice.clients.metadrive.roads import Lane, LineMark, Road, RoadMap, Turn, with_rails
+from looktwice.clients.metadrive.y_flip import centre_line_from_metadrive
 
 _LANE_SPACING_M: Final = 1.0
 _BLOCK_WEIGHTS: Final = {"S": 0.42, "C": 0.22, "X": 0.11, "T": 0.09, "O": 0.03, "r": 0.07, "R": 0.06}

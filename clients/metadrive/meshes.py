@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from clients.metadrive import simulator
+from looktwice.clients.metadrive import simulator
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]

@@ -13,9 +13,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from clients.metadrive import simulator
-from clients.metadrive.actors import BODY_SIZES, VEHICLE_MODELS
-from clients.metadrive.meshes import Floats, Mesh, joined, rotation_about_z
+from looktwice.clients.metadrive import simulator
+from looktwice.clients.metadrive.actors import BODY_SIZES, VEHICLE_MODELS
+from looktwice.clients.metadrive.meshes import Floats, Mesh, joined, rotation_about_z
 
 _CELL_M: Final = {"beetle": 0.09, "130": 0.09, "barrier": 0.06, "cone": 0.05, "pedestrian": 0.035}
 GAIT_POSES: Final = 8

@@ -1,9 +1,10 @@
 """What comes of a plan: followed in a fork of the world, it holds or fails, and at what.
 
-A plan is followed by a car with a driver's limits while everybody else reacts (`clients.metadrive.fork`), and
-is compared with the expert's own way on from the same moment, followed by the same car. Bounds of comfort are
-those of NAVSIM (`model.driving.pdm.comfort`). All other thresholds are the constants here: chosen on training
-scenes, where the expert's own trajectories pass them (docs/labelling.md has the figures).
+A plan is followed by a car with a driver's limits while everybody else reacts
+(`looktwice.clients.metadrive.fork`), and is compared with the expert's own way on from the same moment,
+followed by the same car. Bounds of comfort are those of NAVSIM (`looktwice.model.driving.pdm.comfort`). All
+other thresholds are the constants here: chosen on training scenes, where the expert's own trajectories pass
+them (docs/labelling.md has the figures).
 """
 
 from __future__ import annotations
@@ -14,14 +15,14 @@ from typing import Final
 
 import numpy as np
 
-from clients.metadrive.episode import World
-from clients.metadrive.fork import Forked, fork_along, fork_expert
-from clients.metadrive.tracking import WHEELBASE_M
-from model.driving.outcome import FailureName, Outcome, metres_behind
-from model.driving.pdm import world as pdm
-from model.driving.pdm.comfort import comfort
-from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
-from model.driving.trajectory import STEP_S, FloatArray
+from looktwice.clients.metadrive.episode import World
+from looktwice.clients.metadrive.fork import Forked, fork_along, fork_expert
+from looktwice.clients.metadrive.tracking import WHEELBASE_M
+from looktwice.model.driving.outcome import FailureName, Outcome, metres_behind
+from looktwice.model.driving.pdm import world as pdm
+from looktwice.model.driving.pdm.comfort import comfort
+from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
+from looktwice.model.driving.trajectory import STEP_S, FloatArray
 
 BEHIND_RATIO: Final = 0.8
 """Whoever drives less than this share of the expert's way falls behind ..."""

@@ -7,15 +7,15 @@ goes on from where the car is. Forks in which even the expert fails are left out
 
 from __future__ import annotations
 
-from clients.metadrive.drive import Drive, DriveConfig, drive
-from clients.metadrive.episode import World
-from clients.metadrive.fork import ForkError, fork_expert
-from clients.metadrive.lane_maps import LaneMaps
-from clients.metadrive.pilots import Pilot
-from clients.metadrive.rig import Rig
-from clients.metadrive.windows import labelled_scene
-from model.driving.scene import LabelledScene, Scene
-from model.driving.trajectory import FUTURE_STEPS
+from looktwice.clients.metadrive.drive import Drive, DriveConfig, drive
+from looktwice.clients.metadrive.episode import World
+from looktwice.clients.metadrive.fork import ForkError, fork_expert
+from looktwice.clients.metadrive.lane_maps import LaneMaps
+from looktwice.clients.metadrive.pilots import Pilot
+from looktwice.clients.metadrive.rig import Rig
+from looktwice.clients.metadrive.windows import labelled_scene
+from looktwice.model.driving.scene import LabelledScene, Scene
+from looktwice.model.driving.trajectory import FUTURE_STEPS
 
 
 def own_states(

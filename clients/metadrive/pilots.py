@@ -10,11 +10,11 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from clients import wire
-from clients.planner import PlannerClient, imagine_request
-from clients.wire_imagine import ImagineControls
-from model.driving.scene import Scene
-from model.driving.trajectory import FloatArray, constant_velocity
+from looktwice.clients import wire
+from looktwice.clients.planner import PlannerClient, imagine_request
+from looktwice.clients.wire_imagine import ImagineControls
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.trajectory import FloatArray, constant_velocity
 
 _OVERLOOKED_SHARES: Final = (0.0, 0.0, 0.04, 0.08)
 """Shares of plans at which carelessness begins; an episode has one of them."""

@@ -16,16 +16,16 @@ from typing import Final
 import numpy as np
 import shapely
 
-from clients.metadrive import simulator
-from clients.metadrive.episode import World, worlds_of_episode
-from clients.metadrive.fork import fork_expert
-from clients.metadrive.generate import GENERATOR_VERSION, GenerateConfig
-from clients.metadrive.maps import MapError
-from clients.metadrive.outcomes import MomentOutcomes, outcomes_at
-from clients.metadrive.windows import history_at
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import MANIFEST
-from model.driving.trajectory import FloatArray
+from looktwice.clients.metadrive import simulator
+from looktwice.clients.metadrive.episode import World, worlds_of_episode
+from looktwice.clients.metadrive.fork import fork_expert
+from looktwice.clients.metadrive.generate import GENERATOR_VERSION, GenerateConfig
+from looktwice.clients.metadrive.maps import MapError
+from looktwice.clients.metadrive.outcomes import MomentOutcomes, outcomes_at
+from looktwice.clients.metadrive.windows import history_at
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import MANIFEST
+from looktwice.model.driving.trajectory import FloatArray
 
 TOLERANCE_M: Final = 0.01
 """Metres and radians between a stored scene and its world made again; mostly they are equal to the bit."""
@@ -38,7 +38,7 @@ class ReplayError(ValueError):
 
 @dataclass(frozen=True)
 class EpisodeSetting:
-    """What decides an episode besides its seed; see `clients.metadrive.episode.run_episode`."""
+    """What decides an episode besides its seed; see `looktwice.clients.metadrive.episode.run_episode`."""
 
     duration_s: float
     drifts: bool

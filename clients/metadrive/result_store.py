@@ -8,12 +8,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from clients.metadrive.drive import Drive
-from clients.metadrive.outcomes import MomentOutcomes
-from clients.metadrive.replay import EpisodeSetting
-from clients.metadrive.workers import FollowTask
-from model.driving.hashing import hash_of
-from model.driving.outcome import OUTCOMES_VERSION, Outcome
+from looktwice.clients.metadrive.drive import Drive
+from looktwice.clients.metadrive.outcomes import MomentOutcomes
+from looktwice.clients.metadrive.replay import EpisodeSetting
+from looktwice.clients.metadrive.workers import FollowTask
+from looktwice.model.driving.hashing import hash_of
+from looktwice.model.driving.outcome import OUTCOMES_VERSION, Outcome
 
 _Result = TypeVar("_Result")
 

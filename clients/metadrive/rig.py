@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from clients.metadrive import simulator
-from model.driving.cameras import FRONT_CAMERAS, CameraSpec
+from looktwice.clients.metadrive import simulator
+from looktwice.model.driving.cameras import FRONT_CAMERAS, CameraSpec
 
 JPEG_QUALITY: Final = 85
 NEAR_M: Final = 0.3

@@ -10,10 +10,10 @@ from typing import Any, Final
 import numpy as np
 from PIL import Image, ImageDraw
 
-from clients.metadrive.lettering import font, line_height, wrap
-from model.driving.labeller import expert_plan
-from model.driving.metrics import box_corners
-from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, SEMANTIC_CLASSES, LabelledScene
+from looktwice.clients.metadrive.lettering import font, line_height, wrap
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.metrics import box_corners
+from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, SEMANTIC_CLASSES, LabelledScene
 
 _PICTURE: Final = (336, 168)
 _MAP: Final = 2 * _PICTURE[1]

@@ -8,12 +8,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from clients.metadrive import map_meshes, simulator
-from clients.metadrive.actors import BODY_SIZES
-from clients.metadrive.episode_log import BRAKE_LIGHT, LEFT_LIGHT, RIGHT_LIGHT, ActorLog, EpisodeLog
-from clients.metadrive.meshes import box
-from clients.metadrive.models import GAIT_CYCLE_M, GAIT_POSES, model_meshes
-from clients.metadrive.rig import Picture, Rig
+from looktwice.clients.metadrive import map_meshes, simulator
+from looktwice.clients.metadrive.actors import BODY_SIZES
+from looktwice.clients.metadrive.episode_log import BRAKE_LIGHT, LEFT_LIGHT, RIGHT_LIGHT, ActorLog, EpisodeLog
+from looktwice.clients.metadrive.meshes import box
+from looktwice.clients.metadrive.models import GAIT_CYCLE_M, GAIT_POSES, model_meshes
+from looktwice.clients.metadrive.rig import Picture, Rig
 
 _BLINK_STEPS: Final = 4
 _LAMP_DEPTH_M: Final = {"beetle": 0.28, "130": 0.06}

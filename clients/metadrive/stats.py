@@ -10,13 +10,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from model.driving.labeller import expert_plan
-from model.driving.lead import LEAD_WITHIN_M, lead_within
-from model.driving.metrics import collides, leaves_road
-from model.driving.plan import GROUPS, TICKS, WORDS, Plan
-from model.driving.scene import TAGS, LabelledScene
-from model.driving.scene_store import MANIFEST, SceneFileError, read_scenes
-from model.driving.trajectory import HORIZON_S, STEP_S
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.lead import LEAD_WITHIN_M, lead_within
+from looktwice.model.driving.metrics import collides, leaves_road
+from looktwice.model.driving.plan import GROUPS, TICKS, WORDS, Plan
+from looktwice.model.driving.scene import TAGS, LabelledScene
+from looktwice.model.driving.scene_store import MANIFEST, SceneFileError, read_scenes
+from looktwice.model.driving.trajectory import HORIZON_S, STEP_S
 
 _ALL_WORDS: Final = tuple(word for group in GROUPS for word in WORDS[group])
 _TURNS: Final = ("Left Turn", "Right Turn")

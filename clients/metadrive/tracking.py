@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from clients.metadrive.actors import STEP_S, Vehicle
-from clients.metadrive.roads import Array, RoadMap
-from model.driving.trajectory import FloatArray
+from looktwice.clients.metadrive.actors import STEP_S, Vehicle
+from looktwice.clients.metadrive.roads import Array, RoadMap
+from looktwice.model.driving.trajectory import FloatArray
 
 WHEELBASE_M: Final = 2.8
 _MAX_STEER_RAD: Final = 0.6

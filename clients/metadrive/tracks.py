@@ -6,14 +6,15 @@ import math
 
 import numpy as np
 
-from clients.metadrive.annotate import to_ego
-from clients.metadrive.episode_log import ActorLog, EpisodeLog, lights_on
-from model.driving.tracks import SPEED_STEPS, TRACK_REACH_M, Track, nearest_tracks
-from model.driving.trajectory import STEP_S
+from looktwice.clients.metadrive.annotate import to_ego
+from looktwice.clients.metadrive.episode_log import ActorLog, EpisodeLog, lights_on
+from looktwice.model.driving.tracks import SPEED_STEPS, TRACK_REACH_M, Track, nearest_tracks
+from looktwice.model.driving.trajectory import STEP_S
 
 
 def tracks_at(log: EpisodeLog, step: int) -> tuple[Track, ...]:
-    """The nearest tracks at ``step``, as `model.driving.tracks.tracks_of` tells them of a labelled scene."""
+    """The nearest tracks at ``step``, as `looktwice.model.driving.tracks.tracks_of` tells them of a labelled
+    scene."""
     ego = log.ego[step]
     near = (
         actor

@@ -9,16 +9,16 @@ import numpy as np
 import shapely
 import shapely.affinity
 
-from clients.metadrive.annotate import Tagger, dense_target, route_ahead, to_ego
-from clients.metadrive.episode_log import EpisodeLog, lights_on
-from clients.metadrive.lane_maps import LaneMaps
-from clients.metadrive.rig import Picture, Rig
-from clients.metadrive.roads import Array
-from clients.metadrive.stage import Stage
-from model.driving.cameras import FRONT_CAMERAS, CameraSpec
-from model.driving.lane_map import LaneMap
-from model.driving.metrics import collides, leaves_road
-from model.driving.scene import (
+from looktwice.clients.metadrive.annotate import Tagger, dense_target, route_ahead, to_ego
+from looktwice.clients.metadrive.episode_log import EpisodeLog, lights_on
+from looktwice.clients.metadrive.lane_maps import LaneMaps
+from looktwice.clients.metadrive.rig import Picture, Rig
+from looktwice.clients.metadrive.roads import Array
+from looktwice.clients.metadrive.stage import Stage
+from looktwice.model.driving.cameras import FRONT_CAMERAS, CameraSpec
+from looktwice.model.driving.lane_map import LaneMap
+from looktwice.model.driving.metrics import collides, leaves_road
+from looktwice.model.driving.scene import (
     CLIP_FRAMES,
     CLIP_PERIOD_S,
     NO_PICTURE,
@@ -31,7 +31,7 @@ from model.driving.scene import (
     Scene,
     Tag,
 )
-from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
+from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
 
 PICTURE_STEPS: Final = round(CLIP_PERIOD_S / STEP_S)
 AGENT_REACH_M: Final = 80.0

@@ -10,9 +10,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from typing import Final
 
-from clients.metadrive.outcomes import MomentOutcomes
-from clients.metadrive.replay import EpisodeSetting, Moment, ReplayError, outcomes_of_episode
-from model.driving.trajectory import FloatArray
+from looktwice.clients.metadrive.outcomes import MomentOutcomes
+from looktwice.clients.metadrive.replay import EpisodeSetting, Moment, ReplayError, outcomes_of_episode
+from looktwice.model.driving.trajectory import FloatArray
 
 FollowTask = tuple[Moment, Sequence[FloatArray]]
 """A moment, and the trajectories [64, 4] that are to be followed from it."""

@@ -1,1 +1,2 @@
-"""An agent for NAVSIM (docs/drivers.md). Nothing here needs NAVSIM but `clients.navsim.agent.make_agent`."""
+"""An agent for NAVSIM (docs/drivers.md). Nothing here needs NAVSIM but
+`looktwice.clients.navsim.agent.make_agent`."""

@@ -9,16 +9,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from clients import wire
-from clients.navsim.history import PERIOD_S, STATUSES, history_of
-from clients.navsim.inputs import AgentInput, Cameras, InputError
-from clients.navsim.reprojection import seen_as
-from clients.planner import Access, PlannerClient, RetryPolicy
-from model.driving.cameras import FRONT_CAMERAS, CameraSpec
-from model.driving.hashing import scene_hash
-from model.driving.images import encode_jpeg
-from model.driving.scene import Clip, Scene
-from model.driving.trajectory import STEP_S, FloatArray
+from looktwice.clients import wire
+from looktwice.clients.navsim.history import PERIOD_S, STATUSES, history_of
+from looktwice.clients.navsim.inputs import AgentInput, Cameras, InputError
+from looktwice.clients.navsim.reprojection import seen_as
+from looktwice.clients.planner import Access, PlannerClient, RetryPolicy
+from looktwice.model.driving.cameras import FRONT_CAMERAS, CameraSpec
+from looktwice.model.driving.hashing import scene_hash
+from looktwice.model.driving.images import encode_jpeg
+from looktwice.model.driving.scene import Clip, Scene
+from looktwice.model.driving.trajectory import STEP_S, FloatArray
 
 POSES: Final = 8
 """Every half second of four."""

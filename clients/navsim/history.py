@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from clients.navsim.inputs import EgoStatus, InputError
-from model.driving.trajectory import HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
+from looktwice.clients.navsim.inputs import EgoStatus, InputError
+from looktwice.model.driving.trajectory import HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
 
 PERIOD_S: Final = 0.5
 STATUSES: Final = 4

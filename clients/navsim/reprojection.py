@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from clients.navsim.inputs import Camera, InputError
-from model.driving.cameras import CameraSpec
+from looktwice.clients.navsim.inputs import Camera, InputError
+from looktwice.model.driving.cameras import CameraSpec
 
 _UNSEEN: Final = 128
 """Grey, where no camera looks."""

@@ -6,7 +6,7 @@ positive. Requests refuse fields they do not know; answers may grow fields, so r
 A module for each endpoint; what is public is here too.
 """
 
-from clients.wire.base import (
+from looktwice.clients.wire.base import (
     IDEMPOTENCY_KEY_HEADER,
     MAX_SEED,
     MSGPACK_MEDIA_TYPE,
@@ -38,7 +38,7 @@ from clients.wire.base import (
     TopP,
     Trajectory,
 )
-from clients.wire.controls import (
+from looktwice.clients.wire.controls import (
     Controls,
     Decision,
     Imagine,
@@ -49,7 +49,7 @@ from clients.wire.controls import (
     Thinking,
     Tracks,
 )
-from clients.wire.events import (
+from looktwice.clients.wire.events import (
     EVENTS,
     BranchTaken,
     Event,
@@ -58,9 +58,16 @@ from clients.wire.events import (
     ThinkingWritten,
     TrajectoryWritten,
 )
-from clients.wire.label import Annotations, LabelRequest, LabelResponse, PlanOutcome, Seconds, TeacherName
-from clients.wire.models import LoadRequest, ModelCard, ModelList, NamedModel
-from clients.wire.plan import (
+from looktwice.clients.wire.label import (
+    Annotations,
+    LabelRequest,
+    LabelResponse,
+    PlanOutcome,
+    Seconds,
+    TeacherName,
+)
+from looktwice.clients.wire.models import LoadRequest, ModelCard, ModelList, NamedModel
+from looktwice.clients.wire.plan import (
     MAX_BATCH,
     MAX_FEEDBACK_CHARACTERS,
     Attempt,
@@ -78,10 +85,10 @@ from clients.wire.plan import (
     Section,
     Timing,
 )
-from clients.wire.problem import Fault, Problem
-from clients.wire.reflect import Group, PlanChange, Reflection, ReflectRequest, ReflectResponse
-from clients.wire.scene import Clip, Image, Scene, Track
-from clients.wire.scenes import Agent, LabelledScene, NextImage, SceneEntry, SceneFile, SceneList
+from looktwice.clients.wire.problem import Fault, Problem
+from looktwice.clients.wire.reflect import Group, PlanChange, Reflection, ReflectRequest, ReflectResponse
+from looktwice.clients.wire.scene import Clip, Image, Scene, Track
+from looktwice.clients.wire.scenes import Agent, LabelledScene, NextImage, SceneEntry, SceneFile, SceneList
 
 __all__ = [
     "Agent",

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag
 
-from clients.wire.base import MAX_SEED, Camera, Finite, Probability, RequestModel, Temperature, TopP
+from looktwice.clients.wire.base import MAX_SEED, Camera, Finite, Probability, RequestModel, Temperature, TopP
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]

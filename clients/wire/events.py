@@ -6,9 +6,9 @@ from typing import Final
 
 from pydantic import Field, model_validator
 
-from clients.wire.base import Poses, ResponseModel, TimesS, check_times
-from clients.wire.plan import Branch, Plan, Section
-from clients.wire.problem import Problem
+from looktwice.clients.wire.base import Poses, ResponseModel, TimesS, check_times
+from looktwice.clients.wire.plan import Branch, Plan, Section
+from looktwice.clients.wire.problem import Problem
 
 
 class PlanWritten(ResponseModel):

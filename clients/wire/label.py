@@ -6,10 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from clients.wire.base import MAX_SEED, Nearby, NearbyPoint, RequestModel, ResponseModel
-from clients.wire.controls import PlanGiven
-from clients.wire.scene import Scene
-from clients.wire.scenes import Agent
+from looktwice.clients.wire.base import MAX_SEED, Nearby, NearbyPoint, RequestModel, ResponseModel
+from looktwice.clients.wire.controls import PlanGiven
+from looktwice.clients.wire.scene import Scene
+from looktwice.clients.wire.scenes import Agent
 
 LaneLine = Annotated[list[NearbyPoint], Field(min_length=2, max_length=2000, fail_fast=True)]
 

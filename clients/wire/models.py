@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from clients.wire.base import RequestModel, ResponseModel
-from clients.wire.label import TeacherName
+from looktwice.clients.wire.base import RequestModel, ResponseModel
+from looktwice.clients.wire.label import TeacherName
 
 
 class ModelCard(ResponseModel):

@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field, JsonValue, SkipValidation, model_validator
 
-from clients.wire.base import (
+from looktwice.clients.wire.base import (
     Milliseconds,
     ModelName,
     Poses,
@@ -16,9 +16,9 @@ from clients.wire.base import (
     TimesS,
     check_times,
 )
-from clients.wire.controls import Controls, Tracks
-from clients.wire.problem import Problem
-from clients.wire.scene import Scene
+from looktwice.clients.wire.controls import Controls, Tracks
+from looktwice.clients.wire.problem import Problem
+from looktwice.clients.wire.scene import Scene
 
 Branch = Literal["Action:", "Thinking:"]
 Cut = Literal["skipped", "shortened", "replaced"]

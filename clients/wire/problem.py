@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from clients.wire.base import ResponseModel
+from looktwice.clients.wire.base import ResponseModel
 
 
 class Fault(ResponseModel):

@@ -6,9 +6,17 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from clients.wire.base import ModelName, Poses, Probability, RequestModel, ResponseModel, TimesS, check_times
-from clients.wire.controls import PlanGiven, ReflectControls
-from clients.wire.plan import (
+from looktwice.clients.wire.base import (
+    ModelName,
+    Poses,
+    Probability,
+    RequestModel,
+    ResponseModel,
+    TimesS,
+    check_times,
+)
+from looktwice.clients.wire.controls import PlanGiven, ReflectControls
+from looktwice.clients.wire.plan import (
     Consistent,
     CutOfDraw,
     Deadline,
@@ -21,7 +29,7 @@ from clients.wire.plan import (
     Timing,
     TokenCounts,
 )
-from clients.wire.scene import Scene
+from looktwice.clients.wire.scene import Scene
 
 Group = Literal["longitudinal", "lateral", "lane"]
 

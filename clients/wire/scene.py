@@ -6,7 +6,17 @@ from typing import Annotated
 
 from pydantic import Discriminator, Field, Tag, WithJsonSchema
 
-from clients.wire.base import AgentKind, Camera, Finite, History, Length, Light, Nearby, RequestModel, Route
+from looktwice.clients.wire.base import (
+    AgentKind,
+    Camera,
+    Finite,
+    History,
+    Length,
+    Light,
+    Nearby,
+    RequestModel,
+    Route,
+)
 
 
 def _form_of_image(value: object) -> str:

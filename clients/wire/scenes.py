@@ -6,8 +6,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from clients.wire.base import Camera, Length, Nearby, Point, ResponseModel, Trajectory
-from clients.wire.scene import Scene, Track
+from looktwice.clients.wire.base import Camera, Length, Nearby, Point, ResponseModel, Trajectory
+from looktwice.clients.wire.scene import Scene, Track
 
 
 class Agent(ResponseModel):

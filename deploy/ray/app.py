@@ -17,11 +17,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from ray import serve
 from ray.serve import Application
 
-from model.bundled import CHECKPOINT
-from service.app import create_app
-from service.cli.engines import make_engine
-from service.server import check_who_may_ask
-from service.settings import Settings, TeacherSettings
+from looktwice.model.bundled import CHECKPOINT
+from looktwice.service.app import create_app
+from looktwice.service.cli.engines import make_engine
+from looktwice.service.server import check_who_may_ask
+from looktwice.service.settings import Settings, TeacherSettings
 
 _GLANCE_S: Final = 0.2
 

@@ -4,10 +4,10 @@ import json
 import sys
 from pathlib import Path
 
-from loadtests.bodies import make_calls
-from loadtests.mix import parse_mix
-from model.bundled import SCENES
-from model.driving.scene_store import read_scenes
+from looktwice.loadtests.bodies import make_calls
+from looktwice.loadtests.mix import parse_mix
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.scene_store import read_scenes
 
 kinds = parse_mix("direct", "1", "json", "none", 0).kinds(int((sys.argv[2:] or ["500"])[0]), seed=0)
 calls = make_calls(tuple(read_scenes(SCENES, dense=False)), kinds, seed=0)

@@ -4,10 +4,10 @@ import csv
 import sys
 from pathlib import Path
 
-from model.bundled import SCENES
-from model.driving.scene import CLIP_PERIOD_S
-from model.driving.scene_store import read_scenes
-from model.driving.trajectory import STEP_S
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.scene import CLIP_PERIOD_S
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.trajectory import STEP_S
 
 labelled = next(iter(read_scenes(SCENES, dense=False)))
 pictures = Path(sys.argv[1]) / "dash"

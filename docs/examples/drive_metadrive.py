@@ -6,12 +6,12 @@ Needs the simulator (`make sim`). `looktwice drive` does the same for many episo
 import argparse
 from pathlib import Path
 
-from clients.metadrive.drive import DriveConfig, drive
-from clients.metadrive.film import Film
-from clients.metadrive.pilots import ServicePilot
-from clients.metadrive.rig import Rig
-from clients.planner import PlannerClient
-from clients.wire import Controls
+from looktwice.clients.metadrive.drive import DriveConfig, drive
+from looktwice.clients.metadrive.film import Film
+from looktwice.clients.metadrive.pilots import ServicePilot
+from looktwice.clients.metadrive.rig import Rig
+from looktwice.clients.planner import PlannerClient
+from looktwice.clients.wire import Controls
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--service", default="http://127.0.0.1:8000")

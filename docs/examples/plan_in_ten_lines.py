@@ -2,10 +2,10 @@
 
 import sys
 
-from clients.planner import PlannerClient
-from clients.wire import Controls
-from model.bundled import SCENES
-from model.driving.scene_store import read_scenes
+from looktwice.clients.planner import PlannerClient
+from looktwice.clients.wire import Controls
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.scene_store import read_scenes
 
 scene = next(iter(read_scenes(SCENES, dense=False))).scene
 with PlannerClient(sys.argv[1] if len(sys.argv) > 1 else "http://127.0.0.1:8000") as planner:

@@ -5,11 +5,11 @@ Here the other planner is careless: it accelerates straight on, whatever is ahea
 
 import sys
 
-from clients.planner import PlannerClient
-from clients.wire import ReflectControls
-from model.bundled import SCENES
-from model.driving.plan import parse_plan
-from model.driving.scene_store import read_scenes
+from looktwice.clients.planner import PlannerClient
+from looktwice.clients.wire import ReflectControls
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.scene_store import read_scenes
 
 careless = parse_plan(
     "- longitudinal\n  - 0.0s-6.4s: Accelerate\n"

@@ -15,14 +15,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from loadtests.attacks import COSTLY, Bait, Hostility, be_hostile, costly_calls
-from loadtests.bad_teacher import BadTeacher
-from loadtests.bodies import make_call, make_calls
-from loadtests.environment import left_behind, lines_lost
-from loadtests.loads import OpenLoop, Phase, poisson_arrivals, windows
-from loadtests.memory import MemoryWatch
-from loadtests.mix import Kind
-from loadtests.run import WARM_UP, Result, Setup, check, run
+from looktwice.loadtests.attacks import COSTLY, Bait, Hostility, be_hostile, costly_calls
+from looktwice.loadtests.bad_teacher import BadTeacher
+from looktwice.loadtests.bodies import make_call, make_calls
+from looktwice.loadtests.environment import left_behind, lines_lost
+from looktwice.loadtests.loads import OpenLoop, Phase, poisson_arrivals, windows
+from looktwice.loadtests.memory import MemoryWatch
+from looktwice.loadtests.mix import Kind
+from looktwice.loadtests.run import WARM_UP, Result, Setup, check, run
 
 CALM, HOSTILE, AFTER = "calm", "hostile", "after"
 _NICENESS: Final = 5

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from loadtests.accounting import Summary, summarise
-from loadtests.bodies import make_calls, make_drives
-from loadtests.loads import OpenLoop, Phase, Window, poisson_arrivals
-from loadtests.loads import fleet as make_fleet
-from loadtests.memory import Growth, MemoryWatch, growth
-from loadtests.run import WARM_UP, Ran, Result, Setup, check, needed, run
+from looktwice.loadtests.accounting import Summary, summarise
+from looktwice.loadtests.bodies import make_calls, make_drives
+from looktwice.loadtests.loads import OpenLoop, Phase, Window, poisson_arrivals
+from looktwice.loadtests.loads import fleet as make_fleet
+from looktwice.loadtests.memory import Growth, MemoryWatch, growth
+from looktwice.loadtests.run import WARM_UP, Ran, Result, Setup, check, needed, run
 
 MEASURED = "measured"
 

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from loadtests.accounting import LEAST_ACHIEVED, Summary
-from loadtests.bodies import make_calls
-from loadtests.exchange import Exchange
-from loadtests.loads import OpenLoop, poisson_arrivals
-from loadtests.run import Result, Setup, check, run
-from loadtests.scenarios.steady import MEASURED, steady_phases
+from looktwice.loadtests.accounting import LEAST_ACHIEVED, Summary
+from looktwice.loadtests.bodies import make_calls
+from looktwice.loadtests.exchange import Exchange
+from looktwice.loadtests.loads import OpenLoop, poisson_arrivals
+from looktwice.loadtests.run import Result, Setup, check, run
+from looktwice.loadtests.scenarios.steady import MEASURED, steady_phases
 
 
 @dataclass(frozen=True)

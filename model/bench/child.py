@@ -16,12 +16,19 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from model.bench.contenders import SHORTCUTS, Answer, Contender, EngineContender, PlainVllm, Transformers
-from model.bench.memory import forget_peaks, peak_bytes
-from model.bench.workload import Workload
-from model.driving.scene_store import read_scenes
-from model.engines.engine import PlanRequest
-from model.network.precision import fast_dtype
+from looktwice.model.bench.contenders import (
+    SHORTCUTS,
+    Answer,
+    Contender,
+    EngineContender,
+    PlainVllm,
+    Transformers,
+)
+from looktwice.model.bench.memory import forget_peaks, peak_bytes
+from looktwice.model.bench.workload import Workload
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.engines.engine import PlanRequest
+from looktwice.model.network.precision import fast_dtype
 
 _ROWS = 96
 _MAX_TOKENS = 600
@@ -37,7 +44,7 @@ def contenders(names: list[str], checkpoint: Path, device: str) -> dict[str, Con
     dtype = fast_dtype(device)
     for name in names:
         if name.startswith("vllm"):
-            from model.engines.vllm.engine import VllmEngine, VllmSettings
+            from looktwice.model.engines.vllm.engine import VllmEngine, VllmSettings
 
             if "vllm-grammar" not in made:
                 engine = VllmEngine(
@@ -63,8 +70,8 @@ def contenders(names: list[str], checkpoint: Path, device: str) -> dict[str, Con
 
 def _torch_engine(name: str, checkpoint: Path, device: str) -> Any:
     """``torch``, or ``torch+…`` with some shortcuts only: ``torch+none``, ``torch+jump,shared_prompts``."""
-    from model.engines.torch.engine import TorchEngine, TorchSettings
-    from model.engines.torch.shortcuts import Shortcuts
+    from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+    from looktwice.model.engines.torch.shortcuts import Shortcuts
 
     settings = TorchSettings.on(device, _ROWS)
     if "+" in name:

@@ -10,12 +10,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from model.engines.engine import Draw, DrawFinished, Engine, PlanRequest
-from model.families.registry import families_of
-from model.formats.cursor import CompiledFormat
-from model.formats.pieces import FormatError
-from model.formats.text import parse
-from model.network.vocabulary import END_OF_TEXT, IM_END, Vocabulary
+from looktwice.model.engines.engine import Draw, DrawFinished, Engine, PlanRequest
+from looktwice.model.families.registry import families_of
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.pieces import FormatError
+from looktwice.model.formats.text import parse
+from looktwice.model.network.vocabulary import END_OF_TEXT, IM_END, Vocabulary
 
 SHORTCUTS = ("jump", "shared_prompts", "shared_rows", "speculate", "reuse", "capture")
 """The torch engine's, in the order in which the bench switches them on."""
@@ -110,7 +110,7 @@ class PlainVllm(Contender):
     """
 
     def __init__(self, checkpoint: Path, engine: Any, max_tokens: int) -> None:
-        from model.network.checkpoint import read_parts
+        from looktwice.model.network.checkpoint import read_parts
 
         self._engine, self._max_tokens = engine, max_tokens
         parts = read_parts(checkpoint)
@@ -155,7 +155,7 @@ class Transformers(Contender):
     """
 
     def __init__(self, checkpoint: Path, *, dtype: Any, device: str, max_tokens: int, cache: str) -> None:
-        from model.network.checkpoint import load
+        from looktwice.model.network.checkpoint import load
 
         self._loaded = load(checkpoint, dtype, device)
         families = families_of(self._loaded.card.formats, self._loaded.settings.reflection)

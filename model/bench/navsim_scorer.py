@@ -18,8 +18,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.world import LONG_STEPS, STEPS, Array, World
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.world import LONG_STEPS, STEPS, Array, World
 
 _UNUSED: Final = ("torch", "pytorch_lightning", "ray", "hydra", "omegaconf")
 _ACTORS: Final = "nuplan.common.actor_state"

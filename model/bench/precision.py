@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from model.driving.scene import Scene
-from model.engines.engine import Controls, PlanRequest
-from model.engines.sampling import probabilities, uniform
-from model.engines.torch.batch import Batch, Feed
-from model.engines.torch.offline import draws_of
-from model.engines.torch.runner import Prompt, PromptRequest, Runner
-from model.network.checkpoint import load
+from looktwice.model.driving.scene import Scene
+from looktwice.model.engines.engine import Controls, PlanRequest
+from looktwice.model.engines.sampling import probabilities, uniform
+from looktwice.model.engines.torch.batch import Batch, Feed
+from looktwice.model.engines.torch.offline import draws_of
+from looktwice.model.engines.torch.runner import Prompt, PromptRequest, Runner
+from looktwice.model.network.checkpoint import load
 
 _AT_ONCE = 8
 """Scenes that are decoded together, as in service."""

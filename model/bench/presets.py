@@ -9,10 +9,10 @@ from typing import Any, Final
 import torch
 from transformers import Qwen2_5_VLConfig
 
-from model.network.checkpoint import read_parts, save
-from model.network.settings import VlaSettings
-from model.network.vla import LookTwiceVla, padded_size, with_settings
-from model.network.vocabulary import END_OF_TEXT, IM_END
+from looktwice.model.network.checkpoint import read_parts, save
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla import LookTwiceVla, padded_size, with_settings
+from looktwice.model.network.vocabulary import END_OF_TEXT, IM_END
 
 
 @dataclass(frozen=True)

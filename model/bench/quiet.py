@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from model.engines.torch.threads import CpuTimes, cpu_times
+from looktwice.model.engines.torch.threads import CpuTimes, cpu_times
 
 _LOOK_S: Final = 0.25
 _IDLE: Final = 0.1

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from model.bench.roofline import Machine, Work
-from model.bench.run import Deadlines, Planner, Row
-from model.driving.columns import aligned, interval_cell
+from looktwice.model.bench.roofline import Machine, Work
+from looktwice.model.bench.run import Deadlines, Planner, Row
+from looktwice.model.driving.columns import aligned, interval_cell
 
 
 @dataclass(frozen=True)

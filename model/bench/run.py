@@ -16,8 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from model.bench.quiet import wait_until_quiet
-from model.bench.workload import Workload
+from looktwice.model.bench.quiet import wait_until_quiet
+from looktwice.model.bench.workload import Workload
 
 _SHARES: Final = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
 """Loads among which the knee is looked for, in requests during the latency of a scene alone."""
@@ -31,7 +31,7 @@ class Job:
     """What is compared.
 
     Attributes:
-        contenders: names; ``torch`` may carry shortcuts, see `model.bench.child`.
+        contenders: names; ``torch`` may carry shortcuts, see `looktwice.model.bench.child`.
         workloads: each is asked of each contender that can do it.
         checkpoint, scenes: the same for all.
         repeats: measured rounds, after one that is not.
@@ -247,7 +247,7 @@ def _process(job: Job, names: Sequence[str]) -> Iterator[_Process]:
     log_path = os.environ.get("LOOKTWICE_BENCH_LOG", os.devnull)
     with open(log_path, "a", encoding="utf-8") as log, os.fdopen(reading, encoding="utf-8") as replies:
         process = subprocess.Popen(
-            [python, "-m", "model.bench.child", str(writing), json.dumps(settings)],
+            [python, "-m", "looktwice.model.bench.child", str(writing), json.dumps(settings)],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,

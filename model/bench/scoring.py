@@ -14,9 +14,9 @@ from typing import Final
 
 import numpy as np
 
-from model.bench.navsim_scorer import NavsimScorer
-from model.driving.pdm.scoring import Others, score
-from model.driving.pdm.world import SPEED, STATE_SIZE, Area, Array, Lane, TrackedBox, World
+from looktwice.model.bench.navsim_scorer import NavsimScorer
+from looktwice.model.driving.pdm.scoring import Others, score
+from looktwice.model.driving.pdm.world import SPEED, STATE_SIZE, Area, Array, Lane, TrackedBox, World
 
 FEW: Final = 6
 MANY: Final = 4096
@@ -131,7 +131,13 @@ def _seconds(work: Callable[[], object], repeats: int) -> float:
 
 
 def _navsim_seconds(repeats: int, folders: Sequence[Path], python: Path | None) -> float:
-    command = [str(python or sys.executable), "-m", "model.bench.scoring", str(repeats), *map(str, folders)]
+    command = [
+        str(python or sys.executable),
+        "-m",
+        "looktwice.model.bench.scoring",
+        str(repeats),
+        *map(str, folders),
+    ]
     root = Path(__file__).parents[__name__.count(".")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=root, check=False)
     if done.returncode:

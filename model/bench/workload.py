@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from model.driving.scene import Scene
-from model.driving.variations import fresh, moved
-from model.engines.engine import Controls, PlanRequest, Thinking
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.variations import fresh, moved
+from looktwice.model.engines.engine import Controls, PlanRequest, Thinking
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, FloatArray
+from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, FloatArray
 
 TRACK_STEPS: Final = HISTORY_STEPS + FUTURE_STEPS
 """Rows of an agent's track: 16 past poses (the last one is now), then 64 future ones."""

@@ -8,15 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
-from model.driving.claims import claims, unfounded
-from model.driving.direction import agrees, asked_changes
-from model.driving.labeller import label_plan
-from model.driving.phrases import agrees as changes_as_stated
-from model.driving.phrases import facts_of
-from model.driving.plan import Plan, plan_iou
-from model.driving.seen import all_shown
-from model.driving.trajectory import FUTURE_STEPS, FloatArray
-from model.driving.view import View
+from looktwice.model.driving.claims import claims, unfounded
+from looktwice.model.driving.direction import agrees, asked_changes
+from looktwice.model.driving.labeller import label_plan
+from looktwice.model.driving.phrases import agrees as changes_as_stated
+from looktwice.model.driving.phrases import facts_of
+from looktwice.model.driving.plan import Plan, plan_iou
+from looktwice.model.driving.seen import all_shown
+from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray
+from looktwice.model.driving.view import View
 
 Parts = Literal["plan_trajectory", "reason_change"]
 """Two parts of a response that can be held against each other without knowing the scene."""

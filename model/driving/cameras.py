@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class CameraSpec:
     """One camera: where it looks and how.
 
     Attributes:
-        name: one of `model.driving.scene.CAMERAS`.
+        name: one of `looktwice.model.driving.scene.CAMERAS`.
         hfov_degrees: horizontal field of view.
         horizon: where the horizon lies, as a share of the picture's height from the top; the lens is
             shifted for it, not tilted, so upright things stay upright.

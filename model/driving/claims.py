@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from model.driving.agents import AgentKind
-from model.driving.direction import CORRECTION
-from model.driving.view import Bend, Place, View
+from looktwice.model.driving.agents import AgentKind
+from looktwice.model.driving.direction import CORRECTION
+from looktwice.model.driving.view import Bend, Place, View
 
 CLEAR_WITHIN_M: Final = 45.0
 """A lane is clear where nobody is to be seen in it nearer than this."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 
-from model.driving.intervals import Interval
+from looktwice.model.driving.intervals import Interval
 
 Columns = Mapping[str, tuple[str, str]]
 """Title and pattern of `str.format`, by the figure's key."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from typing import Final, Literal, get_args
 
-from model.driving.plan import GROUPS, TICKS, Group, Plan
+from looktwice.model.driving.plan import GROUPS, TICKS, Group, Plan
 
 Change = Literal["slower", "faster", "left", "right", "straight", "lane_left", "lane_right", "keep_lane"]
 CHANGES: Final[tuple[Change, ...]] = get_args(Change)

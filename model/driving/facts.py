@@ -14,10 +14,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.route_frame import RouteFrame
-from model.driving.scene import EGO_LENGTH_M, LabelledScene
-from model.driving.tracks import Track, tracks_of
-from model.driving.trajectory import FloatArray
+from looktwice.model.driving.route_frame import RouteFrame
+from looktwice.model.driving.scene import EGO_LENGTH_M, LabelledScene
+from looktwice.model.driving.tracks import Track, tracks_of
+from looktwice.model.driving.trajectory import FloatArray
 
 LANES: Final = ("own", "left", "right")
 RANKS: Final = 2

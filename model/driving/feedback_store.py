@@ -13,7 +13,7 @@ from typing import Final
 
 import pyarrow as pa
 
-from model.driving.parquet_rows import read_rows, write_rows
+from looktwice.model.driving.parquet_rows import read_rows, write_rows
 
 FEEDBACK_VERSION: Final = "1"
 _VERSION_KEY: Final = b"looktwice.feedback_version"
@@ -37,7 +37,8 @@ class FeedbackRow:
         score: that it was judged by; partial where sub-scores are missing.
         is_partial: which of the two.
         threshold, correct: what it was held to, and whether it is at least that.
-        feedback: the verdict by rule, or five sections (`model.driving.pdm.feedback.parse_feedback`).
+        feedback: the verdict by rule, or five sections
+            (`looktwice.model.driving.pdm.feedback.parse_feedback`).
         facts: of the failure, in JSON.
         model, model_revision: who planned.
         teacher, teacher_revision: who wrote.

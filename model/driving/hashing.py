@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from model.driving.scene import LabelledScene, Scene
+from looktwice.model.driving.scene import LabelledScene, Scene
 
 
 def hash_of(*parts: object) -> str:

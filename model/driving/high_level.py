@@ -16,10 +16,10 @@ from typing import Final, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.labeller import ACCELERATION_ENTER, MIN_HEADING_CHANGE, WAIT_LEAVE
-from model.driving.lane_graph import LaneGraph, Way
-from model.driving.lead import LANE_HALF_WIDTH_M
-from model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, at_times, wrap_angle
+from looktwice.model.driving.labeller import ACCELERATION_ENTER, MIN_HEADING_CHANGE, WAIT_LEAVE
+from looktwice.model.driving.lane_graph import LaneGraph, Way
+from looktwice.model.driving.lead import LANE_HALF_WIDTH_M
+from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, at_times, wrap_angle
 
 Array = npt.NDArray[np.float64]
 Longitudinal = Literal["accelerate", "decelerate", "maintain", "stop"]
@@ -34,7 +34,7 @@ WINDOW_STEPS: Final = 4
 """Steps (2 s) of the sliding window: poses written in decimetres then give 0.1 m/s^2, a quarter of what
 counts as accelerating, and a driver's shift from one pedal to the other does not count."""
 ACCELERATING_MS2: Final = ACCELERATION_ENTER
-"""m/s^2: as in plans (`model.driving.labeller`)."""
+"""m/s^2: as in plans (`looktwice.model.driving.labeller`)."""
 STOPPED_MS: Final = WAIT_LEAVE
 """m/s over the last step: as slow as this waits, in plans too."""
 TURNED_RAD: Final = MIN_HEADING_CHANGE

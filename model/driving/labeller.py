@@ -16,9 +16,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.plan import TICKS, Plan, Track, track_from_words
-from model.driving.scene import LabelledScene, LaneTrace
-from model.driving.trajectory import HISTORY_STEPS, STEP_S, check_history, check_trajectory
+from looktwice.model.driving.plan import TICKS, Plan, Track, track_from_words
+from looktwice.model.driving.scene import LabelledScene, LaneTrace
+from looktwice.model.driving.trajectory import HISTORY_STEPS, STEP_S, check_history, check_trajectory
 
 Array = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

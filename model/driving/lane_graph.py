@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.route_frame import RouteFrame
-from model.driving.trajectory import FloatArray, wrap_angle
+from looktwice.model.driving.route_frame import RouteFrame
+from looktwice.model.driving.trajectory import FloatArray, wrap_angle
 
 Array = npt.NDArray[np.float64]
 

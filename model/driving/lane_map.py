@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.agents import SceneError
-from model.driving.trajectory import FloatArray
+from looktwice.model.driving.agents import SceneError
+from looktwice.model.driving.trajectory import FloatArray
 
 LANE_MAP_CM: Final = 100
 """A lane map is exact to the centimetre: so many of its units are one metre."""

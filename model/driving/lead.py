@@ -6,8 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.scene import EGO_LENGTH_M, LabelledScene
-from model.driving.trajectory import FloatArray
+from looktwice.model.driving.scene import EGO_LENGTH_M, LabelledScene
+from looktwice.model.driving.trajectory import FloatArray
 
 LEAD_WITHIN_M: Final = 20.0
 LANE_HALF_WIDTH_M: Final = 1.75

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, Agent
-from model.driving.trajectory import STEP_S, TEN_HZ_S, FloatArray, at_times, shared_times
+from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, Agent
+from looktwice.model.driving.trajectory import STEP_S, TEN_HZ_S, FloatArray, at_times, shared_times
 
 Array = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.cameras import CameraSpec
+from looktwice.model.driving.cameras import CameraSpec
 
 Array = npt.NDArray[np.float64]
 

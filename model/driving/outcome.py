@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal, cast
 
 OUTCOMES_VERSION: Final = 1
-"""Of `clients.metadrive.outcomes` and the car that follows; raised when plans may fare otherwise."""
+"""Of `looktwice.clients.metadrive.outcomes` and the car that follows; raised when plans may fare
+otherwise."""
 
 FailureName = Literal["collision", "off_road", "off_route", "comfort", "behind", "ahead"]
 HitKind = Literal["standing vehicle", "moving vehicle", "oncoming vehicle", "pedestrian", "obstacle"]

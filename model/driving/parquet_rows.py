@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from model.driving.whole_files import written_whole
+from looktwice.model.driving.whole_files import written_whole
 
 
 def write_rows(path: Path, rows: Iterable[Mapping[str, Any]], schema: pa.Schema, group: int) -> int:

@@ -13,13 +13,13 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.agents import AGENT_KINDS, Agent, AgentKind
-from model.driving.pdm.geometry import Boxes, boxes_meet
-from model.driving.reasoning import edge_distances
-from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, LabelledScene
-from model.driving.tracks import track_of
-from model.driving.trajectory import STEP_S, THREE_SECONDS_S, FloatArray, speeds
-from model.driving.view import visible
+from looktwice.model.driving.agents import AGENT_KINDS, Agent, AgentKind
+from looktwice.model.driving.pdm.geometry import Boxes, boxes_meet
+from looktwice.model.driving.reasoning import edge_distances
+from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, LabelledScene
+from looktwice.model.driving.tracks import track_of
+from looktwice.model.driving.trajectory import STEP_S, THREE_SECONDS_S, FloatArray, speeds
+from looktwice.model.driving.view import visible
 
 MAX_PERCEIVED: Final = 8
 """Agents that are told of, the nearest."""

@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-from model.driving.agents import AgentKind
-from model.driving.direction import Change, group_of, track_changes
-from model.driving.plan import GROUPS, Plan
+from looktwice.model.driving.agents import AgentKind
+from looktwice.model.driving.direction import Change, group_of, track_changes
+from looktwice.model.driving.plan import GROUPS, Plan
 
 Side = Literal["left", "right"]
 ReflectionLanguage = Literal["free_text", "phrases"]

@@ -14,16 +14,16 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.agents import ROAD_USERS, Agent
-from model.driving.high_level import action_of
-from model.driving.labeller import LANE_MOVING
-from model.driving.lane_graph import LaneGraph, Way
-from model.driving.lead import LANE_HALF_WIDTH_M
-from model.driving.phrases import FARTHEST_M, STEP_M, Side, State
-from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, LabelledScene
-from model.driving.seen import SLOWER_BY_MS, STANDING_MS
-from model.driving.sentences import EDGE_FARTHEST_M, EDGE_STEP_M
-from model.driving.thoughts import (
+from looktwice.model.driving.agents import ROAD_USERS, Agent
+from looktwice.model.driving.high_level import action_of
+from looktwice.model.driving.labeller import LANE_MOVING
+from looktwice.model.driving.lane_graph import LaneGraph, Way
+from looktwice.model.driving.lead import LANE_HALF_WIDTH_M
+from looktwice.model.driving.phrases import FARTHEST_M, STEP_M, Side, State
+from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, LabelledScene
+from looktwice.model.driving.seen import SLOWER_BY_MS, STANDING_MS
+from looktwice.model.driving.sentences import EDGE_FARTHEST_M, EDGE_STEP_M
+from looktwice.model.driving.thoughts import (
     Beside,
     Crosser,
     Crossing,
@@ -36,9 +36,9 @@ from model.driving.thoughts import (
     Road,
     Thoughts,
 )
-from model.driving.tracks import Track, track_of
-from model.driving.trajectory import STEP_S, FloatArray, present_speed
-from model.driving.view import bend_along, beside_of, visible
+from looktwice.model.driving.tracks import Track, track_of
+from looktwice.model.driving.trajectory import STEP_S, FloatArray, present_speed
+from looktwice.model.driving.view import bend_along, beside_of, visible
 
 Array = npt.NDArray[np.float64]
 

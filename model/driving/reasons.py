@@ -13,10 +13,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.claims import CLEAR_WITHIN_M
-from model.driving.direction import CHANGES, Change
-from model.driving.facts import FACTS, ROAD_DISTANCES_M, ROAD_SCALE_M, SPEED_SCALE_MS
-from model.driving.phrases import (
+from looktwice.model.driving.claims import CLEAR_WITHIN_M
+from looktwice.model.driving.direction import CHANGES, Change
+from looktwice.model.driving.facts import FACTS, ROAD_DISTANCES_M, ROAD_SCALE_M, SPEED_SCALE_MS
+from looktwice.model.driving.phrases import (
     FARTHEST_M,
     STEP_M,
     Bend,
@@ -29,10 +29,10 @@ from model.driving.phrases import (
     Straight,
     Thing,
 )
-from model.driving.seen import LANES, SLOWER_BY_MS, STANDING_MS, is_clear, spot_of, state_of
-from model.driving.tracks import Track
-from model.driving.trajectory import FloatArray, present_speed
-from model.driving.view import Place, Sight, View, bend_of, view_along
+from looktwice.model.driving.seen import LANES, SLOWER_BY_MS, STANDING_MS, is_clear, spot_of, state_of
+from looktwice.model.driving.tracks import Track
+from looktwice.model.driving.trajectory import FloatArray, present_speed
+from looktwice.model.driving.view import Place, Sight, View, bend_of, view_along
 
 Array = npt.NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def reasons_in(view: View) -> frozenset[Statement]:
 def reasons_tracked(
     history: FloatArray, route: FloatArray | None, tracks: Sequence[Track]
 ) -> frozenset[Statement]:
-    """The reasons of a scene whose tracks are known; see `model.driving.view.view_along`."""
+    """The reasons of a scene whose tracks are known; see `looktwice.model.driving.view.view_along`."""
     return reasons_in(view_along(history, route, tracks))
 
 

@@ -13,8 +13,8 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from model.driving.parquet_rows import read_rows, write_rows
-from model.driving.plan import Plan, PlanError, parse_plan
+from looktwice.model.driving.parquet_rows import read_rows, write_rows
+from looktwice.model.driving.plan import Plan, PlanError, parse_plan
 
 REFLECTION_VERSION: Final = "2"
 _VERSION_KEY: Final = b"looktwice.reflection_version"

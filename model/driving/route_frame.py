@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.trajectory import ROUTE_SPACING_M, FloatArray
+from looktwice.model.driving.trajectory import ROUTE_SPACING_M, FloatArray
 
 _BEHIND_M: Final = 80.0
 _BEYOND_M: Final = 80.0

@@ -8,7 +8,7 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.agents import (
+from looktwice.model.driving.agents import (
     AGENT_KINDS,
     LIGHTS,
     TRACK_STEPS,
@@ -17,9 +17,9 @@ from model.driving.agents import (
     Light,
     SceneError,
 )
-from model.driving.lane_map import LaneMap
-from model.driving.tracks import Track, check_tracks, tracks_of
-from model.driving.trajectory import (
+from looktwice.model.driving.lane_map import LaneMap
+from looktwice.model.driving.tracks import Track, check_tracks, tracks_of
+from looktwice.model.driving.trajectory import (
     FloatArray,
     GeometryError,
     check_history,

@@ -17,10 +17,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from model.driving.images import decode_image, encode_png
-from model.driving.lane_map import LANE_MAP_CM, LaneArea, LaneMap
-from model.driving.parquet_rows import write_rows
-from model.driving.scene import (
+from looktwice.model.driving.images import decode_image, encode_png
+from looktwice.model.driving.lane_map import LANE_MAP_CM, LaneArea, LaneMap
+from looktwice.model.driving.parquet_rows import write_rows
+from looktwice.model.driving.scene import (
     Agent,
     AgentKind,
     Clip,
@@ -32,7 +32,7 @@ from model.driving.scene import (
     SceneError,
     Tag,
 )
-from model.driving.trajectory import FloatArray, GeometryError
+from looktwice.model.driving.trajectory import FloatArray, GeometryError
 
 SCENE_VERSION: Final = "2"
 _VERSION_KEY: Final = b"looktwice.scene_version"

@@ -5,9 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from model.driving.claims import CLEAR_WITHIN_M, is_near
-from model.driving.phrases import Bend, Clear, Cue, Facts, Junction, Room, Side, Spot, State, Straight, Thing
-from model.driving.view import Place, Sight, View
+from looktwice.model.driving.claims import CLEAR_WITHIN_M, is_near
+from looktwice.model.driving.phrases import (
+    Bend,
+    Clear,
+    Cue,
+    Facts,
+    Junction,
+    Room,
+    Side,
+    Spot,
+    State,
+    Straight,
+    Thing,
+)
+from looktwice.model.driving.view import Place, Sight, View
 
 STANDING_MS: Final = 0.5
 """Who is not faster stands."""

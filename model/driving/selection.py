@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
-from model.driving.scene import LabelledScene, Tag
+from looktwice.model.driving.scene import LabelledScene, Tag
 
 
 def pick_varied(scenes: Iterable[LabelledScene], count: int) -> list[LabelledScene]:

@@ -1,4 +1,4 @@
-"""The sentences that thoughts are written in (`model.driving.thoughts`), as tables.
+"""The sentences that thoughts are written in (`looktwice.model.driving.thoughts`), as tables.
 
 Every text in a table is one decision of the model that writes it, and stands for a meaning. So each text is
 read as meanings again, and what cannot be written cannot be stated either.
@@ -10,8 +10,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from model.driving.high_level import Lateral, Longitudinal
-from model.driving.phrases import FARTHEST_M, STEP_M
+from looktwice.model.driving.high_level import Lateral, Longitudinal
+from looktwice.model.driving.phrases import FARTHEST_M, STEP_M
 
 EDGE_STEP_M: Final = 0.5
 EDGE_FARTHEST_M: Final = 3.0

@@ -23,9 +23,9 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.agents import Agent
-from model.driving.scene import LabelledScene
-from model.driving.trajectory import HISTORY_STEPS, STEP_S, FloatArray, wrap_angle
+from looktwice.model.driving.agents import Agent
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.trajectory import HISTORY_STEPS, STEP_S, FloatArray, wrap_angle
 
 Array = npt.NDArray[np.float64]
 

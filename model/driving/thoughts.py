@@ -4,7 +4,7 @@ The order is that of ELF-VLA's prompt (supplement, figure 6): the road's boundar
 may affect the ego, then what it does next. Agents are the three kinds of section 7.2: CIPO-1 leads in the own
 lane, CIPO-2 merges from a lane beside, and others' ways cross the ego's. Static elements follow.
 
-`model.driving.sentences` holds the words.
+`looktwice.model.driving.sentences` holds the words.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, Literal, cast
 
-from model.driving.high_level import HighLevelAction, Lateral, Longitudinal
-from model.driving.phrases import Side, State
-from model.driving.sentences import Meaning, joined, meanings_of, texts_of
+from looktwice.model.driving.high_level import HighLevelAction, Lateral, Longitudinal
+from looktwice.model.driving.phrases import Side, State
+from looktwice.model.driving.sentences import Meaning, joined, meanings_of, texts_of
 
 Beside = Literal["none", "left", "right", "both"]
 Origin = Literal["left", "right", "oncoming"]

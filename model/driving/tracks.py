@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.agents import (
+from looktwice.model.driving.agents import (
     AGENT_KINDS,
     LIGHTS,
     Agent,
@@ -17,7 +17,7 @@ from model.driving.agents import (
     Light,
     SceneError,
 )
-from model.driving.trajectory import HISTORY_STEPS, MAX_POSITION_M, STEP_S
+from looktwice.model.driving.trajectory import HISTORY_STEPS, MAX_POSITION_M, STEP_S
 
 MAX_TRACKS: Final = 16
 TRACK_REACH_M: Final = 100.0

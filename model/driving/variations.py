@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.driving.images import decode_image, encode_jpeg
-from model.driving.scene import Clip, Scene
+from looktwice.model.driving.images import decode_image, encode_jpeg
+from looktwice.model.driving.scene import Clip, Scene
 
 
 def fresh(scene: Scene, number: int) -> Scene:

@@ -12,10 +12,10 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.lead import LANE_HALF_WIDTH_M
-from model.driving.scene import EGO_LENGTH_M, Agent, AgentKind, LabelledScene, Scene
-from model.driving.tracks import Track, track_of
-from model.driving.trajectory import HISTORY_STEPS, STEP_S, FloatArray, present_speed
+from looktwice.model.driving.lead import LANE_HALF_WIDTH_M
+from looktwice.model.driving.scene import EGO_LENGTH_M, Agent, AgentKind, LabelledScene, Scene
+from looktwice.model.driving.tracks import Track, track_of
+from looktwice.model.driving.trajectory import HISTORY_STEPS, STEP_S, FloatArray, present_speed
 
 Array = npt.NDArray[np.float64]
 Place = Literal["my lane", "the left lane", "the right lane", "the left side", "the right side"]

@@ -12,13 +12,13 @@ from typing import Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.agreement import FOLLOWS_IOU
-from model.driving.labeller import label_plan
-from model.driving.plan import GROUPS, Plan, parse_plan
-from model.driving.trajectory import FloatArray
-from model.engines.engine import PlanRequest
-from model.formats.cursor import Token
-from model.network.codec import TrajectoryCodec
+from looktwice.model.driving.agreement import FOLLOWS_IOU
+from looktwice.model.driving.labeller import label_plan
+from looktwice.model.driving.plan import GROUPS, Plan, parse_plan
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.engines.engine import PlanRequest
+from looktwice.model.formats.cursor import Token
+from looktwice.model.network.codec import TrajectoryCodec
 
 BoolArray = npt.NDArray[np.bool_]
 

@@ -12,12 +12,12 @@ from typing import Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.plan import Plan
-from model.driving.scene import CAMERAS, Scene
-from model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S, FloatArray, at_10_hz
-from model.families.family import Attempt, Foreseen
-from model.formats.pieces import Plain, Value
-from model.network.model_card import ModelCard
+from looktwice.model.driving.plan import Plan
+from looktwice.model.driving.scene import CAMERAS, Scene
+from looktwice.model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S, FloatArray, at_10_hz
+from looktwice.model.families.family import Attempt, Foreseen
+from looktwice.model.formats.pieces import Plain, Value
+from looktwice.model.network.model_card import ModelCard
 
 Thinking = Literal["adaptive", "always", "never"]
 Decision = Literal["least_error", "drawn"]
@@ -62,12 +62,12 @@ class Controls:
             Thinking that would not fit is not begun, or cut; while it lasts, a direct trajectory is made
             ready beside it and is the answer if the reflection does not end in time.
         numbers: how numbers in the text are chosen, such as the times of a plan: ``least_error`` takes the
-            one that is expected to be off the least (`model.engines.least_error`), ``drawn`` draws them as
-            words are.
+            one that is expected to be off the least (`looktwice.model.engines.least_error`), ``drawn`` draws
+            them as words are.
         codes: how trajectory codes are chosen, likewise.
-        bind: only trajectories may be begun that do what the plan says (`model.engines.binding`).
+        bind: only trajectories may be begun that do what the plan says (`looktwice.model.engines.binding`).
         reasons: what a reflection in phrases may state: only what has a reason ``in_view``, as far as the
-            model can know, or ``any`` statement (`model.engines.reason_mask`).
+            model can know, or ``any`` statement (`looktwice.model.engines.reason_mask`).
         logprobs: draws tell how likely each of their decisions was.
         imagine: who decides whether a picture is imagined: ``auto`` leaves it to the model. For formats that
             imagine.
@@ -175,8 +175,8 @@ class Draw:
         times_s: of the poses of the trajectory, its family's.
         ids: of its tokens.
         reasons: the statements that its reflection could make; None where it could make any.
-        logprobs: of each token's choice, see `model.engines.logprobs`; None where the token is forced. Empty
-            where `Controls.logprobs` does not ask for them.
+        logprobs: of each token's choice, see `looktwice.model.engines.logprobs`; None where the token is
+            forced. Empty where `Controls.logprobs` does not ask for them.
         section_logprobs: of each section's text, the sum over its choices; empty likewise.
         foreseen: what its family reads of it as perceived and foreseen; None where it tells of neither.
         sections: what the sections say that only its family has, see `Family.own_sections`.

@@ -15,10 +15,10 @@ from typing import Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.engine import Controls
-from model.engines.sampling import Array, probabilities
-from model.formats.cursor import Allowed
-from model.network.codec import TrajectoryCodec
+from looktwice.model.engines.engine import Controls
+from looktwice.model.engines.sampling import Array, probabilities
+from looktwice.model.formats.cursor import Allowed
+from looktwice.model.network.codec import TrajectoryCodec
 
 Expected = Callable[[Array], Array]
 """From probabilities [k] to the expected error [k] of each choice, in metres or in steps between numbers."""

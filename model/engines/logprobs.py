@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from model.engines.engine import Controls
-from model.formats.cursor import Cursor
+from looktwice.model.engines.engine import Controls
+from looktwice.model.formats.cursor import Cursor
 
 
 def log_probability(logits: Tensor, place: int, temperature: float) -> Tensor:

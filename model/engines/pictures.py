@@ -12,8 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 from typing import Final, TypeVar
 
-from model.driving.images import ImageError, check_image, decoding_while
-from model.engines.engine import EngineError
+from looktwice.model.driving.images import ImageError, check_image, decoding_while
+from looktwice.model.engines.engine import EngineError
 
 _Result = TypeVar("_Result")
 THREADS: Final = 2

@@ -2,7 +2,7 @@
 
 A second look that speaks of what is not there is worth nothing, whoever reads it. What is in view is what
 the scene's tracks tell or, without any, the facts that the network reads from the pictures
-(`model.driving.reasons`). A mask leaves out the words that lead to any other statement.
+(`looktwice.model.driving.reasons`). A mask leaves out the words that lead to any other statement.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.phrases import NOTHING, Statement, unfinished
-from model.driving.reasons import reasons_read, reasons_tracked
-from model.driving.trajectory import FloatArray
-from model.engines.engine import PlanRequest
-from model.families.family import Family
-from model.formats.cursor import Cursor, Token
-from model.formats.phrases import in_phrases
+from looktwice.model.driving.phrases import NOTHING, Statement, unfinished
+from looktwice.model.driving.reasons import reasons_read, reasons_tracked
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.engines.engine import PlanRequest
+from looktwice.model.families.family import Family
+from looktwice.model.formats.cursor import Cursor, Token
+from looktwice.model.formats.phrases import in_phrases
 
 BoolArray = npt.NDArray[np.bool_]
 

@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from model.driving.images import ImageError
-from model.driving.plan import Plan
-from model.driving.scene import Scene
-from model.driving.trajectory import GeometryError, check_trajectory
-from model.engines.engine import (
+from looktwice.model.driving.images import ImageError
+from looktwice.model.driving.plan import Plan
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.trajectory import GeometryError, check_trajectory
+from looktwice.model.engines.engine import (
     CodesWritten,
     Draw,
     Event,
@@ -19,20 +19,20 @@ from model.engines.engine import (
     SectionFinished,
     TextWritten,
 )
-from model.engines.reason_mask import ReasonMask
-from model.engines.response import Response, SectionText
-from model.families.family import Attempt, Branch, Family
-from model.formats.cursor import CompiledFormat, Cursor
-from model.formats.pieces import NOTHING, FormatError
-from model.formats.text import parse
-from model.network.codec import TrajectoryCodec
-from model.network.model_card import ModelCard
-from model.network.vocabulary import Vocabulary
+from looktwice.model.engines.reason_mask import ReasonMask
+from looktwice.model.engines.response import Response, SectionText
+from looktwice.model.families.family import Attempt, Branch, Family
+from looktwice.model.formats.cursor import CompiledFormat, Cursor
+from looktwice.model.formats.pieces import NOTHING, FormatError
+from looktwice.model.formats.text import parse
+from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.network.model_card import ModelCard
+from looktwice.model.network.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
     # Scheduling imports this module, and needs no torch.
-    from model.network.inputs import InputBuilder, ModelInputs
-    from model.network.visual_codes import Frame, VisualCodes
+    from looktwice.model.network.inputs import InputBuilder, ModelInputs
+    from looktwice.model.network.visual_codes import Frame, VisualCodes
 
 
 def begin(

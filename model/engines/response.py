@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from model.driving.plan import Plan
-from model.engines.engine import Cut
-from model.formats.cursor import Cursor, Token
-from model.formats.pieces import Values
-from model.formats.text import parse_beginning
-from model.network.vocabulary import Vocabulary
+from looktwice.model.driving.plan import Plan
+from looktwice.model.engines.engine import Cut
+from looktwice.model.formats.cursor import Cursor, Token
+from looktwice.model.formats.pieces import Values
+from looktwice.model.formats.text import parse_beginning
+from looktwice.model.network.vocabulary import Vocabulary
 
 _HALF_A_CHARACTER: Final = "\ufffd"
 

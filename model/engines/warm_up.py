@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from model.driving.images import encode_jpeg
-from model.driving.scene import CLIP_FRAMES, Clip, Scene
-from model.driving.trajectory import HISTORY_STEPS
-from model.engines.engine import Controls, Engine, PlanRequest
-from model.families.family import Attempt
-from model.families.registry import family_named
-from model.network.model_card import ModelCard
+from looktwice.model.driving.images import encode_jpeg
+from looktwice.model.driving.scene import CLIP_FRAMES, Clip, Scene
+from looktwice.model.driving.trajectory import HISTORY_STEPS
+from looktwice.model.engines.engine import Controls, Engine, PlanRequest
+from looktwice.model.families.family import Attempt
+from looktwice.model.families.registry import family_named
+from looktwice.model.network.model_card import ModelCard
 
 
 def grey_scene(card: ModelCard) -> Scene:

@@ -14,10 +14,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path as Outline
 
-from model.driving.metrics import box_corners, points_inside
-from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, Agent, AgentKind, LabelledScene, Scene
-from model.driving.trajectory import FloatArray
-from model.engines.engine import Draw
+from looktwice.model.driving.metrics import box_corners, points_inside
+from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, Agent, AgentKind, LabelledScene, Scene
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.engines.engine import Draw
 
 DIRECT_COLOUR: Final = "#1f6fd0"
 REFLECTED_COLOUR: Final = "#d9480f"

@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from model.driving.intervals import Array, Interval, episode_weights, interval_of
+from looktwice.model.driving.intervals import Array, Interval, episode_weights, interval_of
 
 
 class Measured(Protocol):

@@ -14,12 +14,12 @@ import msgpack
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.hashing import hash_of, scene_hash
-from model.driving.perceived import Perceived, PerceivedAgent
-from model.driving.plan import Plan, parse_plan
-from model.engines.engine import Draw, DrawFinished, Engine, Event, Load, PlanRequest, Started
-from model.families.family import Foreseen, NextPicture
-from model.network.model_card import ModelCard
+from looktwice.model.driving.hashing import hash_of, scene_hash
+from looktwice.model.driving.perceived import Perceived, PerceivedAgent
+from looktwice.model.driving.plan import Plan, parse_plan
+from looktwice.model.engines.engine import Draw, DrawFinished, Engine, Event, Load, PlanRequest, Started
+from looktwice.model.families.family import Foreseen, NextPicture
+from looktwice.model.network.model_card import ModelCard
 
 _SCHEMA_VERSION: Final = 4
 """Part of every key, so that a draw that is kept otherwise is none that is known."""

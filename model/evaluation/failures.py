@@ -11,30 +11,30 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from model.driving.high_level import action_of
-from model.driving.lane_graph import LaneGraph
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.foresight import world_ahead
-from model.driving.pdm.judged import THRESHOLD, JudgedPlan
-from model.driving.pdm.judging import SceneJudge, judged_plans
-from model.driving.pdm.labelled import plans_of
-from model.driving.pdm.rule_teacher import feedback_on
-from model.driving.pdm.scoring import Others, score
-from model.driving.scene import LabelledScene
-from model.driving.trajectory import agreed
-from model.engines.engine import Controls, Draw, Engine
-from model.evaluation.open_loop import SceneResult
-from model.evaluation.report import evaluate_variants
-from model.evaluation.scores import (
+from looktwice.model.driving.high_level import action_of
+from looktwice.model.driving.lane_graph import LaneGraph
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.foresight import world_ahead
+from looktwice.model.driving.pdm.judged import THRESHOLD, JudgedPlan
+from looktwice.model.driving.pdm.judging import SceneJudge, judged_plans
+from looktwice.model.driving.pdm.labelled import plans_of
+from looktwice.model.driving.pdm.rule_teacher import feedback_on
+from looktwice.model.driving.pdm.scoring import Others, score
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.trajectory import agreed
+from looktwice.model.engines.engine import Controls, Draw, Engine
+from looktwice.model.evaluation.open_loop import SceneResult
+from looktwice.model.evaluation.report import evaluate_variants
+from looktwice.model.evaluation.scores import (
     SceneScore,
     by_scene,
     mean_of,
     scene_scores,
 )
-from model.evaluation.variants import Variant, over_scenes, planned, request_for
-from model.families.family import Attempt, Family
-from model.families.registry import OURS, family_named
-from model.network.model_card import ModelCard
+from looktwice.model.evaluation.variants import Variant, over_scenes, planned, request_for
+from looktwice.model.families.family import Attempt, Family
+from looktwice.model.families.registry import OURS, family_named
+from looktwice.model.network.model_card import ModelCard
 
 VERSION: Final[Version] = "v1.1"
 """PDMS: what the paper judges failures by."""

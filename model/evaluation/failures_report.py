@@ -6,15 +6,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
-from model.driving.columns import Columns, aligned
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.judged import THRESHOLD
-from model.driving.pdm.judging import SceneJudge
-from model.evaluation.bootstrap import Comparison, compare
-from model.evaluation.failures import MEASURES, Stage
-from model.evaluation.figures import FigureRow, figure_table
-from model.evaluation.scores import SceneScore, ScoreTable, baseline_planners, scene_scores, table_of
-from model.evaluation.table import comparison_cells
+from looktwice.model.driving.columns import Columns, aligned
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.judged import THRESHOLD
+from looktwice.model.driving.pdm.judging import SceneJudge
+from looktwice.model.evaluation.bootstrap import Comparison, compare
+from looktwice.model.evaluation.failures import MEASURES, Stage
+from looktwice.model.evaluation.figures import FigureRow, figure_table
+from looktwice.model.evaluation.scores import (
+    SceneScore,
+    ScoreTable,
+    baseline_planners,
+    scene_scores,
+    table_of,
+)
+from looktwice.model.evaluation.table import comparison_cells
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-from model.driving.columns import Columns, cells, titles
-from model.driving.intervals import Interval
-from model.evaluation.bootstrap import Measured, mean_interval
+from looktwice.model.driving.columns import Columns, cells, titles
+from looktwice.model.driving.intervals import Interval
+from looktwice.model.evaluation.bootstrap import Measured, mean_interval
 
 
 @dataclass(frozen=True)

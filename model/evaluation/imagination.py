@@ -8,13 +8,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from model.driving.columns import Columns, aligned, cell
-from model.driving.scene import LabelledScene
-from model.driving.trajectory import TEN_HZ_S
-from model.engines.engine import Controls, Draw, Engine
-from model.evaluation.bootstrap import Comparison, compare
-from model.evaluation.figures import FigureRow, figure_table
-from model.evaluation.next_frames import (
+from looktwice.model.driving.columns import Columns, aligned, cell
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.trajectory import TEN_HZ_S
+from looktwice.model.engines.engine import Controls, Draw, Engine
+from looktwice.model.evaluation.bootstrap import Comparison, compare
+from looktwice.model.evaluation.figures import FigureRow, figure_table
+from looktwice.model.evaluation.next_frames import (
     Painter,
     Pictures,
     TowerFeatures,
@@ -23,12 +23,12 @@ from model.evaluation.next_frames import (
     through_codes,
     warped,
 )
-from model.evaluation.open_loop import BASELINES, SceneResult
-from model.evaluation.protocols import Protocol
-from model.evaluation.report import evaluate_variants
-from model.evaluation.table import comparison_cells
-from model.evaluation.variants import Variant, next_camera
-from model.evaluation.waypoints import (
+from looktwice.model.evaluation.open_loop import BASELINES, SceneResult
+from looktwice.model.evaluation.protocols import Protocol
+from looktwice.model.evaluation.report import evaluate_variants
+from looktwice.model.evaluation.table import comparison_cells
+from looktwice.model.evaluation.variants import Variant, next_camera
+from looktwice.model.evaluation.waypoints import (
     PROTOCOLS,
     WAYPOINT_MEASURES,
     ActionScore,
@@ -37,11 +37,11 @@ from model.evaluation.waypoints import (
     action_scores,
     waypoints_of,
 )
-from model.families.family import Family
-from model.families.registry import family_named
-from model.network.checkpoint import Loaded
-from model.network.model_card import ModelCard
-from model.network.visual_codes import Frame
+from looktwice.model.families.family import Family
+from looktwice.model.families.registry import family_named
+from looktwice.model.network.checkpoint import Loaded
+from looktwice.model.network.model_card import ModelCard
+from looktwice.model.network.visual_codes import Frame
 
 AUTO: Final = "auto"
 NEVER: Final = "never"

@@ -11,12 +11,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from model.driving.scene import LabelledScene
-from model.engines.engine import Controls, Draw, Thinking
-from model.evaluation.bootstrap import Comparison, compare
-from model.evaluation.open_loop import SceneResult, evaluate_draws
-from model.evaluation.report import Report, variant_rows
-from model.evaluation.variants import Variant
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.engines.engine import Controls, Draw, Thinking
+from looktwice.model.evaluation.bootstrap import Comparison, compare
+from looktwice.model.evaluation.open_loop import SceneResult, evaluate_draws
+from looktwice.model.evaluation.report import Report, variant_rows
+from looktwice.model.evaluation.variants import Variant
 
 META_ACT: Final = "meta-act"
 MULTI_ROUND: Final = "multi-round"

@@ -9,8 +9,8 @@ from typing import Final
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from model.evaluation.ladder import Difficulty
-from model.evaluation.table import Row
+from looktwice.model.evaluation.ladder import Difficulty
+from looktwice.model.evaluation.table import Row
 
 _THINK: Final = "#c9772b"
 _ERROR: Final = "#2b6cb0"

@@ -14,14 +14,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from model.driving.cameras import CAMERA_SPECS
-from model.driving.intervals import Interval
-from model.driving.next_view import moved_view
-from model.driving.scene import LabelledScene
-from model.driving.short_term import INERTIA
-from model.network.checkpoint import Loaded
-from model.network.patches import resize
-from model.network.visual_codes import Frame, VisualCodes, frame_of, psnr
+from looktwice.model.driving.cameras import CAMERA_SPECS
+from looktwice.model.driving.intervals import Interval
+from looktwice.model.driving.next_view import moved_view
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.short_term import INERTIA
+from looktwice.model.network.checkpoint import Loaded
+from looktwice.model.network.patches import resize
+from looktwice.model.network.visual_codes import Frame, VisualCodes, frame_of, psnr
 
 Array = npt.NDArray[np.float64]
 

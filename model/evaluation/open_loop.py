@@ -1,7 +1,7 @@
 """Open-loop results of single scenes: what n draws, or a kinematic baseline, make of a labelled scene.
 
-The measures are those of CF-VLA's table 1; `model.evaluation.table` averages them over scenes. Trajectories
-with times of their own are compared with the expert at these times.
+The measures are those of CF-VLA's table 1; `looktwice.model.evaluation.table` averages them over scenes.
+Trajectories with times of their own are compared with the expert at these times.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.agreement import reason_and_change, reason_and_view, trajectory_iou
-from model.driving.labeller import expert_plan
-from model.driving.lead import lead_within
-from model.driving.metrics import collides, common, displacement_errors, leaves_road
-from model.driving.plan import Plan, plan_iou
-from model.driving.scene import LabelledScene, Tag
-from model.driving.trajectory import (
+from looktwice.model.driving.agreement import reason_and_change, reason_and_view, trajectory_iou
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.lead import lead_within
+from looktwice.model.driving.metrics import collides, common, displacement_errors, leaves_road
+from looktwice.model.driving.plan import Plan, plan_iou
+from looktwice.model.driving.scene import LabelledScene, Tag
+from looktwice.model.driving.trajectory import (
     TEN_HZ_S,
     FloatArray,
     agreed,
@@ -28,9 +28,9 @@ from model.driving.trajectory import (
     path_length,
     present_speed,
 )
-from model.driving.view import Surroundings, view_of
-from model.engines.engine import Draw
-from model.evaluation.words import unknown_words
+from looktwice.model.driving.view import Surroundings, view_of
+from looktwice.model.engines.engine import Draw
+from looktwice.model.evaluation.words import unknown_words
 
 MEASURES: Final = (
     "agreed_ade_m",
@@ -87,10 +87,10 @@ class SceneResult:
         collision_rate: share of draws that meet another agent or obstacle within 5 s.
         off_road_rate: share of draws that leave the road; None where no drivable area is known.
         agreement_plan_trajectory: IOU of the plan that a draw ends with and the plan that its trajectory
-            carries out (`model.driving.agreement`), mean; None without plans.
+            carries out (`looktwice.model.driving.agreement`), mean; None without plans.
         agreement_reason_change: share of the reasonings whose revised plan changes as they ask for.
         agreement_reason_view: share of the reasonings that name nothing but what is in view, in its place.
-        unknown_words: words of a reasoning that are none (`model.evaluation.words`), mean.
+        unknown_words: words of a reasoning that are none (`looktwice.model.evaluation.words`), mean.
         plan_iou_first: IOU of the first plan with the expert's, mean over draws; None without plans.
         plan_iou_best: the same, best of the draws.
         plan_iou_revised: IOU of the plan a draw ends with (the first one, where it did not reflect), mean.

@@ -1,4 +1,5 @@
-"""Second looks by what comes of them: plans are followed, and either hold or fail (`model.driving.outcome`).
+"""Second looks by what comes of them: plans are followed, and either hold or fail
+(`looktwice.model.driving.outcome`).
 
 Two runs over the same scenes are compared draw by draw: one never thinks, one thinks where it chooses to. A
 draw's random numbers depend on seed, draw and position alone, so both begin with the same first plan, and the
@@ -13,9 +14,9 @@ from typing import Any, get_args
 
 import numpy as np
 
-from model.driving.columns import aligned
-from model.driving.intervals import Array, Interval, episode_weights, interval_of, ratio_interval
-from model.driving.outcome import FailureName, Outcome
+from looktwice.model.driving.columns import aligned
+from looktwice.model.driving.intervals import Array, Interval, episode_weights, interval_of, ratio_interval
+from looktwice.model.driving.outcome import FailureName, Outcome
 
 FAILURES: tuple[FailureName, ...] = get_args(FailureName)
 

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from model.driving.columns import Columns, aligned, cells, titles
-from model.driving.facts import (
+from looktwice.model.driving.columns import Columns, aligned, cells, titles
+from looktwice.model.driving.facts import (
     FACTS,
     LANES,
     ROAD_DISTANCES_M,
@@ -21,9 +21,9 @@ from model.driving.facts import (
     WALKERS,
     scene_facts,
 )
-from model.driving.scene import LabelledScene
-from model.network.checkpoint import Loaded
-from model.network.fact_reader import likely
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.network.checkpoint import Loaded
+from looktwice.model.network.fact_reader import likely
 
 _BATCH: Final = 16
 _NEAR_M: Final = 60.0

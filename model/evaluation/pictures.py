@@ -11,16 +11,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from model.driving.images import decode_image
-from model.driving.labeller import expert_plan
-from model.driving.metrics import common, displacement_errors
-from model.driving.plan import Plan
-from model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, Clip, LabelledScene, Scene
-from model.driving.trajectory import present_speed
-from model.engines.engine import Draw
-from model.evaluation.birds_eye import DIRECT_COLOUR, REFLECTED_COLOUR, draw_birds_eye
-from model.evaluation.open_loop import iou_with_expert
-from model.evaluation.timeline import draw_timeline, row_count
+from looktwice.model.driving.images import decode_image
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.metrics import common, displacement_errors
+from looktwice.model.driving.plan import Plan
+from looktwice.model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, Clip, LabelledScene, Scene
+from looktwice.model.driving.trajectory import present_speed
+from looktwice.model.engines.engine import Draw
+from looktwice.model.evaluation.birds_eye import DIRECT_COLOUR, REFLECTED_COLOUR, draw_birds_eye
+from looktwice.model.evaluation.open_loop import iou_with_expert
+from looktwice.model.evaluation.timeline import draw_timeline, row_count
 
 WIDTH_PX: Final = 1400
 HEIGHT_PX: Final = 900

@@ -39,10 +39,10 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
-from model.driving.agents import Agent, AgentKind
-from model.driving.metrics import box_corners
-from model.driving.paper_axes import to_paper_axes
-from model.driving.trajectory import STEP_S, THREE_SECONDS_S
+from looktwice.model.driving.agents import Agent, AgentKind
+from looktwice.model.driving.metrics import box_corners
+from looktwice.model.driving.paper_axes import to_paper_axes
+from looktwice.model.driving.trajectory import STEP_S, THREE_SECONDS_S
 
 Array = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

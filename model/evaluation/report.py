@@ -8,12 +8,12 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from model.driving.lead import LEAD_WITHIN_M
-from model.driving.scene import LabelledScene
-from model.driving.trajectory import FloatArray
-from model.engines.engine import Draw, Engine
-from model.evaluation.bootstrap import Comparison, compare
-from model.evaluation.open_loop import (
+from looktwice.model.driving.lead import LEAD_WITHIN_M
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.engines.engine import Draw, Engine
+from looktwice.model.evaluation.bootstrap import Comparison, compare
+from looktwice.model.evaluation.open_loop import (
     EXPERT,
     LEAD_WITHIN_S,
     MEASURES,
@@ -21,8 +21,8 @@ from model.evaluation.open_loop import (
     evaluate_baselines,
     evaluate_trajectories,
 )
-from model.evaluation.table import Row, format_table, to_json
-from model.evaluation.variants import Variant, evaluate_engine
+from looktwice.model.evaluation.table import Row, format_table, to_json
+from looktwice.model.evaluation.variants import Variant, evaluate_engine
 
 LEAD_SUBGROUP = f"lead within {LEAD_WITHIN_M:.0f} m"
 SOON_SUBGROUP = f"lead within {LEAD_WITHIN_S:.0f} s"
@@ -43,7 +43,7 @@ class Report:
     speed_response: Mapping[str, Mapping[float, float]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """See `model.evaluation.table.to_json`; factors of speed are told as text."""
+        """See `looktwice.model.evaluation.table.to_json`; factors of speed are told as text."""
         responses = {
             name: {f"{factor:g}": value for factor, value in of.items()}
             for name, of in self.speed_response.items()

@@ -9,12 +9,12 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from model.driving.columns import aligned, cell, interval_cell
-from model.driving.intervals import Interval, ratio_interval
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.judging import SceneJudge
-from model.driving.pdm.labelled import moment_before, plans_of, states_of
-from model.driving.pdm.scoring import (
+from looktwice.model.driving.columns import aligned, cell, interval_cell
+from looktwice.model.driving.intervals import Interval, ratio_interval
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.judging import SceneJudge
+from looktwice.model.driving.pdm.labelled import moment_before, plans_of, states_of
+from looktwice.model.driving.pdm.scoring import (
     COLLISIONS,
     COMFORT,
     DIRECTION,
@@ -27,10 +27,10 @@ from model.driving.pdm.scoring import (
     TIME_TO_COLLISION,
     WEIGHTS,
 )
-from model.driving.pdm.world import Array
-from model.driving.scene import LabelledScene
-from model.driving.trajectory import FloatArray
-from model.evaluation.open_loop import BASELINES, EXPERT
+from looktwice.model.driving.pdm.world import Array
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.evaluation.open_loop import BASELINES, EXPERT
 
 VERSIONS: Final[Mapping[Version, str]] = {"v1.1": "PDMS", "v2.2": "EPDMS"}
 BEFORE_S: Final = 0.5
@@ -245,7 +245,7 @@ def score_table(
 
     Raises:
         ValueError: no scenes.
-        ScoreError, SolveError: see `model.driving.pdm.scoring.score`.
+        ScoreError, SolveError: see `looktwice.model.driving.pdm.scoring.score`.
     """
     judges = [SceneJudge(each) for each in scenes]
     every = {**baseline_planners(), **planners}

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from model.driving.columns import Columns, aligned, cells, interval_cell, titles
-from model.engines.engine import Thinking
-from model.evaluation.bootstrap import Comparison
-from model.evaluation.figures import FigureRow
+from looktwice.model.driving.columns import Columns, aligned, cells, interval_cell, titles
+from looktwice.model.engines.engine import Thinking
+from looktwice.model.evaluation.bootstrap import Comparison
+from looktwice.model.evaluation.figures import FigureRow
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Final
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyBboxPatch
 
-from model.driving.plan import GROUPS, TICKS, MetaAction, Plan
+from looktwice.model.driving.plan import GROUPS, TICKS, MetaAction, Plan
 
 WORD_COLOURS: Final[Mapping[str, str]] = {
     "Accelerate": "#2f9e6e",

@@ -11,9 +11,9 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from model.driving.labeller import expert_plan
-from model.driving.scene import Clip, LabelledScene
-from model.engines.engine import (
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.scene import Clip, LabelledScene
+from looktwice.model.engines.engine import (
     Controls,
     Draw,
     DrawFinished,
@@ -21,8 +21,8 @@ from model.engines.engine import (
     EngineError,
     PlanRequest,
 )
-from model.evaluation.open_loop import SceneResult, evaluate_draws
-from model.families.registry import family_named
+from looktwice.model.evaluation.open_loop import SceneResult, evaluate_draws
+from looktwice.model.families.registry import family_named
 
 _Scene = TypeVar("_Scene")
 _Found = TypeVar("_Found")

@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.intervals import Interval, ratio_interval
-from model.driving.scene import LabelledScene
-from model.driving.trajectory import TEN_HZ_S, FloatArray, at_times
-from model.evaluation.protocols import (
+from looktwice.model.driving.intervals import Interval, ratio_interval
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, at_times
+from looktwice.model.evaluation.protocols import (
     WAYPOINT_TIMES_S,
     Array,
     BoolArray,
@@ -20,7 +20,7 @@ from model.evaluation.protocols import (
     st_p3,
     uniad,
 )
-from model.families.family import Actions
+from looktwice.model.families.family import Actions
 
 PROTOCOLS: Final[tuple[Protocol, ...]] = ("ST-P3", "UniAD")
 

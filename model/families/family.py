@@ -7,16 +7,16 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
-from model.driving.perceived import Perceived
-from model.driving.phrases import ReflectionLanguage
-from model.driving.plan import Plan
-from model.driving.scene import CAMERAS
-from model.driving.thoughts import Thoughts
-from model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, check_times
-from model.families.prompts import Attempt as Attempt
-from model.families.prompts import Situation as Situation
-from model.families.prompts import TextInputs as TextInputs
-from model.formats.pieces import (
+from looktwice.model.driving.perceived import Perceived
+from looktwice.model.driving.phrases import ReflectionLanguage
+from looktwice.model.driving.plan import Plan
+from looktwice.model.driving.scene import CAMERAS
+from looktwice.model.driving.thoughts import Thoughts
+from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, check_times
+from looktwice.model.families.prompts import Attempt as Attempt
+from looktwice.model.families.prompts import Situation as Situation
+from looktwice.model.families.prompts import TextInputs as TextInputs
+from looktwice.model.formats.pieces import (
     Format,
     FormatError,
     Plain,
@@ -114,7 +114,7 @@ class NextPicture:
 
     Attributes:
         camera: one of `CAMERAS`.
-        codes: 98 codes of its picture, see `model.network.visual_codes`.
+        codes: 98 codes of its picture, see `looktwice.model.network.visual_codes`.
 
     Raises:
         FamilyError: there is no such camera.

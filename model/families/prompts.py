@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from model.driving.trajectory import FloatArray
-from model.formats.pieces import Format, Values
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.formats.pieces import Format, Values
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,12 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Final
 
-from model.driving.phrases import ReflectionLanguage
-from model.families.cf_vla import CF_VLA
-from model.families.elf_vla import ELF_VLA, ELF_VLA_REFINE
-from model.families.family import Family, FamilyError
-from model.families.traj_only import TRAJ_ONLY
-from model.families.vla_world import VLA_WORLD
+from looktwice.model.driving.phrases import ReflectionLanguage
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.elf_vla import ELF_VLA, ELF_VLA_REFINE
+from looktwice.model.families.family import Family, FamilyError
+from looktwice.model.families.traj_only import TRAJ_ONLY
+from looktwice.model.families.vla_world import VLA_WORLD
 
 GROUP: Final = "looktwice.families"
 """The entry points that declare families."""

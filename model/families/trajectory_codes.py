@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, cast
 
-from model.formats.pieces import Codes, Literal, Sequence, Value
+from looktwice.model.formats.pieces import Codes, Literal, Sequence, Value
 
 TRAJECTORY: Final = "trajectory"
 """The alphabet of trajectory codes: one codebook for each of its `CODES` stages."""

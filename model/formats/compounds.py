@@ -7,7 +7,7 @@ from decimal import Decimal
 from functools import cached_property
 from typing import Final
 
-from model.formats.pieces import (
+from looktwice.model.formats.pieces import (
     Choice,
     Codes,
     Compound,

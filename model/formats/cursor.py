@@ -13,10 +13,10 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.plan import Plan
-from model.formats.free_text import BEGUN, Alphabet, TextRules, TextState
-from model.formats.lengths import longest
-from model.formats.pieces import (
+from looktwice.model.driving.plan import Plan
+from looktwice.model.formats.free_text import BEGUN, Alphabet, TextRules, TextState
+from looktwice.model.formats.lengths import longest
+from looktwice.model.formats.pieces import (
     Choice,
     Codes,
     Format,
@@ -34,11 +34,11 @@ from model.formats.pieces import (
     narrowing_sections,
     with_picks,
 )
-from model.formats.plan_tracks import with_given
-from model.formats.starts import check, first_bytes
-from model.formats.trie import Node, build_trie
-from model.formats.writing import Token as Token
-from model.formats.writing import write
+from looktwice.model.formats.plan_tracks import with_given
+from looktwice.model.formats.starts import check, first_bytes
+from looktwice.model.formats.trie import Node, build_trie
+from looktwice.model.formats.writing import Token as Token
+from looktwice.model.formats.writing import write
 
 
 class Vocabulary(Protocol):

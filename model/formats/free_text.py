@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model.formats.pieces import FormatError, FreeText
+from looktwice.model.formats.pieces import FormatError, FreeText
 
 Ids = npt.NDArray[np.int64]
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from model.formats.cursor import Active, AtChoice, AtCode, Cursor, InText, Rest, Run, Ways
-from model.formats.free_text import BEGUN, TextState
-from model.formats.pieces import (
+from looktwice.model.formats.cursor import Active, AtChoice, AtCode, Cursor, InText, Rest, Run, Ways
+from looktwice.model.formats.free_text import BEGUN, TextState
+from looktwice.model.formats.pieces import (
     Choice,
     Codes,
     FreeText,
@@ -26,8 +26,8 @@ from model.formats.pieces import (
     Sequence,
     Shorthand,
 )
-from model.formats.plan_tracks import MAX_SEGMENTS, Track, TrackWord
-from model.formats.trie import Node
+from looktwice.model.formats.plan_tracks import MAX_SEGMENTS, Track, TrackWord
+from looktwice.model.formats.trie import Node
 
 
 def to_lark(cursor: Cursor) -> str:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from model.driving.plan import TICKS, WORDS, Group, format_tick
-from model.formats.pieces import (
+from looktwice.model.driving.plan import TICKS, WORDS, Group, format_tick
+from looktwice.model.formats.pieces import (
     Choice,
     Codes,
     FreeText,
@@ -16,10 +16,10 @@ from model.formats.pieces import (
     Sequence,
     Shorthand,
 )
-from model.formats.plan_tracks import MAX_SEGMENTS, PlanTracks
+from looktwice.model.formats.plan_tracks import MAX_SEGMENTS, PlanTracks
 
 if TYPE_CHECKING:
-    from model.formats.cursor import CompiledFormat
+    from looktwice.model.formats.cursor import CompiledFormat
 
 
 def longest(compiled: CompiledFormat, piece: Piece) -> int:

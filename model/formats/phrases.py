@@ -1,4 +1,4 @@
-"""A reflection in phrases as a piece: `model.driving.phrases`, one decision a text.
+"""A reflection in phrases as a piece: `looktwice.model.driving.phrases`, one decision a text.
 
 Its value is its text. Only such reflections can be written as the first plan leaves room for: nobody who
 waits can be told to slow down.
@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from model.driving.direction import CHANGES, Change, group_of, needed
-from model.driving.phrases import (
+from looktwice.model.driving.direction import CHANGES, Change, group_of, needed
+from looktwice.model.driving.phrases import (
     CONSEQUENCES,
     CORRECTIONS,
     END,
@@ -27,8 +27,8 @@ from model.driving.phrases import (
     details,
     read_facts,
 )
-from model.driving.plan import GROUPS, TICKS
-from model.formats.pieces import (
+from looktwice.model.driving.plan import GROUPS, TICKS
+from looktwice.model.formats.pieces import (
     Choice,
     Compound,
     Format,
@@ -43,7 +43,7 @@ from model.formats.pieces import (
     Value,
     walk,
 )
-from model.formats.plan_tracks import written_plan
+from looktwice.model.formats.plan_tracks import written_plan
 
 _ALL: Final = frozenset(CHANGES)
 

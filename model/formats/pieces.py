@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, TypeAlias
 
-from model.driving.plan import Plan
+from looktwice.model.driving.plan import Plan
 
 Value: TypeAlias = "Plan | str | bool | float | tuple[Value, ...] | Mapping[str, Value]"
 """A plan, a word or free text, whether a `Maybe` is there, a number, codes or repeated values, a record."""

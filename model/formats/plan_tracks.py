@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final
 
-from model.driving.direction import Change, done, gain, group_of, needed
-from model.driving.phrases import Facts, PhraseError, agrees, read_facts
-from model.driving.plan import (
+from looktwice.model.driving.direction import Change, done, gain, group_of, needed
+from looktwice.model.driving.phrases import Facts, PhraseError, agrees, read_facts
+from looktwice.model.driving.plan import (
     GROUPS,
     TICKS,
     WORDS,
@@ -22,8 +22,8 @@ from model.driving.plan import (
     parse_plan,
     plan_from_bins,
 )
-from model.driving.plan import Track as DrivingTrack
-from model.formats.pieces import (
+from looktwice.model.driving.plan import Track as DrivingTrack
+from looktwice.model.formats.pieces import (
     Choice,
     Compound,
     FormatError,

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model.formats.cursor import Cursor
-from model.formats.pieces import FormatError
+from looktwice.model.formats.cursor import Cursor
+from looktwice.model.formats.pieces import FormatError
 
 
 class Decision(NamedTuple):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from model.formats.pieces import (
+from looktwice.model.formats.pieces import (
     Choice,
     Codes,
     FormatError,
@@ -20,10 +20,10 @@ from model.formats.pieces import (
     Sequence,
     Shorthand,
 )
-from model.formats.plan_tracks import PlanTracks
+from looktwice.model.formats.plan_tracks import PlanTracks
 
 if TYPE_CHECKING:
-    from model.formats.cursor import CompiledFormat
+    from looktwice.model.formats.cursor import CompiledFormat
 
 
 class Start(NamedTuple):

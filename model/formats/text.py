@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 
-from model.driving.plan import Plan
-from model.formats.cursor import CompiledFormat
-from model.formats.pieces import (
+from looktwice.model.driving.plan import Plan
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.pieces import (
     Choice,
     Codes,
     Compound,

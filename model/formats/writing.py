@@ -6,7 +6,7 @@ import collections.abc
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
-from model.formats.pieces import (
+from looktwice.model.formats.pieces import (
     Choice,
     Codes,
     Compound,
@@ -25,7 +25,7 @@ from model.formats.pieces import (
 )
 
 if TYPE_CHECKING:
-    from model.formats.cursor import CompiledFormat
+    from looktwice.model.formats.cursor import CompiledFormat
 
 
 class Token(NamedTuple):

@@ -11,9 +11,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from model.network.card import CheckpointError
-from model.network.checkpoint import Loaded
-from model.network.vla import is_planner, is_vision
+from looktwice.model.network.card import CheckpointError
+from looktwice.model.network.checkpoint import Loaded
+from looktwice.model.network.vla import is_planner, is_vision
 
 
 def blend(before: Loaded, after: Loaded, share: float) -> Loaded:

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from model.network.codec import CODEC_FILE
-from model.network.settings import VlaSettings
+from looktwice.model.network.codec import CODEC_FILE
+from looktwice.model.network.settings import VlaSettings
 
 CARD_FILE: Final = "looktwice.json"
 LOG_FILE: Final = "log.jsonl"
@@ -85,7 +85,7 @@ def weights_revision(folder: Path) -> str:
         CheckpointError: the network's or the codec's are missing.
     """
     # Who only reads cards needs no torch.
-    from model.network.visual_codes import WEIGHTS_FILE
+    from looktwice.model.network.visual_codes import WEIGHTS_FILE
 
     if not (folder / CODEC_FILE).is_file():
         raise CheckpointError(f"{folder} has no {CODEC_FILE}")

@@ -2,7 +2,7 @@
 
 A folder holds ``config.json``, tokenizer files, ``model.safetensors`` (or shards), the trajectory codec,
 ``looktwice.json``, a small card for tools, the codes of pictures where a model imagines any, and what a model
-repository needs (`model.network.repository`).
+repository needs (`looktwice.model.network.repository`).
 """
 
 from __future__ import annotations
@@ -20,17 +20,30 @@ from safetensors import SafetensorError
 from transformers import AutoTokenizer, Qwen2_5_VLConfig
 from transformers.utils import logging as transformers_logging
 
-from model.network.card import CheckpointError, read_card, weight_files, weights_revision, write_card
-from model.network.codec import CodecError, TrajectoryCodec
-from model.network.inputs import InputBuilder
-from model.network.model_card import ModelCard
-from model.network.numbers import needed_numbers, write_number_embeddings
-from model.network.repository import write_repository
-from model.network.settings import SettingsError, VlaSettings
-from model.network.visual_codes import WEIGHTS_FILE as VISUAL_CODES_FILE
-from model.network.visual_codes import VisualCodes, VisualCodesError, load_visual_codes
-from model.network.vla import LookTwiceVla, VlaConfig, nano_config, padded_size, parameters_of, with_settings
-from model.network.vocabulary import Vocabulary, VocabularyError, add_numbers, expand_tokenizer
+from looktwice.model.network.card import (
+    CheckpointError,
+    read_card,
+    weight_files,
+    weights_revision,
+    write_card,
+)
+from looktwice.model.network.codec import CodecError, TrajectoryCodec
+from looktwice.model.network.inputs import InputBuilder
+from looktwice.model.network.model_card import ModelCard
+from looktwice.model.network.numbers import needed_numbers, write_number_embeddings
+from looktwice.model.network.repository import write_repository
+from looktwice.model.network.settings import SettingsError, VlaSettings
+from looktwice.model.network.visual_codes import WEIGHTS_FILE as VISUAL_CODES_FILE
+from looktwice.model.network.visual_codes import VisualCodes, VisualCodesError, load_visual_codes
+from looktwice.model.network.vla import (
+    LookTwiceVla,
+    VlaConfig,
+    nano_config,
+    padded_size,
+    parameters_of,
+    with_settings,
+)
+from looktwice.model.network.vocabulary import Vocabulary, VocabularyError, add_numbers, expand_tokenizer
 
 _PUBLISHED_NAMES: Final = {
     r"^visual\.": "model.visual.",

@@ -18,10 +18,10 @@ import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from model.driving.scene import EGO_LENGTH_M
-from model.driving.trajectory import FUTURE_STEPS, HORIZON_S, STEP_S, FloatArray
-from model.network import quantiser
-from model.network.splines import clamped_basis
+from looktwice.model.driving.scene import EGO_LENGTH_M
+from looktwice.model.driving.trajectory import FUTURE_STEPS, HORIZON_S, STEP_S, FloatArray
+from looktwice.model.network import quantiser
+from looktwice.model.network.splines import clamped_basis
 
 CODEC_FILE: Final = "trajectory_codec.safetensors"
 CODEC_VERSION: Final = 1
@@ -178,7 +178,7 @@ class TrajectoryCodec:
 
 
 def _present_speeds(histories: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """`model.driving.trajectory.present_speed` of histories [n, 16, 4] at once, m/s [n]."""
+    """`looktwice.model.driving.trajectory.present_speed` of histories [n, 16, 4] at once, m/s [n]."""
     speeds: npt.NDArray[np.float64] = -np.asarray(histories, np.float64)[:, -4, 0] / (3 * STEP_S)
     return speeds
 

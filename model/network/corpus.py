@@ -10,12 +10,12 @@ import random
 from collections.abc import Iterator
 from typing import Final
 
-from model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, track_from_words
-from model.driving.scene import CAMERAS
-from model.families.cf_vla.format import ACTION, PLAN_START, THINKING
-from model.families.registry import family_named
-from model.network.prompts import SYSTEM, prompt_text
-from model.network.settings import NANO_SETTINGS, VlaSettings
+from looktwice.model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, track_from_words
+from looktwice.model.driving.scene import CAMERAS
+from looktwice.model.families.cf_vla.format import ACTION, PLAN_START, THINKING
+from looktwice.model.families.registry import family_named
+from looktwice.model.network.prompts import SYSTEM, prompt_text
+from looktwice.model.network.settings import NANO_SETTINGS, VlaSettings
 
 _SLOTS: Final[dict[str, tuple[str, ...]]] = {
     "agent": (

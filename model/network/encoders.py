@@ -7,7 +7,7 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS, ROUTE_SPACING_M, STEP_S
+from looktwice.model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS, ROUTE_SPACING_M, STEP_S
 
 # Typical sizes, so that what the networks see is of order one: metres, metres, metres, radians.
 _POSE_SCALE: Final = (10.0, 2.0, 1.0, 0.3)

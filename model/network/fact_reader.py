@@ -1,4 +1,4 @@
-"""The facts that decide a plan, read from the gathered tokens of a scene (`model.driving.facts`).
+"""The facts that decide a plan, read from the gathered tokens of a scene (`looktwice.model.driving.facts`).
 
 What pictures show is brought down to numbers with a meaning before anything is planned from them: they are
 taught densely and read alike in scenes that were never seen, where a vector without a meaning is learned by
@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from model.driving.facts import FACT_GROUPS, IS_YES_OR_NO, PRESENCE, TELLS_OF_OBJECT
+from looktwice.model.driving.facts import FACT_GROUPS, IS_YES_OR_NO, PRESENCE, TELLS_OF_OBJECT
 
 _OUTLIER = 6.0
 

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Final
 
-from model.network.card import CheckpointError
+from looktwice.model.network.card import CheckpointError
 
 _NAME: Final = re.compile(r"[\w.-]+/[\w.-]+(@[\w./-]+)?")
 _FILES: Final = ("*.json", "*.safetensors", "*.jinja", "*.md")

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.images import decode_image
-from model.driving.scene import Scene
-from model.driving.trajectory import FloatArray
-from model.families.family import Attempt, Situation, TextInputs
-from model.families.registry import family_named
-from model.formats.cursor import CompiledFormat
-from model.network.patches import normalise, patchify, resize
-from model.network.prompts import prompt_text
-from model.network.settings import VlaSettings
-from model.network.track_features import track_features
-from model.network.vocabulary import VIDEO_PAD, Vocabulary
+from looktwice.model.driving.images import decode_image
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.families.family import Attempt, Situation, TextInputs
+from looktwice.model.families.registry import family_named
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.network.patches import normalise, patchify, resize
+from looktwice.model.network.prompts import prompt_text
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.track_features import track_features
+from looktwice.model.network.vocabulary import VIDEO_PAD, Vocabulary
 
 IntArray = npt.NDArray[np.int64]
 

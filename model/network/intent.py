@@ -14,11 +14,11 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from model.driving.tracks import MAX_TRACKS
-from model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS, ROUTE_SPACING_M, STEP_S
-from model.network.codec import DIMENSIONS, TrajectoryCodec
-from model.network.track_features import TRACK_FEATURES
-from model.network.trajectory_head import spread_of
+from looktwice.model.driving.tracks import MAX_TRACKS
+from looktwice.model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS, ROUTE_SPACING_M, STEP_S
+from looktwice.model.network.codec import DIMENSIONS, TrajectoryCodec
+from looktwice.model.network.track_features import TRACK_FEATURES
+from looktwice.model.network.trajectory_head import spread_of
 
 INTENT_TOKENS: Final = 2
 """Tokens of the prompt that one state becomes, without those of its sketch."""

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from model.families.picture_codes import PICTURE
-from model.families.registry import families_of
-from model.formats.compounds import number_alphabets
-from model.network.settings import VlaSettings
-from model.network.visual_codes import levels_of
-from model.network.vocabulary import Vocabulary
+from looktwice.model.families.picture_codes import PICTURE
+from looktwice.model.families.registry import families_of
+from looktwice.model.formats.compounds import number_alphabets
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.visual_codes import levels_of
+from looktwice.model.network.vocabulary import Vocabulary
 
 _WAVES: Final = 4
 """Of a number's place, the longest over the whole alphabet and each half as long as the one before: tokens

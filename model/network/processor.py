@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from transformers import BatchFeature, ProcessorMixin
 
-from model.driving.scene import Scene
-from model.families.family import Attempt
-from model.network.inputs import InputBuilder
-from model.network.settings import CONFIG_KEY, VlaSettings
-from model.network.vocabulary import Vocabulary
+from looktwice.model.driving.scene import Scene
+from looktwice.model.families.family import Attempt
+from looktwice.model.network.inputs import InputBuilder
+from looktwice.model.network.settings import CONFIG_KEY, VlaSettings
+from looktwice.model.network.vocabulary import Vocabulary
 
 
 class LookTwiceProcessor(ProcessorMixin):
@@ -20,7 +20,7 @@ class LookTwiceProcessor(ProcessorMixin):
     Args:
         tokenizer: with our markers and codes.
         looktwice: the checkpoint's settings, as in its ``config.json``.
-        chat_template: writes the prompt that `model.network.prompts` writes.
+        chat_template: writes the prompt that `looktwice.model.network.prompts` writes.
     """
 
     def __init__(

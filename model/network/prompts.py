@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from model.families.registry import family_named
-from model.network.settings import VlaSettings
-from model.network.vocabulary import (
+from looktwice.model.families.registry import family_named
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vocabulary import (
     HISTORY,
     HISTORY_END,
     HISTORY_START,

@@ -12,11 +12,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from model.network.card import CheckpointError, read_card, write_details
-from model.network.processor import LookTwiceProcessor, processor_config
-from model.network.prompts import chat_template
-from model.network.settings import CONFIG_KEY, SettingsError, VlaSettings
-from model.network.vla import LookTwiceVla
+from looktwice.model.network.card import CheckpointError, read_card, write_details
+from looktwice.model.network.processor import LookTwiceProcessor, processor_config
+from looktwice.model.network.prompts import chat_template
+from looktwice.model.network.settings import CONFIG_KEY, SettingsError, VlaSettings
+from looktwice.model.network.vla import LookTwiceVla
 
 CARD: Final = "README.md"
 _MODEL_CODE: Final = "modeling_looktwice"
@@ -94,8 +94,8 @@ def model_card(card: Mapping[str, Any], settings: VlaSettings) -> str:
         "```python",
         "from transformers import AutoModel, AutoProcessor",
         "",
-        "from model.bundled import SCENES",
-        "from model.driving.scene_store import read_scenes",
+        "from looktwice.model.bundled import SCENES",
+        "from looktwice.model.driving.scene_store import read_scenes",
         "",
         "model = AutoModel.from_pretrained(FOLDER, trust_remote_code=True)",
         "processor = AutoProcessor.from_pretrained(FOLDER, trust_remote_code=True)",

@@ -13,10 +13,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.driving.facts import FACTS
-from model.network.encoders import HistoryEncoder, RouteEncoder
-from model.network.fact_reader import FactReader, likely, weighed
-from model.network.intent import IntentReader, SketchCodes
+from looktwice.model.driving.facts import FACTS
+from looktwice.model.network.encoders import HistoryEncoder, RouteEncoder
+from looktwice.model.network.fact_reader import FactReader, likely, weighed
+from looktwice.model.network.intent import IntentReader, SketchCodes
 
 _HEADS: Final = 4
 _LAYERS: Final = 2

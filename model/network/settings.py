@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Final, get_args
 
-from model.driving.facts import FACT_GROUPS
-from model.driving.phrases import ReflectionLanguage
-from model.driving.scene import CAMERAS, CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE
-from model.families.trajectory_codes import CODES
-from model.network.intent import INTENT_TOKENS
+from looktwice.model.driving.facts import FACT_GROUPS
+from looktwice.model.driving.phrases import ReflectionLanguage
+from looktwice.model.driving.scene import CAMERAS, CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE
+from looktwice.model.families.trajectory_codes import CODES
+from looktwice.model.network.intent import INTENT_TOKENS
 
 CONFIG_KEY: Final = "looktwice"
 """Where these settings lie in a checkpoint's ``config.json``."""
@@ -34,7 +34,7 @@ class VlaSettings:
         with_route: whether it has a route encoder.
         with_tracks: whether it has a reader of tracks.
         sketch_tokens: of the prompt that tell the trajectory which a small planner's state amounts to
-            (`model.network.intent`); 0 for none.
+            (`looktwice.model.network.intent`); 0 for none.
         scene_tokens: 0 where every vision token stands in the prompt, as in Qwen2.5-VL; otherwise a
             resampler brings those of all cameras down to so many.
         patch_size, temporal_patch_size, spatial_merge_size, tokens_per_second: as in the backbone's

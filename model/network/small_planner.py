@@ -20,15 +20,15 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from model.driving.facts import FACTS
-from model.driving.scene import Scene, SceneError
-from model.driving.trajectory import FUTURE_STEPS, FloatArray
-from model.network.card import CARD_FILE, files_revision, weights_revision
-from model.network.checkpoint import load
-from model.network.codec import CODEC_FILE, CodecError, TrajectoryCodec
-from model.network.intent import IntentTrunk, TrackPool, present_speeds
-from model.network.track_features import track_features
-from model.network.trajectory_head import Guesses, TrajectoryHead
+from looktwice.model.driving.facts import FACTS
+from looktwice.model.driving.scene import Scene, SceneError
+from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray
+from looktwice.model.network.card import CARD_FILE, files_revision, weights_revision
+from looktwice.model.network.checkpoint import load
+from looktwice.model.network.codec import CODEC_FILE, CodecError, TrajectoryCodec
+from looktwice.model.network.intent import IntentTrunk, TrackPool, present_speeds
+from looktwice.model.network.track_features import track_features
+from looktwice.model.network.trajectory_head import Guesses, TrajectoryHead
 
 SmallKind = Literal["blind", "teacher", "facts"]
 DRIVING_KINDS: Final[tuple[SmallKind, ...]] = ("blind", "teacher")

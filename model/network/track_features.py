@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.route_frame import RouteFrame
-from model.driving.tracks import MAX_TRACKS, Track
-from model.driving.trajectory import FloatArray
+from looktwice.model.driving.route_frame import RouteFrame
+from looktwice.model.driving.tracks import MAX_TRACKS, Track
+from looktwice.model.driving.trajectory import FloatArray
 
 TRACK_FEATURES: Final = (
     "present",

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.driving.trajectory import FUTURE_STEPS, STEP_S
-from model.network.codec import HEADING_WEIGHT_M, TrajectoryCodec
+from looktwice.model.driving.trajectory import FUTURE_STEPS, STEP_S
+from looktwice.model.network.codec import HEADING_WEIGHT_M, TrajectoryCodec
 
 MODES: Final = 6
 _HEADING_WEIGHT: Final = 1.5

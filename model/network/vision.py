@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from model.network.attention import attend
-from model.network.patches import normalisation
+from looktwice.model.network.attention import attend
+from looktwice.model.network.patches import normalisation
 
 
 def attends_to_whole_pictures(vision_config: Any) -> bool:

@@ -23,8 +23,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from model.driving.images import decode_image
-from model.driving.whole_files import written_whole
+from looktwice.model.driving.images import decode_image
+from looktwice.model.driving.whole_files import written_whole
 
 FRAME_WIDTH: Final = 224
 FRAME_HEIGHT: Final = 112

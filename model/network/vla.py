@@ -14,15 +14,15 @@ import torch
 from torch import Tensor, nn
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
-from model.driving.trajectory import ROUTE_POINTS, FloatArray
-from model.network.encoders import HistoryEncoder, RouteEncoder
-from model.network.fact_reader import likely
-from model.network.inputs import ModelInputs, Prompt, rotary_positions
-from model.network.intent import SketchBooks, SketchCodes, TrackReader
-from model.network.resampler import SceneResampler
-from model.network.settings import CONFIG_KEY, VlaSettings
-from model.network.vision import attends_to_whole_pictures, encode_pictures, normalised
-from model.network.vocabulary import (
+from looktwice.model.driving.trajectory import ROUTE_POINTS, FloatArray
+from looktwice.model.network.encoders import HistoryEncoder, RouteEncoder
+from looktwice.model.network.fact_reader import likely
+from looktwice.model.network.inputs import ModelInputs, Prompt, rotary_positions
+from looktwice.model.network.intent import SketchBooks, SketchCodes, TrackReader
+from looktwice.model.network.resampler import SceneResampler
+from looktwice.model.network.settings import CONFIG_KEY, VlaSettings
+from looktwice.model.network.vision import attends_to_whole_pictures, encode_pictures, normalised
+from looktwice.model.network.vocabulary import (
     END_OF_TEXT,
     HISTORY,
     IM_END,

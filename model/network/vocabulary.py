@@ -17,7 +17,7 @@ import numpy.typing as npt
 from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, trainers
 from transformers import PreTrainedTokenizerFast
 
-from model.families.trajectory_codes import CODES, TRAJECTORY
+from looktwice.model.families.trajectory_codes import CODES, TRAJECTORY
 
 END_OF_TEXT: Final = "<|endoftext|>"
 IM_START: Final = "<|im_start|>"

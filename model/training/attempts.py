@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.feedback_store import FeedbackRow
-from model.driving.trajectory import TIMES_OF, FloatArray, at_times
-from model.families.family import Attempt, JudgedAttempt
-from model.training.examples import Examples
-from model.training.reflections import places_of, plain
+from looktwice.model.driving.feedback_store import FeedbackRow
+from looktwice.model.driving.trajectory import TIMES_OF, FloatArray, at_times
+from looktwice.model.families.family import Attempt, JudgedAttempt
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.reflections import places_of, plain
 
 
 class AttemptsOn(NamedTuple):

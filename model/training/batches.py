@@ -12,27 +12,34 @@ import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
-from model.driving.plan import Plan
-from model.driving.scene import mirrored_camera
-from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, present_speed
-from model.families.family import FamilyError, JudgedAttempt, Lesson, NextPicture, Reflection, Situation
-from model.families.registry import families_of
-from model.families.trajectory_codes import CODES
-from model.formats.cursor import CompiledFormat
-from model.formats.pieces import FormatError
-from model.network.codec import TrajectoryCodec
-from model.network.inputs import InputBuilder
-from model.network.patches import patchify
-from model.network.prompts import motion_text
-from model.network.track_features import MIRRORED, without_route
-from model.network.visual_codes import VisualCodes, frame_of
-from model.network.vocabulary import Vocabulary
-from model.training.examples import Examples, example_frames
-from model.training.own_plans import OwnPlans
-from model.training.reflections import mirrored
-from model.training.soft_codes import SoftCodes
-from model.training.targets import SectionWeights, Target, make_target
-from model.training.vision_cache import VisionCache
+from looktwice.model.driving.plan import Plan
+from looktwice.model.driving.scene import mirrored_camera
+from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, present_speed
+from looktwice.model.families.family import (
+    FamilyError,
+    JudgedAttempt,
+    Lesson,
+    NextPicture,
+    Reflection,
+    Situation,
+)
+from looktwice.model.families.registry import families_of
+from looktwice.model.families.trajectory_codes import CODES
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.pieces import FormatError
+from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.network.inputs import InputBuilder
+from looktwice.model.network.patches import patchify
+from looktwice.model.network.prompts import motion_text
+from looktwice.model.network.track_features import MIRRORED, without_route
+from looktwice.model.network.visual_codes import VisualCodes, frame_of
+from looktwice.model.network.vocabulary import Vocabulary
+from looktwice.model.training.examples import Examples, example_frames
+from looktwice.model.training.own_plans import OwnPlans
+from looktwice.model.training.reflections import mirrored
+from looktwice.model.training.soft_codes import SoftCodes
+from looktwice.model.training.targets import SectionWeights, Target, make_target
+from looktwice.model.training.vision_cache import VisionCache
 
 Batch = dict[str, Tensor]
 

@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.cameras import CAMERA_SPECS
-from model.driving.facts import SPEED_SCALE_MS
-from model.driving.scene import SEMANTIC_CLASSES, DenseTarget, LabelledScene
-from model.driving.tracks import track_of
-from model.driving.trajectory import present_speed
+from looktwice.model.driving.cameras import CAMERA_SPECS
+from looktwice.model.driving.facts import SPEED_SCALE_MS
+from looktwice.model.driving.scene import SEMANTIC_CLASSES, DenseTarget, LabelledScene
+from looktwice.model.driving.tracks import track_of
+from looktwice.model.driving.trajectory import present_speed
 
 DENSE_SHAPE: Final = (24, 48)
 """Rows and columns that dense targets are brought to."""

@@ -15,22 +15,22 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.facts import scene_facts
-from model.driving.hashing import hash_of
-from model.driving.labeller import expert_plan
-from model.driving.perceived import ROW_SIZE, Perceived, perceived_of, perceived_of_row
-from model.driving.plan import Plan, plan_from_bins
-from model.driving.reasoning import thoughts_of
-from model.driving.scene import CAMERAS, CLIP_FRAMES, LabelledScene
-from model.driving.scene_store import read_scenes, scene_files
-from model.driving.thoughts import Thoughts, read_thoughts
-from model.driving.tracks import tracks_of
-from model.driving.trajectory import FloatArray
-from model.driving.whole_files import written_whole
-from model.families.family import LessonPart
-from model.network.inputs import InputBuilder
-from model.network.track_features import track_features
-from model.training.dense import coarse, no_target, relative_motion
+from looktwice.model.driving.facts import scene_facts
+from looktwice.model.driving.hashing import hash_of
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.perceived import ROW_SIZE, Perceived, perceived_of, perceived_of_row
+from looktwice.model.driving.plan import Plan, plan_from_bins
+from looktwice.model.driving.reasoning import thoughts_of
+from looktwice.model.driving.scene import CAMERAS, CLIP_FRAMES, LabelledScene
+from looktwice.model.driving.scene_store import read_scenes, scene_files
+from looktwice.model.driving.thoughts import Thoughts, read_thoughts
+from looktwice.model.driving.tracks import tracks_of
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.driving.whole_files import written_whole
+from looktwice.model.families.family import LessonPart
+from looktwice.model.network.inputs import InputBuilder
+from looktwice.model.network.track_features import track_features
+from looktwice.model.training.dense import coarse, no_target, relative_motion
 
 CACHE_VERSION: Final = 7
 DENSE_FAR_M: Final = 200.0

@@ -2,8 +2,8 @@
 
 All frames of each camera go through the tower; small heads predict for every vision token what the cells
 it covers show, how far that is and how it moves (dense, so one picture teaches thousands of things). From
-what the resampler gathers, other heads tell the facts of `model.driving.facts`, by which perception is
-judged, and the expert's trajectory, so that what a plan needs is gathered. The heads are kept beside the
+what the resampler gathers, other heads tell the facts of `looktwice.model.driving.facts`, by which perception
+is judged, and the expert's trajectory, so that what a plan needs is gathered. The heads are kept beside the
 checkpoint: `looktwice evaluate --perception` reads with them.
 """
 
@@ -18,21 +18,21 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from model.driving.facts import (
+from looktwice.model.driving.facts import (
     FACTS,
     IS_YES_OR_NO,
     mirrored,
 )
-from model.driving.scene import SEMANTIC_CLASSES
-from model.network.codec import TrajectoryCodec
-from model.network.fact_reader import likely
-from model.network.inputs import InputBuilder
-from model.network.intent import IntentTrunk, present_speeds
-from model.network.patches import patchify
-from model.network.trajectory_head import TrajectoryHead
-from model.network.vla import LookTwiceVla
-from model.training.dense import FIRST_AGENT_CLASS, UNLABELLED
-from model.training.examples import Examples, example_frames
+from looktwice.model.driving.scene import SEMANTIC_CLASSES
+from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.network.fact_reader import likely
+from looktwice.model.network.inputs import InputBuilder
+from looktwice.model.network.intent import IntentTrunk, present_speeds
+from looktwice.model.network.patches import patchify
+from looktwice.model.network.trajectory_head import TrajectoryHead
+from looktwice.model.network.vla import LookTwiceVla
+from looktwice.model.training.dense import FIRST_AGENT_CLASS, UNLABELLED
+from looktwice.model.training.examples import Examples, example_frames
 
 _CLASSES: Final = len(SEMANTIC_CLASSES)
 _CLASS_WEIGHTS: Final = (0.3, 0.5, 0.5, 3.0, 6.0, 4.0)

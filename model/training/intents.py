@@ -1,8 +1,8 @@
 """Learning what to do about what is known, thousands of scenes a second: before a decoder puts it into words.
 
-The reader of tracks and the intent of the gathered tokens (`model.network.intent`) learn the expert's
-trajectory in metres, its plan's words bin by bin, and the facts that decide them. The best guess of the
-trajectory is kept as the sketch; all other heads are thrown away. Tower and queries stay as they are.
+The reader of tracks and the intent of the gathered tokens (`looktwice.model.network.intent`) learn the
+expert's trajectory in metres, its plan's words bin by bin, and the facts that decide them. The best guess of
+the trajectory is kept as the sketch; all other heads are thrown away. Tower and queries stay as they are.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from model.driving.facts import FACTS, mirrored
-from model.driving.plan import GROUPS, TICKS, WORDS
-from model.driving.trajectory import FloatArray
-from model.network.codec import TrajectoryCodec
-from model.network.fact_reader import likely
-from model.network.intent import IntentTrunk, present_speeds
-from model.network.track_features import MIRRORED, without_route
-from model.network.trajectory_head import TrajectoryHead
-from model.network.vla import LookTwiceVla
-from model.training.examples import Examples
-from model.training.grounding import fact_loss, fact_weights
-from model.training.misread import misread
-from model.training.vision_cache import VisionCache
+from looktwice.model.driving.facts import FACTS, mirrored
+from looktwice.model.driving.plan import GROUPS, TICKS, WORDS
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.network.fact_reader import likely
+from looktwice.model.network.intent import IntentTrunk, present_speeds
+from looktwice.model.network.track_features import MIRRORED, without_route
+from looktwice.model.network.trajectory_head import TrajectoryHead
+from looktwice.model.network.vla import LookTwiceVla
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.grounding import fact_loss, fact_weights
+from looktwice.model.training.misread import misread
+from looktwice.model.training.vision_cache import VisionCache
 
 Source = Literal["tracks", "scene"]
 _BATCH: Final = 64

@@ -9,15 +9,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.engines.logprobs import log_probability
-from model.formats.replay import Decision
-from model.network.codec import TrajectoryCodec
-from model.network.intent import present_speeds
-from model.network.trajectory_head import TrajectoryHead
-from model.network.vla import LookTwiceVla
-from model.network.vocabulary import FUTURE_START, Vocabulary
-from model.training.batches import Batch
-from model.training.loss import response_loss
+from looktwice.model.engines.logprobs import log_probability
+from looktwice.model.formats.replay import Decision
+from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.network.intent import present_speeds
+from looktwice.model.network.trajectory_head import TrajectoryHead
+from looktwice.model.network.vla import LookTwiceVla
+from looktwice.model.network.vocabulary import FUTURE_START, Vocabulary
+from looktwice.model.training.batches import Batch
+from looktwice.model.training.loss import response_loss
 
 _PLACES_STEP: Final = 256
 """Predicted places are filled up to multiples of this, for the reason that `WIDTH_STEP` gives."""

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from model.driving.facts import FACT_GROUPS, IS_YES_OR_NO
-from model.driving.trajectory import FloatArray
+from looktwice.model.driving.facts import FACT_GROUPS, IS_YES_OR_NO
+from looktwice.model.driving.trajectory import FloatArray
 
 _ALIKE: Final = 8
 """Of so many nearest ones, one is drawn."""
@@ -35,7 +35,7 @@ def misread(
     Args:
         facts: [m, facts], what is true in them; NaN where a fact does not apply.
         known: [n, facts], what is true in scenes with pictures.
-        read: [n, times, facts], what is read there each time (`model.network.fact_reader.likely`).
+        read: [n, times, facts], what is read there each time (`looktwice.model.network.fact_reader.likely`).
         random: draws one of the most alike.
         device: where they are looked for.
 

@@ -1,8 +1,9 @@
 """Learning from what comes of the network's own draws: they are made, judged and learned from in one step.
 
-Words, numbers and codes are drawn, and learned from by `model.training.policy`: plans with their times, the
-branch and the codes of CF-VLA, thoughts and poses of ELF-VLA. The policy is the distribution that decodes:
-over the tokens that the format allows, at the temperature of the draws. The expert is imitated a little
+Words, numbers and codes are drawn, and learned from by `looktwice.model.training.policy`: plans with their
+times, the branch and the codes of CF-VLA, thoughts and poses of ELF-VLA. The policy is the distribution that
+decodes: over the tokens that the format allows, at the temperature of the draws. The expert is imitated a
+    little
 beside it, against drivers who find a gap in the score.
 
 Where all draws of a scene fail, nothing says what would be better. There the network refines its best draw by
@@ -20,23 +21,23 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from model.driving.pdm.judging import Said, SceneJudge
-from model.driving.pdm.labelled import plans_of
-from model.driving.pdm.rule_teacher import critique, verdict_with_truth
-from model.driving.scene import LabelledScene
-from model.engines.engine import Controls, Draw, PlanRequest
-from model.engines.torch.offline import draws_of
-from model.engines.torch.runner import Runner
-from model.families.family import Attempt
-from model.families.trajectory_codes import TRAJECTORY
-from model.formats.replay import Decision, decisions
-from model.network.checkpoint import Loaded
-from model.training.batches import Item, ResponseDataset, Sample, collate
-from model.training.learner import ResponseLearner
-from model.training.policy import advantages, policy_loss
-from model.training.recipes import FeedbackWriter, OutcomeSettings
-from model.training.rewards import Rewards, rewards
-from model.training.rollouts import with_draws
+from looktwice.model.driving.pdm.judging import Said, SceneJudge
+from looktwice.model.driving.pdm.labelled import plans_of
+from looktwice.model.driving.pdm.rule_teacher import critique, verdict_with_truth
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.engines.engine import Controls, Draw, PlanRequest
+from looktwice.model.engines.torch.offline import draws_of
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.families.family import Attempt
+from looktwice.model.families.trajectory_codes import TRAJECTORY
+from looktwice.model.formats.replay import Decision, decisions
+from looktwice.model.network.checkpoint import Loaded
+from looktwice.model.training.batches import Item, ResponseDataset, Sample, collate
+from looktwice.model.training.learner import ResponseLearner
+from looktwice.model.training.policy import advantages, policy_loss
+from looktwice.model.training.recipes import FeedbackWriter, OutcomeSettings
+from looktwice.model.training.rewards import Rewards, rewards
+from looktwice.model.training.rollouts import with_draws
 
 _MAX_SEED = 2**31
 

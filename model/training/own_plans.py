@@ -14,14 +14,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.driving.labeller import labelled_track
-from model.driving.plan import GROUPS, TICKS, WORDS, Plan
-from model.driving.trajectory import FloatArray
-from model.network.intent import IntentTrunk
-from model.network.vla import LookTwiceVla
-from model.training.examples import Examples
-from model.training.intents import IntentDataset, collate_intents, read_facts
-from model.training.vision_cache import VisionCache
+from looktwice.model.driving.labeller import labelled_track
+from looktwice.model.driving.plan import GROUPS, TICKS, WORDS, Plan
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.network.intent import IntentTrunk
+from looktwice.model.network.vla import LookTwiceVla
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.intents import IntentDataset, collate_intents, read_facts
+from looktwice.model.training.vision_cache import VisionCache
 
 _BATCH: Final = 256
 _EPOCHS: Final = 7

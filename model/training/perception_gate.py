@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from model.driving.intervals import ratio_interval
-from model.driving.tracks import MAX_TRACKS
-from model.evaluation.perception import Reading
-from model.network.codec import TrajectoryCodec
-from model.network.fact_reader import weighed
-from model.network.small_planner import SmallInputs, SmallKind
-from model.network.track_features import TRACK_FEATURES
-from model.training.small import SmallExamples, SmallSettings, fit_small, small_errors
+from looktwice.model.driving.intervals import ratio_interval
+from looktwice.model.driving.tracks import MAX_TRACKS
+from looktwice.model.evaluation.perception import Reading
+from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.network.fact_reader import weighed
+from looktwice.model.network.small_planner import SmallInputs, SmallKind
+from looktwice.model.network.track_features import TRACK_FEATURES
+from looktwice.model.training.small import SmallExamples, SmallSettings, fit_small, small_errors
 
 Gate = Literal["none", "read", "true"]
 GATES: Final[tuple[Gate, ...]] = ("none", "read", "true")

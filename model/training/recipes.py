@@ -11,14 +11,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.judged import THRESHOLD
-from model.engines.engine import Decision
-from model.families.cf_vla.targets import CODE_WEIGHTS, NANO_WEIGHTS, PAPER_WEIGHTS
-from model.families.elf_vla import targets as elf_vla
-from model.families.vla_world import targets as vla_world
-from model.training.rewards import RewardWeights
-from model.training.targets import SectionWeights
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.judged import THRESHOLD
+from looktwice.model.engines.engine import Decision
+from looktwice.model.families.cf_vla.targets import CODE_WEIGHTS, NANO_WEIGHTS, PAPER_WEIGHTS
+from looktwice.model.families.elf_vla import targets as elf_vla
+from looktwice.model.families.vla_world import targets as vla_world
+from looktwice.model.training.rewards import RewardWeights
+from looktwice.model.training.targets import SectionWeights
 
 Goal = Literal["ground", "read", "respond", "outcome", "code"]
 FeedbackWriter = Literal["teacher", "rule"]
@@ -26,7 +26,8 @@ FeedbackWriter = Literal["teacher", "rule"]
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """How a network's own refinements are learned from as first answers; see `model.training.outcomes`.
+    """How a network's own refinements are learned from as first answers; see
+    `looktwice.model.training.outcomes`.
 
     Attributes:
         format: that it refines in; what it writes there must be an answer in the format of its draws.
@@ -46,7 +47,7 @@ class RefineSettings:
 
 @dataclass(frozen=True)
 class OutcomeSettings:
-    """How a network learns from what comes of its own draws; see `model.training.outcomes`.
+    """How a network learns from what comes of its own draws; see `looktwice.model.training.outcomes`.
 
     Attributes:
         draws: of each scene, compared with each other.
@@ -163,7 +164,7 @@ _OUTCOME: Final = replace(
 VISUAL_CODES: Final = Recipe(
     "visual-codes", "code", steps=6000, batch_size=16, learning_rate=1e-3, warmup_steps=200
 )
-"""Of the codes of pictures, which start from nothing; see `model.training.visual_codes`."""
+"""Of the codes of pictures, which start from nothing; see `looktwice.model.training.visual_codes`."""
 
 _READ: Final = Recipe(
     "read",

@@ -9,10 +9,10 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.phrases import facts_of, read_facts
-from model.driving.reflection_store import LabelledReflection
-from model.families.family import Reflection
-from model.training.examples import Examples
+from looktwice.model.driving.phrases import facts_of, read_facts
+from looktwice.model.driving.reflection_store import LabelledReflection
+from looktwice.model.families.family import Reflection
+from looktwice.model.training.examples import Examples
 
 _PLAIN: Final = str.maketrans(
     {

@@ -1,7 +1,7 @@
 """What a draw is worth in a labelled scene: what comes of it, and whether its parts agree.
 
 Rewards are pure functions of a scene and its draws. What comes of a plan is NAVSIM's score against the true
-ways of the others (`model.driving.pdm`), with the expert as the reference of progress.
+ways of the others (`looktwice.model.driving.pdm`), with the expert as the reference of progress.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from model.driving.agreement import agreement
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.judging import SceneJudge
-from model.driving.pdm.labelled import plans_of
-from model.driving.pdm.scoring import COLLISIONS
-from model.driving.pdm.world import Array
-from model.driving.scene import LabelledScene
-from model.driving.trajectory import FloatArray
-from model.engines.engine import Draw
+from looktwice.model.driving.agreement import agreement
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.judging import SceneJudge
+from looktwice.model.driving.pdm.labelled import plans_of
+from looktwice.model.driving.pdm.scoring import COLLISIONS
+from looktwice.model.driving.pdm.world import Array
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.engines.engine import Draw
 
 _FAR_M = 10.0
 _GOAL_BOUNDS_M: Final = (2.0, 4.0, 6.0, 10.0, 15.0)

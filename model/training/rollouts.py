@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.driving.scene import Scene
-from model.driving.trajectory import FUTURE_STEPS, ROUTE_POINTS
-from model.engines.engine import Draw
-from model.network.inputs import InputBuilder
-from model.network.track_features import track_features
-from model.training.batches import Sample
-from model.training.targets import Target
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.trajectory import FUTURE_STEPS, ROUTE_POINTS
+from looktwice.model.engines.engine import Draw
+from looktwice.model.network.inputs import InputBuilder
+from looktwice.model.network.track_features import track_features
+from looktwice.model.training.batches import Sample
+from looktwice.model.training.targets import Target
 
 
 def rollout(scene: Scene, format: str, draws: Sequence[Draw], inputs: InputBuilder) -> Sample:

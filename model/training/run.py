@@ -16,27 +16,32 @@ import torch
 from torch import nn
 from torch.utils.data import Dataset, Subset
 
-from model.driving.feedback_store import read_feedback
-from model.driving.reflection_store import read_reflections
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import read_scenes
-from model.families.registry import family_named
-from model.network.attention import MATMUL_ATTENTION
-from model.network.card import LOG_FILE
-from model.network.checkpoint import Loaded, create_nano, load, save, with_formats, with_sketches
-from model.network.codec import TrajectoryCodec
-from model.network.corpus import nano_corpus, nano_phrases
-from model.network.intent import IntentReader
-from model.network.settings import NANO_SETTINGS
-from model.network.visual_codes import load_visual_codes
-from model.network.vla import LookTwiceVla
-from model.network.vocabulary import Vocabulary, build_nano_tokenizer
-from model.training.attempts import AttemptsOn, attempts_on
-from model.training.batches import ResponseDataset, TaskSampler, collate
-from model.training.dense import DENSE_SHAPE
-from model.training.examples import Examples, load_examples
-from model.training.grounding import GroundingDataset, GroundingLearner, collate_grounding, looked_at
-from model.training.intents import (
+from looktwice.model.driving.feedback_store import read_feedback
+from looktwice.model.driving.reflection_store import read_reflections
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.families.registry import family_named
+from looktwice.model.network.attention import MATMUL_ATTENTION
+from looktwice.model.network.card import LOG_FILE
+from looktwice.model.network.checkpoint import Loaded, create_nano, load, save, with_formats, with_sketches
+from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.network.corpus import nano_corpus, nano_phrases
+from looktwice.model.network.intent import IntentReader
+from looktwice.model.network.settings import NANO_SETTINGS
+from looktwice.model.network.visual_codes import load_visual_codes
+from looktwice.model.network.vla import LookTwiceVla
+from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
+from looktwice.model.training.attempts import AttemptsOn, attempts_on
+from looktwice.model.training.batches import ResponseDataset, TaskSampler, collate
+from looktwice.model.training.dense import DENSE_SHAPE
+from looktwice.model.training.examples import Examples, load_examples
+from looktwice.model.training.grounding import (
+    GroundingDataset,
+    GroundingLearner,
+    collate_grounding,
+    looked_at,
+)
+from looktwice.model.training.intents import (
     IntentDataset,
     IntentLearner,
     Source,
@@ -44,14 +49,14 @@ from model.training.intents import (
     read_errors,
     read_facts,
 )
-from model.training.learner import ResponseLearner
-from model.training.outcomes import OutcomeLearner, ScenePlaces, collate_places
-from model.training.own_plans import OwnPlans
-from model.training.recipes import Recipe
-from model.training.reflections import OnExamples, reflections_on
-from model.training.trainer import LearnerTrainer, Validate
-from model.training.validation import open_loop
-from model.training.vision_cache import open_vision
+from looktwice.model.training.learner import ResponseLearner
+from looktwice.model.training.outcomes import OutcomeLearner, ScenePlaces, collate_places
+from looktwice.model.training.own_plans import OwnPlans
+from looktwice.model.training.recipes import Recipe
+from looktwice.model.training.reflections import OnExamples, reflections_on
+from looktwice.model.training.trainer import LearnerTrainer, Validate
+from looktwice.model.training.validation import open_loop
+from looktwice.model.training.vision_cache import open_vision
 
 
 @dataclass(frozen=True)

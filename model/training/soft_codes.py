@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.trajectory import FUTURE_STEPS, FloatArray
-from model.network.codec import TrajectoryCodec
+from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray
+from looktwice.model.network.codec import TrajectoryCodec
 
 _SOFTNESS: Final = 0.5
 """Width of the target, in mean squared distances to the nearest codeword: about four codes share a target."""

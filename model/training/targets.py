@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from model.driving.direction import wanted_changes
-from model.driving.plan import Plan
-from model.families.family import Family, Lesson
-from model.formats.cursor import CompiledFormat
+from looktwice.model.driving.direction import wanted_changes
+from looktwice.model.driving.plan import Plan
+from looktwice.model.families.family import Family, Lesson
+from looktwice.model.formats.cursor import CompiledFormat
 
 SectionWeights = Mapping[str, float]
 

@@ -13,11 +13,11 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset, Subset, get_worker_info
 from transformers import Trainer, TrainerCallback, TrainingArguments
 
-from model.network.allocator import FreedMemory
-from model.network.card import LOG_FILE
-from model.network.vla import is_vision
-from model.training.batches import TaskSampler
-from model.training.recipes import Recipe
+from looktwice.model.network.allocator import FreedMemory
+from looktwice.model.network.card import LOG_FILE
+from looktwice.model.network.vla import is_vision
+from looktwice.model.training.batches import TaskSampler
+from looktwice.model.training.recipes import Recipe
 
 _STATE_FILE: Final = "learner.pt"
 

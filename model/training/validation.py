@@ -8,12 +8,12 @@ from typing import Final
 import numpy as np
 import torch
 
-from model.driving.scene import LabelledScene
-from model.engines.engine import Controls, PlanRequest
-from model.engines.torch.offline import draws_of
-from model.engines.torch.runner import Runner
-from model.evaluation.open_loop import evaluate_draws
-from model.network.checkpoint import Loaded
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.engines.engine import Controls, PlanRequest
+from looktwice.model.engines.torch.offline import draws_of
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.evaluation.open_loop import evaluate_draws
+from looktwice.model.network.checkpoint import Loaded
 
 _ROWS = 48
 _GIVEN: Final = (("", False, False), ("+route", True, False), ("+route+tracks", True, True))

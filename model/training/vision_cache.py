@@ -17,11 +17,11 @@ import numpy.typing as npt
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from model.driving.hashing import hash_of
-from model.driving.whole_files import written_whole
-from model.network.checkpoint import Loaded
-from model.network.patches import patchify
-from model.training.examples import Examples, example_frames
+from looktwice.model.driving.hashing import hash_of
+from looktwice.model.driving.whole_files import written_whole
+from looktwice.model.network.checkpoint import Loaded
+from looktwice.model.network.patches import patchify
+from looktwice.model.training.examples import Examples, example_frames
 
 _BATCH: Final = 16
 _VERSION: Final = 2

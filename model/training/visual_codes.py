@@ -16,10 +16,10 @@ from PIL import Image
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import read_scenes
-from model.driving.whole_files import written_whole
-from model.network.visual_codes import (
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.whole_files import written_whole
+from looktwice.model.network.visual_codes import (
     CODE_COLUMNS,
     CODE_ROWS,
     CODEBOOK_SIZE,
@@ -31,9 +31,9 @@ from model.network.visual_codes import (
     frame_of,
     psnr,
 )
-from model.training.recipes import Recipe
-from model.training.run import last_whole_state
-from model.training.trainer import LearnerTrainer
+from looktwice.model.training.recipes import Recipe
+from looktwice.model.training.run import last_whole_state
+from looktwice.model.training.trainer import LearnerTrainer
 
 SHEET_FILE: Final = "pictures.png"
 _HELD_OUT_EVERY: Final = 10

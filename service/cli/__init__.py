@@ -15,7 +15,7 @@ _MORE: Final = (
 def main() -> None:
     """Run the command line; says what to install where a package is missing."""
     try:
-        from service.cli.commands import app
+        from looktwice.service.cli.commands import app
     except ImportError as error:
         sys.exit(f"looktwice: {error}. The command line needs more: pip install 'looktwice[serve]'")
     try:

@@ -1,5 +1,5 @@
-"""`python -m service.cli` is `looktwice`."""
+"""`python -m looktwice.service.cli` is `looktwice`."""
 
-from service.cli import main
+from looktwice.service.cli import main
 
 main()

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from service.cli.engines import Device
-from service.cli.options import (
+from looktwice.service.cli.engines import Device
+from looktwice.service.cli.options import (
     DEFAULT_CHECKPOINT,
     DEFAULT_SCENES,
     Checkpoint,
@@ -24,8 +24,8 @@ from service.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from model.bench.report import Roofline
-    from model.bench.run import Row
+    from looktwice.model.bench.report import Roofline
+    from looktwice.model.bench.run import Row
 
 bench = typer.Typer(help="Measure speed, as ratios within one run.", no_args_is_help=True)
 
@@ -56,10 +56,10 @@ def engine(
 ) -> None:
     """Our engine, transformers and vLLM on the same checkpoint, scenes and controls."""
     with reported_errors(), tempfile.TemporaryDirectory() as folder:
-        from model.bench.report import BenchReport
-        from model.bench.run import Job, run, run_deadlines, run_planner
-        from model.bench.workload import Workload
-        from model.engines.engine import Controls
+        from looktwice.model.bench.report import BenchReport
+        from looktwice.model.bench.run import Job, run, run_deadlines, run_planner
+        from looktwice.model.bench.workload import Workload
+        from looktwice.model.engines.engine import Controls
 
         if preset:
             checkpoint = _random_checkpoint(preset, checkpoint, Path(folder), device, random_weights)
@@ -109,8 +109,8 @@ def precision(
 ) -> None:
     """How often rounding in float32 and bfloat16 changes a response, and how close the decision was."""
     with reported_errors():
-        from model.bench.precision import measure
-        from model.driving.scene_store import read_scenes
+        from looktwice.model.bench.precision import measure
+        from looktwice.model.driving.scene_store import read_scenes
 
         found = measure(checkpoint, [each.scene for each in read_scenes(scenes, dense=False)], n)
         if as_json:
@@ -135,7 +135,7 @@ def score(
 ) -> None:
     """Our scorer of plans, and NAVSIM's own beside it, in seconds of one core."""
     with reported_errors():
-        from model.bench.scoring import measure
+        from looktwice.model.bench.scoring import measure
 
         found = measure(repeats, navsim or [], navsim_python and navsim_python.absolute())
         if as_json:
@@ -165,8 +165,8 @@ def egodriver(
     with reported_errors():
         from itertools import islice
 
-        from clients.alpasim.throughput import measure
-        from model.driving.scene_store import read_scenes
+        from looktwice.clients.alpasim.throughput import measure
+        from looktwice.model.driving.scene_store import read_scenes
 
         shown = [each.scene for each in islice(read_scenes(scenes, dense=False), sessions)]
         options = f"--n {n} --thinking {thinking} --device {device} --max-sessions {2 * sessions}".split()
@@ -195,9 +195,9 @@ def http(
     with reported_errors():
         import httpx
 
-        from clients.planner import Access
-        from loadtests.overhead import measure
-        from model.driving.scene_store import read_scenes
+        from looktwice.clients.planner import Access
+        from looktwice.loadtests.overhead import measure
+        from looktwice.model.driving.scene_store import read_scenes
 
         key = Access.from_environment().api_key
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
@@ -224,7 +224,16 @@ def _egodriver(*options: str) -> Iterator[str]:
 
     with tempfile.TemporaryDirectory() as folder, (Path(folder) / "log").open("w+") as log:
         address = f"unix://{folder}/driver.sock"
-        command = [sys.executable, "-m", "service.cli", "egodriver", "--host", address, "--deadline-ms", "0"]
+        command = [
+            sys.executable,
+            "-m",
+            "looktwice.service.cli",
+            "egodriver",
+            "--host",
+            address,
+            "--deadline-ms",
+            "0",
+        ]
         process = subprocess.Popen([*command, *options], stderr=log)
         try:
             with grpc.insecure_channel(address) as channel:
@@ -249,14 +258,14 @@ def _whole(text: str) -> int:
 
 def _ladder(device: str) -> tuple[str, ...]:
     """The torch engine without shortcuts, then with one more at a time of those that the device knows."""
-    from model.bench.contenders import SHORTCUTS
+    from looktwice.model.bench.contenders import SHORTCUTS
 
     known = [each for each in SHORTCUTS if device != "cpu" or each != "capture"]
     return "torch+none", *(f"torch+{','.join(known[:count])}" for count in range(1, len(known) + 1))
 
 
 def _random_checkpoint(preset: str, words_of: Path, folder: Path, device: str, agreed: bool) -> Path:
-    from model.bench.presets import PRESETS, write_random
+    from looktwice.model.bench.presets import PRESETS, write_random
 
     if preset not in PRESETS:
         raise ValueError(f"unknown preset {preset!r}; known are {', '.join(PRESETS)}")
@@ -267,10 +276,10 @@ def _random_checkpoint(preset: str, words_of: Path, folder: Path, device: str, a
 
 
 def _rooflines(rows: list[Row], checkpoint: Path, device: str) -> list[Roofline]:
-    from model.bench.report import Roofline
-    from model.bench.roofline import measure, work_of_plan
-    from model.network.checkpoint import read_config, read_parts
-    from model.network.precision import fast_dtype
+    from looktwice.model.bench.report import Roofline
+    from looktwice.model.bench.roofline import measure, work_of_plan
+    from looktwice.model.network.checkpoint import read_config, read_parts
+    from looktwice.model.network.precision import fast_dtype
 
     dtype = fast_dtype(device)
     machine, parts, config = measure(device, dtype), read_parts(checkpoint), read_config(checkpoint)

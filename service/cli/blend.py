@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import reported_errors
+from looktwice.service.cli.options import reported_errors
 
 
 def blend(
@@ -22,9 +22,9 @@ def blend(
 
         import torch
 
-        from model.network.blend import blend as blend_of
-        from model.network.card import LOG_FILE
-        from model.network.checkpoint import load, save
+        from looktwice.model.network.blend import blend as blend_of
+        from looktwice.model.network.card import LOG_FILE
+        from looktwice.model.network.checkpoint import load, save
 
         blended = blend_of(load(before), load(after), share)
         save(

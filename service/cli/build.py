@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from service.cli.options import Json, reported_errors
-from service.cli.stages import do_jobs, progress_bar, report_run, run_stage, scenes_in
+from looktwice.service.cli.options import Json, reported_errors
+from looktwice.service.cli.stages import do_jobs, progress_bar, report_run, run_stage, scenes_in
 
 if TYPE_CHECKING:
-    from clients.labelling.label import LabelTask
-    from clients.labelling.ledger import Ledger, Run
-    from clients.labelling.pipeline import Job, Tally
-    from clients.labelling.teachers.openai import OpenAiSettings
-    from clients.labelling.teachers.teacher import Teacher
-    from model.driving.reflection_store import LabelledReflection
+    from looktwice.clients.labelling.label import LabelTask
+    from looktwice.clients.labelling.ledger import Ledger, Run
+    from looktwice.clients.labelling.pipeline import Job, Tally
+    from looktwice.clients.labelling.teachers.openai import OpenAiSettings
+    from looktwice.clients.labelling.teachers.teacher import Teacher
+    from looktwice.model.driving.reflection_store import LabelledReflection
 
 app = typer.Typer(
     help="Build a counterfactual data set: rollout, outcomes, filter, label, export.", no_args_is_help=True
@@ -65,10 +65,10 @@ def rollout(
     as_json: Json = False,
 ) -> None:
     """Roll a served model out over scenes: what it plans alone, and with the expert's plan given."""
-    from clients.labelling.pipeline import Limits
-    from clients.labelling.rollout import RETRY_POLICY, Sampling, config_of, jobs, roll_out
-    from clients.planner import Access, AsyncPlannerClient, PlannerError
-    from clients.wire import ModelName
+    from looktwice.clients.labelling.pipeline import Limits
+    from looktwice.clients.labelling.rollout import RETRY_POLICY, Sampling, config_of, jobs, roll_out
+    from looktwice.clients.planner import Access, AsyncPlannerClient, PlannerError
+    from looktwice.clients.wire import ModelName
 
     sampling, access = Sampling(n, temperature, top_p, seed, route, tracks), Access.from_environment()
     limits = Limits(at_once, give_up_after, max_error_rate, dry_run or limit)
@@ -85,7 +85,7 @@ def rollout(
             if retry_dead:
                 ledger.forget_dead(run)
             if on_ray is not None:
-                from clients.labelling.on_ray import RolloutWork, chunks, work_on_ray
+                from looktwice.clients.labelling.on_ray import RolloutWork, chunks, work_on_ray
 
                 work = RolloutWork(run, service, access, model, sampling, limits)
                 found = chunks(ledger, run, scenes)
@@ -126,9 +126,9 @@ def outcomes(
     """Follow the model's own plans in the simulator: which hold, which fail, and at what."""
     from collections import Counter
 
-    from clients.labelling.follow import follow_all
-    from clients.labelling.outcomes import Followed, config_of
-    from clients.labelling.pipeline import Limits
+    from looktwice.clients.labelling.follow import follow_all
+    from looktwice.clients.labelling.outcomes import Followed, config_of
+    from looktwice.clients.labelling.pipeline import Limits
 
     limits = Limits(max_error_rate=max_error_rate, at_most=dry_run or limit)
     counts: dict[str, Any] = {}
@@ -180,11 +180,11 @@ def choose(
     as_json: Json = False,
 ) -> None:
     """Keep the scenes whose plan is what goes wrong; writes filter.png."""
-    from clients.labelling.filtering import Thresholds, filtered, filtered_by_outcome, summary
-    from clients.labelling.ledger import Ledger
-    from clients.labelling.outcomes import followed_plans
-    from clients.labelling.scatter import scatter
-    from model.driving.scene_store import row_groups, scene_files
+    from looktwice.clients.labelling.filtering import Thresholds, filtered, filtered_by_outcome, summary
+    from looktwice.clients.labelling.ledger import Ledger
+    from looktwice.clients.labelling.outcomes import followed_plans
+    from looktwice.clients.labelling.scatter import scatter
+    from looktwice.model.driving.scene_store import row_groups, scene_files
 
     thresholds = Thresholds(epsilon, gain, plan_iou, everything)
     with reported_errors(), Ledger(folder) as ledger:
@@ -236,11 +236,11 @@ def label(
     as_json: Json = False,
 ) -> None:
     """Have a teacher say, for every scene kept, what is less good about the model's plan."""
-    from clients.labelling.label import config_of, jobs, labeller, questions
-    from clients.labelling.pipeline import Limits
-    from clients.labelling.teachers.service import ServiceTeacher
-    from clients.labelling.teachers.teacher import TeacherError
-    from clients.planner import Access
+    from looktwice.clients.labelling.label import config_of, jobs, labeller, questions
+    from looktwice.clients.labelling.pipeline import Limits
+    from looktwice.clients.labelling.teachers.service import ServiceTeacher
+    from looktwice.clients.labelling.teachers.teacher import TeacherError
+    from looktwice.clients.planner import Access
 
     connect: Callable[[], Awaitable[Teacher]] = (
         _teacher_of_settings
@@ -264,7 +264,7 @@ def label(
             before = ledger.spent(begun)
             limits = Limits(at_once, give_up_after, max_error_rate, dry_run or limit)
             if on_ray is not None:
-                from clients.labelling.on_ray import LabelWork, chunks, work_on_ray
+                from looktwice.clients.labelling.on_ray import LabelWork, chunks, work_on_ray
 
                 work = LabelWork(begun, rollout, connect, plans_per_scene, seed, limits)
                 kept = chunks(ledger, begun, scenes, rollout)
@@ -325,11 +325,11 @@ def export(
     run: Annotated[str | None, typer.Option("--run", help="Which labels (openai-batch: rollout).")] = None,
 ) -> None:
     """Write what was labelled, or what is still to be asked."""
-    from clients.labelling.batch import batch_requests
-    from clients.labelling.export import held_plans, reflections, right_plans, write_messages
-    from clients.labelling.ledger import Ledger
-    from model.driving.reflection_store import write_reflections
-    from model.driving.whole_files import written_whole
+    from looktwice.clients.labelling.batch import batch_requests
+    from looktwice.clients.labelling.export import held_plans, reflections, right_plans, write_messages
+    from looktwice.clients.labelling.ledger import Ledger
+    from looktwice.model.driving.reflection_store import write_reflections
+    from looktwice.model.driving.whole_files import written_whole
 
     with reported_errors(), Ledger(folder) as ledger:
         if (right_iou is not None or right_outcomes) and form != "parquet":
@@ -375,9 +375,9 @@ def take(
     as_json: Json = False,
 ) -> None:
     """Take the answers to an exported openai-batch; what fails its checks is in the next export again."""
-    from clients.labelling.batch import read_results, take_results
-    from clients.labelling.dead_letters import write_dead_letters
-    from clients.labelling.ledger import Ledger
+    from looktwice.clients.labelling.batch import read_results, take_results
+    from looktwice.clients.labelling.dead_letters import write_dead_letters
+    from looktwice.clients.labelling.ledger import Ledger
 
     with reported_errors(), Ledger(folder) as ledger, results.open() as lines:
         settings, begun, found = _batch(ledger, scenes, plans_per_scene, seed, run)
@@ -391,9 +391,9 @@ def _batch(
     ledger: Ledger, scenes: Path, plans_per_scene: int, seed: int, run: str | None
 ) -> tuple[OpenAiSettings, Run, Iterator[Job[LabelTask]]]:
     """The questions for the endpoint that the settings name."""
-    from clients.labelling.label import config_of, jobs, questions
-    from clients.labelling.teachers.openai import OpenAiTeacher
-    from service.settings import TeacherSettings
+    from looktwice.clients.labelling.label import config_of, jobs, questions
+    from looktwice.clients.labelling.teachers.openai import OpenAiTeacher
+    from looktwice.service.settings import TeacherSettings
 
     settings = TeacherSettings().openai()
     rollout = ledger.the_run("rollout", run)
@@ -408,6 +408,6 @@ def _check_ray(on_ray: str | None, limit: int | None, dry_run: int, every: int =
 
 
 async def _teacher_of_settings() -> Teacher:
-    from service.settings import TeacherSettings
+    from looktwice.service.settings import TeacherSettings
 
     return TeacherSettings().teacher()

@@ -7,22 +7,22 @@ from typing import Annotated
 
 import typer
 
-import service.cli.bench as bench
-import service.cli.blend as blend
-import service.cli.build as build
-import service.cli.describe as describe
-import service.cli.drive as drive
-import service.cli.egodriver as egodriver
-import service.cli.evaluate as evaluate
-import service.cli.failures as failures
-import service.cli.feedback as feedback
-import service.cli.keys as keys
-import service.cli.loadtest as loadtest
-import service.cli.plan as plan
-import service.cli.scenes as scenes
-import service.cli.score as score
-import service.cli.serve as serve
-import service.cli.train as train
+import looktwice.service.cli.bench as bench
+import looktwice.service.cli.blend as blend
+import looktwice.service.cli.build as build
+import looktwice.service.cli.describe as describe
+import looktwice.service.cli.drive as drive
+import looktwice.service.cli.egodriver as egodriver
+import looktwice.service.cli.evaluate as evaluate
+import looktwice.service.cli.failures as failures
+import looktwice.service.cli.feedback as feedback
+import looktwice.service.cli.keys as keys
+import looktwice.service.cli.loadtest as loadtest
+import looktwice.service.cli.plan as plan
+import looktwice.service.cli.scenes as scenes
+import looktwice.service.cli.score as score
+import looktwice.service.cli.serve as serve
+import looktwice.service.cli.train as train
 
 
 def _told_version(asked: bool) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import reported_errors
+from looktwice.service.cli.options import reported_errors
 
 
 def describe(
@@ -19,7 +19,7 @@ def describe(
 ) -> None:
     """Write model card, processor and chat template into a checkpoint folder; weights stay as they are."""
     with reported_errors():
-        from model.network.repository import CARD, write_repository
+        from looktwice.model.network.repository import CARD, write_repository
 
         figures = dict(map(_split, figure)) if figure else None
         write_repository(folder, figures)

@@ -10,7 +10,7 @@ from typing import Annotated, Final, cast
 
 import typer
 
-from service.cli.options import Json, reported_errors
+from looktwice.service.cli.options import Json, reported_errors
 
 SERVICE_DRIVERS: Final = ("adaptive", "never", "always")
 DRIVERS: Final = ("expert", "constant-velocity", *SERVICE_DRIVERS)
@@ -53,20 +53,20 @@ def drive(
     from rich.console import Console
     from rich.progress import Progress
 
-    from clients import wire
-    from clients.metadrive.drive import EXPERT, Drive, DriveConfig
-    from clients.metadrive.drive import drive as drive_episode
-    from clients.metadrive.drive_table import driver_rows, format_table, to_json
-    from clients.metadrive.film import IMAGINED, Film
-    from clients.metadrive.maps import MapError
-    from clients.metadrive.pilots import ConstantVelocity, Pilot, ServicePilot
-    from clients.metadrive.result_store import drive_store
-    from clients.metadrive.rig import Rig
-    from clients.planner import Access, PlannerClient, RetryPolicy
-    from model.driving.cameras import FRONT_CAMERAS
-    from model.driving.hashing import hash_of
-    from model.driving.scene import split_of_seed
-    from service.cli.small_pilot import SmallPilot
+    from looktwice.clients import wire
+    from looktwice.clients.metadrive.drive import EXPERT, Drive, DriveConfig
+    from looktwice.clients.metadrive.drive import drive as drive_episode
+    from looktwice.clients.metadrive.drive_table import driver_rows, format_table, to_json
+    from looktwice.clients.metadrive.film import IMAGINED, Film
+    from looktwice.clients.metadrive.maps import MapError
+    from looktwice.clients.metadrive.pilots import ConstantVelocity, Pilot, ServicePilot
+    from looktwice.clients.metadrive.result_store import drive_store
+    from looktwice.clients.metadrive.rig import Rig
+    from looktwice.clients.planner import Access, PlannerClient, RetryPolicy
+    from looktwice.model.driving.cameras import FRONT_CAMERAS
+    from looktwice.model.driving.hashing import hash_of
+    from looktwice.model.driving.scene import split_of_seed
+    from looktwice.service.cli.small_pilot import SmallPilot
 
     def pilot_of(driver: str, planner: PlannerClient, *, imagines: bool) -> Pilot | None:
         if driver == "expert":
@@ -153,7 +153,7 @@ def drive(
 @contextmanager
 def _named(service: str) -> Iterator[None]:
     """Turn what a service refuses, or that nothing answers, into an error that says which."""
-    from clients.answers import PlannerError
+    from looktwice.clients.answers import PlannerError
 
     try:
         yield

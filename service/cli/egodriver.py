@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
-from service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, reported_errors
+from looktwice.service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
+from looktwice.service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, reported_errors
 
 if TYPE_CHECKING:
-    from clients.planner import AsyncPlannerClient
-    from clients.wire import ModelCard
-    from model.engines.engine import Engine
+    from looktwice.clients.planner import AsyncPlannerClient
+    from looktwice.clients.wire import ModelCard
+    from looktwice.model.engines.engine import Engine
 
 
 def egodriver(
@@ -68,15 +68,15 @@ def egodriver(
     vllm_arguments: VllmArguments = "{}",
 ) -> None:
     """Serve alpasim's egodriver contract over gRPC, many sessions batched together."""
-    from clients import wire
+    from looktwice.clients import wire
 
     with reported_errors():
         if find_spec("carla_driver_interface") is None:
             raise RuntimeError("the egodriver needs more: pip install 'looktwice[alpasim]'")
-        from clients.alpasim.driver import DriverConfig
-        from clients.alpasim.session import CAMERAS
-        from service.logs import configure_logging
-        from service.settings import Settings
+        from looktwice.clients.alpasim.driver import DriverConfig
+        from looktwice.clients.alpasim.session import CAMERAS
+        from looktwice.service.logs import configure_logging
+        from looktwice.service.settings import Settings
 
         config = DriverConfig(
             cameras={**CAMERAS, **_cameras(cameras or [])},
@@ -92,10 +92,10 @@ def egodriver(
         configure_logging(Settings().log_format)
 
         async def run() -> None:
-            from clients.alpasim.driver import Egodriver
-            from clients.alpasim.errors import EgodriverError
-            from clients.alpasim.server import serve
-            from clients.planner import PlannerError
+            from looktwice.clients.alpasim.driver import Egodriver
+            from looktwice.clients.alpasim.errors import EgodriverError
+            from looktwice.clients.alpasim.server import serve
+            from looktwice.clients.planner import PlannerError
 
             async with _planner(service, made) as planner:
                 try:
@@ -119,14 +119,14 @@ async def _planner(service: str | None, engine: Engine | None) -> AsyncIterator[
     """The service at a URL, or the same service in this process, without a socket in between."""
     import httpx
 
-    from clients.planner import Access, AsyncPlannerClient
+    from looktwice.clients.planner import Access, AsyncPlannerClient
 
     if engine is None:
         async with AsyncPlannerClient(str(service), access=Access.from_environment()) as planner:
             yield planner
         return
-    from service.app import create_app
-    from service.settings import Settings
+    from looktwice.service.app import create_app
+    from looktwice.service.settings import Settings
 
     # Nobody else reaches it: sessions are what is limited here.
     app = create_app(engine, Settings(api_keys_file=None, rate_limit=None, max_draws=4096, max_scenes=1024))
@@ -139,7 +139,7 @@ async def _planner(service: str | None, engine: Engine | None) -> AsyncIterator[
 
 async def _card(planner: AsyncPlannerClient) -> ModelCard:
     """The model behind the planner, as soon as it can plan."""
-    from clients.planner import ServiceBusy
+    from looktwice.clients.planner import ServiceBusy
 
     while True:
         try:
@@ -151,7 +151,7 @@ async def _card(planner: AsyncPlannerClient) -> ModelCard:
 
 
 def _cameras(given: list[str]) -> dict[str, str]:
-    from model.driving.scene import CAMERAS
+    from looktwice.model.driving.scene import CAMERAS
 
     found = {}
     for text in given:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 if TYPE_CHECKING:
-    from model.engines.engine import Engine
+    from looktwice.model.engines.engine import Engine
 
 EngineName = Annotated[
     Literal["torch", "vllm", "transformers"],
@@ -59,7 +59,7 @@ def make_engine(
         ValueError: ``vllm_arguments`` are no JSON object.
     """
     if name == "vllm":
-        from model.engines.vllm.engine import VllmEngine, VllmSettings
+        from looktwice.model.engines.vllm.engine import VllmEngine, VllmSettings
 
         try:
             arguments: Any = json.loads(vllm_arguments)
@@ -69,12 +69,12 @@ def make_engine(
             raise ValueError("--vllm-arguments must be a JSON object")
         return VllmEngine(checkpoint, VllmSettings(rows=rows, arguments=arguments))
     if name == "transformers":
-        from model.engines.transformers.engine import TransformersEngine
+        from looktwice.model.engines.transformers.engine import TransformersEngine
 
         return TransformersEngine(checkpoint, rows)
     import torch
 
-    from model.engines.torch.engine import TorchEngine, TorchSettings
+    from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("there is no CUDA device that this torch can use; leave out --device cuda")

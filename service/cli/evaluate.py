@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
-from service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
-from service.cli.options import (
+from looktwice.service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
+from looktwice.service.cli.options import (
     DEFAULT_CHECKPOINT,
     DEFAULT_SCENES,
     Checkpoint,
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
     from rich.progress import Progress
 
-    from model.driving.scene import LabelledScene
-    from model.driving.trajectory import FloatArray
-    from model.engines.engine import Controls, Draw, Engine
-    from model.evaluation.failures_report import FailuresReport
-    from model.evaluation.imagination import ImaginationReport
-    from model.evaluation.ladder import LadderReport
-    from model.evaluation.open_loop import SceneResult
-    from model.evaluation.report import Report
-    from model.evaluation.variants import Variant
+    from looktwice.model.driving.scene import LabelledScene
+    from looktwice.model.driving.trajectory import FloatArray
+    from looktwice.model.engines.engine import Controls, Draw, Engine
+    from looktwice.model.evaluation.failures_report import FailuresReport
+    from looktwice.model.evaluation.imagination import ImaginationReport
+    from looktwice.model.evaluation.ladder import LadderReport
+    from looktwice.model.evaluation.open_loop import SceneResult
+    from looktwice.model.evaluation.report import Report
+    from looktwice.model.evaluation.variants import Variant
 
 _Found = TypeVar("_Found")
 
@@ -129,9 +129,9 @@ def evaluate(
 ) -> None:
     """Evaluate open loop: baselines, with and without route, expert plans given, images shuffled."""
     with reported_errors():
-        from model.driving.scene_store import count_scenes, read_scenes
-        from model.engines.engine import Controls
-        from model.evaluation.draw_store import DrawStore
+        from looktwice.model.driving.scene_store import count_scenes, read_scenes
+        from looktwice.model.engines.engine import Controls
+        from looktwice.model.evaluation.draw_store import DrawStore
 
         controls = Controls(
             n=n,
@@ -144,7 +144,7 @@ def evaluate(
         )
         labelled = list(evenly(read_scenes(scenes, dense=False), count_scenes(scenes), limit))
         if perception:
-            from service.cli.perception import tell_perception
+            from looktwice.service.cli.perception import tell_perception
 
             told_as, text = tell_perception(checkpoint, labelled, gate_scenes, gate_steps, quiet=as_json)
             typer.echo(json.dumps(told_as) if as_json else text)
@@ -178,13 +178,13 @@ def evaluate(
         elif preset == "imagination":
             report = _imagination(labelled, engine_of(checkpoint), checkpoint, controls, rows, quiet=as_json)
         elif preset == "failures":
-            from service.cli.evaluate_failures import evaluate_stages, stages_named
+            from looktwice.service.cli.evaluate_failures import evaluate_stages, stages_named
 
             stages = stages_named(stage or [str(checkpoint)])
             report = evaluate_stages(labelled, engine_of, stages, controls, seeds, rows, quiet=as_json)
         else:
-            from model.evaluation.report import evaluate_checkpoint
-            from model.evaluation.variants import standard_variants
+            from looktwice.model.evaluation.report import evaluate_checkpoint
+            from looktwice.model.evaluation.variants import standard_variants
 
             made = engine_of(checkpoint)
             variants = standard_variants(made.card.formats, controls, made.card.inputs)
@@ -207,9 +207,9 @@ def _outcomes(
     quiet: bool,
 ) -> tuple[dict[str, Any], str]:
     """What comes of first plans and of second looks, as JSON and as text."""
-    from clients.metadrive.replay import Moment, setting_of
-    from model.evaluation.report import evaluate_variants
-    from service.cli.outcomes import follow_pairs, outcome_pairs
+    from looktwice.clients.metadrive.replay import Moment, setting_of
+    from looktwice.model.evaluation.report import evaluate_variants
+    from looktwice.service.cli.outcomes import follow_pairs, outcome_pairs
 
     # What cannot be followed is refused before anything is planned.
     setting = setting_of(folder)
@@ -234,7 +234,7 @@ def _outcomes(
 
 def _small_planner(folder: Path) -> tuple[str, Callable[[LabelledScene], FloatArray]]:
     """A small planner's kind, and how it plans; scenes need a route."""
-    from model.network.small_planner import load_small
+    from looktwice.model.network.small_planner import load_small
 
     planner = load_small(folder)
     return planner.kind, lambda labelled: planner.plan([labelled.given(route=True, tracks=True)])[0]
@@ -260,8 +260,8 @@ def _ladder(
     quiet: bool,
 ) -> LadderReport:
     """Climb the ladder: every checkpoint in turn, the last round's with all temperatures and thresholds."""
-    from model.evaluation import ladder_plots
-    from model.evaluation.ladder import (
+    from looktwice.model.evaluation import ladder_plots
+    from looktwice.model.evaluation.ladder import (
         COUNTERFACTUAL,
         LADDER,
         ROUND_2,
@@ -274,7 +274,7 @@ def _ladder(
         threshold_variants,
         write_scenes,
     )
-    from model.evaluation.report import evaluate_variants
+    from looktwice.model.evaluation.report import evaluate_variants
 
     entries = (
         {} if folder is None else {entry: folder / entry for entry in LADDER if (folder / entry).is_dir()}
@@ -335,8 +335,8 @@ def _imagination(
     quiet: bool,
 ) -> ImaginationReport:
     """What a checkpoint plans with and without imagining, and what its pictures are worth."""
-    from model.evaluation.imagination import evaluate_imagination, imagination_variants
-    from model.network.checkpoint import load
+    from looktwice.model.evaluation.imagination import evaluate_imagination, imagination_variants
+    from looktwice.model.network.checkpoint import load
 
     variants = imagination_variants(engine.card, controls)
     evaluate = partial(evaluate_imagination, loaded=load(checkpoint))
@@ -359,7 +359,7 @@ async def run_started(
         EngineError, RequestError: the engine's.
         ValueError: the scenes do not allow a variant, told before the engine starts.
     """
-    from model.evaluation.variants import check_variants
+    from looktwice.model.evaluation.variants import check_variants
 
     check_variants(scenes, variants)
     await engine.start()

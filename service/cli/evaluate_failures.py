@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from model.driving.scene import LabelledScene
-    from model.engines.engine import Controls, Engine
-    from model.evaluation.failures_report import FailuresReport
+    from looktwice.model.driving.scene import LabelledScene
+    from looktwice.model.engines.engine import Controls, Engine
+    from looktwice.model.evaluation.failures_report import FailuresReport
 
 
 def stages_named(given: Sequence[str]) -> dict[str, Path]:
@@ -43,10 +43,10 @@ def evaluate_stages(
     quiet: bool,
 ) -> FailuresReport:
     """Evaluate stages one after the other on the same scenes."""
-    from model.driving.pdm.judging import SceneJudge
-    from model.evaluation.failures import evaluate_stage, stage_variants
-    from model.evaluation.failures_report import failures_report
-    from service.cli.evaluate import run_started
+    from looktwice.model.driving.pdm.judging import SceneJudge
+    from looktwice.model.evaluation.failures import evaluate_stage, stage_variants
+    from looktwice.model.evaluation.failures_report import failures_report
+    from looktwice.service.cli.evaluate import run_started
 
     judges = [SceneJudge(each) for each in scenes]
     # What one of them cannot do is refused before any of them plans.

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.build import AtOnce, Every, Folder, GiveUp, Limit, MaxErrorRate, RetryDead, Scenes
-from service.cli.options import Json, reported_errors
-from service.cli.stages import do_jobs, report_run, run_stage, scenes_in
+from looktwice.service.cli.build import AtOnce, Every, Folder, GiveUp, Limit, MaxErrorRate, RetryDead, Scenes
+from looktwice.service.cli.options import Json, reported_errors
+from looktwice.service.cli.stages import do_jobs, report_run, run_stage, scenes_in
 
 if TYPE_CHECKING:
-    from clients.labelling.failures import Inference, Sample
-    from clients.labelling.ledger import Ledger, Run
-    from clients.labelling.pipeline import Limits, Tally
+    from looktwice.clients.labelling.failures import Inference, Sample
+    from looktwice.clients.labelling.ledger import Ledger, Run
+    from looktwice.clients.labelling.pipeline import Limits, Tally
 
 
 def failures(
@@ -46,10 +46,10 @@ def failures(
     as_json: Json = False,
 ) -> None:
     """Infer, score, sample correct and wrong responses, have feedback written: docs/feedback.md."""
-    from clients.labelling.failures import Inference, Sample, rows, sampled
-    from clients.labelling.ledger import Ledger
-    from clients.labelling.pipeline import Limits
-    from model.driving.feedback_store import write_feedback
+    from looktwice.clients.labelling.failures import Inference, Sample, rows, sampled
+    from looktwice.clients.labelling.ledger import Ledger
+    from looktwice.clients.labelling.pipeline import Limits
+    from looktwice.model.driving.feedback_store import write_feedback
 
     inference = Inference(n, temperature, top_p, seed, route=route, tracks=tracks, format=format)
     limits = Limits(at_once, give_up_after, max_error_rate, limit)
@@ -91,10 +91,10 @@ async def _infer(
     retry_dead: bool,
     quiet: bool,
 ) -> tuple[Run, Tally]:
-    from clients.labelling.failures import infer, inference_config
-    from clients.labelling.rollout import RETRY_POLICY, jobs
-    from clients.planner import Access, AsyncPlannerClient, PlannerError
-    from clients.wire import ModelName
+    from looktwice.clients.labelling.failures import infer, inference_config
+    from looktwice.clients.labelling.rollout import RETRY_POLICY, jobs
+    from looktwice.clients.planner import Access, AsyncPlannerClient, PlannerError
+    from looktwice.clients.wire import ModelName
 
     async with AsyncPlannerClient(service, RETRY_POLICY, access=Access.from_environment()) as planner:
         try:
@@ -126,9 +126,9 @@ async def _write(
     retry_dead: bool,
     quiet: bool,
 ) -> tuple[Run, Tally]:
-    from clients.labelling.failures import feedback_config, feedback_jobs, sampled, writer
-    from clients.labelling.teachers.feedback import FeedbackTeacher
-    from service.settings import TeacherSettings
+    from looktwice.clients.labelling.failures import feedback_config, feedback_jobs, sampled, writer
+    from looktwice.clients.labelling.teachers.feedback import FeedbackTeacher
+    from looktwice.service.settings import TeacherSettings
 
     set_teacher = TeacherSettings().teacher()
     teacher = set_teacher if isinstance(set_teacher, FeedbackTeacher) else None

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import DEFAULT_SCENES, Json, ScenePath, reported_errors
+from looktwice.service.cli.options import DEFAULT_SCENES, Json, ScenePath, reported_errors
 
 
 def feedback(
@@ -20,11 +20,11 @@ def feedback(
     as_json: Json = False,
 ) -> None:
     """Say why a request's trajectories fail, as the built-in teacher does; docs/feedback.md tells how."""
-    from clients.wire_feedback import FeedbackRequest
-    from service.errors import validated
-    from service.feedback import feedback_given
-    from service.inspector_scenes import BundledScenes
-    from service.problems import ProblemError
+    from looktwice.clients.wire_feedback import FeedbackRequest
+    from looktwice.service.errors import validated
+    from looktwice.service.feedback import feedback_given
+    from looktwice.service.inspector_scenes import BundledScenes
+    from looktwice.service.problems import ProblemError
 
     with reported_errors():
         text = sys.stdin.read() if str(request) == "-" else request.read_text()

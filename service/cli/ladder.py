@@ -11,10 +11,10 @@ from typing import Final
 
 import typer
 
-from model.evaluation.ladder import COUNTERFACTUAL, META_ACT, MULTI_ROUND, ROUND_2, WHOLE_DATASET
-from service.cli.serving import served
+from looktwice.model.evaluation.ladder import COUNTERFACTUAL, META_ACT, MULTI_ROUND, ROUND_2, WHOLE_DATASET
+from looktwice.service.cli.serving import served
 
-_LOOKTWICE: Final = (sys.executable, "-m", "service.cli")
+_LOOKTWICE: Final = (sys.executable, "-m", "looktwice.service.cli")
 _CHECKPOINT_FILE: Final = "looktwice.json"
 
 
@@ -141,7 +141,7 @@ def _train(entry: LadderEntry, folder: Path, scenes: Path, options: Sequence[str
         return
     _run(
         [sys.executable, "-m", "torch.distributed.run", "--standalone"],
-        ["--nproc-per-node", str(processes), "-m", "service.cli", "train", entry.recipe],
+        ["--nproc-per-node", str(processes), "-m", "looktwice.service.cli", "train", entry.recipe],
         ["--from", str(folder / entry.source), "--to", str(folder / entry.name)],
         ["--scenes", str(scenes), *options],
     )

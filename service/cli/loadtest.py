@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from service.cli.options import DEFAULT_SCENES, Json, ScenePath, reported_errors
+from looktwice.service.cli.options import DEFAULT_SCENES, Json, ScenePath, reported_errors
 
 Scenario = Literal["poisson", "sweep", "fleet", "soak", "burst", "hostile", "costly"]
 
@@ -86,19 +86,19 @@ def loadtest(
 ) -> None:
     """Offer load, measured from when each request was due; exits with 1 where the run is not valid."""
     with reported_errors(), ExitStack() as stack:
-        from loadtests.attacks import RUDE
-        from loadtests.bad_teacher import bad_teacher
-        from loadtests.environment import describe_client, describe_service, versions
-        from loadtests.mix import parse_mix
-        from loadtests.report import Report
-        from loadtests.run import Result, Setup
-        from loadtests.scenarios.hostile import OwnService, costly, hostile
-        from loadtests.scenarios.steady import burst, fleet, poisson, soak
-        from loadtests.scenarios.sweep import KneeSearch, sweep
-        from loadtests.sending import Target
-        from model.driving.scene_store import read_scenes
-        from service.cli.serving import served
-        from service.settings import Settings
+        from looktwice.loadtests.attacks import RUDE
+        from looktwice.loadtests.bad_teacher import bad_teacher
+        from looktwice.loadtests.environment import describe_client, describe_service, versions
+        from looktwice.loadtests.mix import parse_mix
+        from looktwice.loadtests.report import Report
+        from looktwice.loadtests.run import Result, Setup
+        from looktwice.loadtests.scenarios.hostile import OwnService, costly, hostile
+        from looktwice.loadtests.scenarios.steady import burst, fleet, poisson, soak
+        from looktwice.loadtests.scenarios.sweep import KneeSearch, sweep
+        from looktwice.loadtests.sending import Target
+        from looktwice.model.driving.scene_store import read_scenes
+        from looktwice.service.cli.serving import served
+        from looktwice.service.settings import Settings
 
         def soaked() -> Result:
             if knee is None or server_pid is None:
@@ -144,7 +144,7 @@ def loadtest(
         began = datetime.now(UTC).isoformat(timespec="seconds")
         made = Report(setup, run[scenario](), began, client, models, versions())
         if report is not None:
-            from loadtests.page import page
+            from looktwice.loadtests.page import page
 
             report.parent.mkdir(parents=True, exist_ok=True)
             report.write_text(page(made), encoding="utf-8")

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from model.bundled import CHECKPOINT, SCENES
+from looktwice.model.bundled import CHECKPOINT, SCENES
 
 
 @contextmanager
@@ -26,7 +26,7 @@ def reported_errors() -> Iterator[None]:
 def _found(checkpoint: Path) -> Path:
     if checkpoint.exists():
         return checkpoint
-    from model.network.hub import checkpoint_folder
+    from looktwice.model.network.hub import checkpoint_folder
 
     with reported_errors():
         return checkpoint_folder(checkpoint)

@@ -11,15 +11,15 @@ from typing import Final
 from rich.console import Console
 from rich.progress import Progress
 
-from clients.metadrive.outcomes import MomentOutcomes
-from clients.metadrive.replay import EpisodeSetting, Moment, ReplayError
-from clients.metadrive.result_store import ResultStore, outcome_key, outcome_store
-from clients.metadrive.workers import FollowTask, follow_episodes
-from model.driving.scene import LabelledScene
-from model.driving.trajectory import FloatArray
-from model.engines.engine import Controls, Draw, EngineError
-from model.evaluation.outcomes import FollowedDraw, OutcomeTable, outcome_table
-from model.evaluation.variants import Variant
+from looktwice.clients.metadrive.outcomes import MomentOutcomes
+from looktwice.clients.metadrive.replay import EpisodeSetting, Moment, ReplayError
+from looktwice.clients.metadrive.result_store import ResultStore, outcome_key, outcome_store
+from looktwice.clients.metadrive.workers import FollowTask, follow_episodes
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.engines.engine import Controls, Draw, EngineError
+from looktwice.model.evaluation.outcomes import FollowedDraw, OutcomeTable, outcome_table
+from looktwice.model.evaluation.variants import Variant
 
 MOST_UNPAIRED: Final = 0.02
 """Of all draws: sums of a batch of another shape differ in their last bits, and now and then a word does."""

@@ -9,12 +9,12 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import count_scenes, read_scenes
-from model.evaluation.perception import Reading, format_perception, perception_rows, read_facts
-from model.network.checkpoint import load
-from model.training.perception_gate import format_gate, perception_gate
-from model.training.small import SmallSettings
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import count_scenes, read_scenes
+from looktwice.model.evaluation.perception import Reading, format_perception, perception_rows, read_facts
+from looktwice.model.network.checkpoint import load
+from looktwice.model.training.perception_gate import format_gate, perception_gate
+from looktwice.model.training.small import SmallSettings
 
 
 def tell_perception(

@@ -11,13 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from service.cli.options import DEFAULT_CHECKPOINT, DEFAULT_SCENES, Checkpoint, Json, reported_errors
+from looktwice.service.cli.options import (
+    DEFAULT_CHECKPOINT,
+    DEFAULT_SCENES,
+    Checkpoint,
+    Json,
+    reported_errors,
+)
 
 if TYPE_CHECKING:
-    import clients.wire as wire
-    from model.driving.scene import LabelledScene
-    from model.engines.engine import Draw, PlanRequest
-    from model.network.model_card import ModelCard
+    import looktwice.clients.wire as wire
+    from looktwice.model.driving.scene import LabelledScene
+    from looktwice.model.engines.engine import Draw, PlanRequest
+    from looktwice.model.network.model_card import ModelCard
 
 _BESIDE_REQUESTS: Final = ("scenes", "checkpoint", "limit", "skip", "out", "as_json")
 """What a request does not say itself."""
@@ -86,13 +92,13 @@ def _refuse_what_requests_say(context: typer.Context, files: list[Path]) -> None
 def _read(file: Path) -> Iterator[LabelledScene | wire.PlanRequest]:
     """The scenes of a file, or its one request."""
     if file.suffix != ".json":
-        from model.driving.scene_store import read_scenes
+        from looktwice.model.driving.scene_store import read_scenes
 
         yield from read_scenes(file, dense=False)
         return
-    import clients.wire as wire
-    from service.errors import validated
-    from service.problems import ProblemError
+    import looktwice.clients.wire as wire
+    from looktwice.service.errors import validated
+    from looktwice.service.problems import ProblemError
 
     try:
         yield validated(wire.PlanRequest, json.loads(file.read_bytes()))
@@ -108,10 +114,10 @@ def _requested(
     controls: dict[str, Any],
 ) -> PlanRequest:
     """The engine's request for a scene, or for a request as the service would make it."""
-    from model.driving.scene import LabelledScene
-    from model.engines.engine import Controls, PlanRequest
-    from service.problems import ProblemError
-    from service.validation import engine_request
+    from looktwice.model.driving.scene import LabelledScene
+    from looktwice.model.engines.engine import Controls, PlanRequest
+    from looktwice.service.problems import ProblemError
+    from looktwice.service.validation import engine_request
 
     if isinstance(found, LabelledScene):
         scene = found.given(**given)
@@ -133,11 +139,11 @@ async def _plan(
 ) -> None:
     import numpy as np
 
-    from model.driving.scene import LabelledScene
-    from model.driving.trajectory import agreed
-    from model.engines.engine import DrawFinished
-    from model.engines.torch.engine import TorchEngine
-    from model.evaluation.pictures import plan_picture
+    from looktwice.model.driving.scene import LabelledScene
+    from looktwice.model.driving.trajectory import agreed
+    from looktwice.model.engines.engine import DrawFinished
+    from looktwice.model.engines.torch.engine import TorchEngine
+    from looktwice.model.evaluation.pictures import plan_picture
 
     engine = TorchEngine(checkpoint)
     await engine.start()

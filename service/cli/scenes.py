@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.options import DEFAULT_SCENES, Json, reported_errors
+from looktwice.service.cli.options import DEFAULT_SCENES, Json, reported_errors
 
 if TYPE_CHECKING:
-    from clients.importers.recording import Recording
-    from clients.importers.resampling import Source
-    from clients.metadrive.pilots import Pilot
-    from model.driving.cameras import CameraSpec
-    from model.driving.scene import LabelledScene
+    from looktwice.clients.importers.recording import Recording
+    from looktwice.clients.importers.resampling import Source
+    from looktwice.clients.metadrive.pilots import Pilot
+    from looktwice.model.driving.cameras import CameraSpec
+    from looktwice.model.driving.scene import LabelledScene
 
 app = typer.Typer(help="Make, count and look at driving scenes.", no_args_is_help=True)
 _Scenes = Annotated[Path, typer.Argument(help="Scene file or folder; the bundled test scenes without one.")]
@@ -69,7 +69,7 @@ def generate(
 ) -> None:
     """Drive episodes in MetaDrive and store their scenes; run again after a kill, it resumes."""
     with reported_errors():
-        from clients.metadrive.generate import GenerateConfig, generate
+        from looktwice.clients.metadrive.generate import GenerateConfig, generate
 
         driver, pilot = _driver(service, small, tracks=tracks, pictures=pictures)
         config = GenerateConfig(
@@ -94,8 +94,8 @@ def _driver(
     service: str | None, small: Path | None, *, tracks: bool, pictures: bool
 ) -> tuple[str | None, Callable[[], Pilot] | None]:
     """Who drives in the expert's place, with revision, and what makes it in a worker; None for nobody."""
-    from clients.planner import Access, PlannerClient
-    from service.cli.small_pilot import SmallPilot
+    from looktwice.clients.planner import Access, PlannerClient
+    from looktwice.service.cli.small_pilot import SmallPilot
 
     if service is not None and small is not None:
         raise ValueError("either --service or --small drives, not both")
@@ -112,9 +112,9 @@ def _driver(
 
 def served_pilot(service: str, *, tracks: bool) -> Pilot:
     """A service's model, without second looks: those are taught by what comes of first plans."""
-    from clients import wire
-    from clients.metadrive.pilots import ServicePilot
-    from clients.planner import Access, PlannerClient, RetryPolicy
+    from looktwice.clients import wire
+    from looktwice.clients.metadrive.pilots import ServicePilot
+    from looktwice.clients.planner import Access, PlannerClient, RetryPolicy
 
     planner = PlannerClient(service, RetryPolicy(timeout_s=120.0), access=Access.from_environment())
     return ServicePilot(planner, "never", wire.Controls(n=6, thinking="never"), tracks=tracks)
@@ -144,8 +144,8 @@ def import_(
 ) -> None:
     """Make scenes of recorded drives, your own or others'; docs/own-cameras.md tells how."""
     with reported_errors():
-        from clients.importers.recording import RecordingError
-        from model.driving.scene_store import write_scenes
+        from looktwice.clients.importers.recording import RecordingError
+        from looktwice.model.driving.scene_store import write_scenes
 
         doubts: set[str] = set()
 
@@ -170,10 +170,10 @@ def import_(
 
 def _recordings(folder: Path, told: list[str], width: int) -> Iterable[Recording]:
     """Of whichever layout the folder has."""
-    from clients.importers.comma2k19 import POSES_FOLDER, read_segments
-    from clients.importers.folder import POSES_FILE, read_folder
-    from clients.importers.nuscenes import VERSIONS, read_nuscenes
-    from model.driving.cameras import FRONT_CAMERAS
+    from looktwice.clients.importers.comma2k19 import POSES_FOLDER, read_segments
+    from looktwice.clients.importers.folder import POSES_FILE, read_folder
+    from looktwice.clients.importers.nuscenes import VERSIONS, read_nuscenes
+    from looktwice.model.driving.cameras import FRONT_CAMERAS
 
     specs = [spec.resized(width) for spec in FRONT_CAMERAS]
     if any(folder.glob(VERSIONS)):
@@ -188,8 +188,8 @@ def _recordings(folder: Path, told: list[str], width: int) -> Iterable[Recording
 
 
 def _played(told: list[str], specs: list[CameraSpec]) -> dict[CameraSpec, Source]:
-    from clients.importers.recording import RecordingError
-    from clients.importers.resampling import Source
+    from looktwice.clients.importers.recording import RecordingError
+    from looktwice.clients.importers.resampling import Source
 
     if not told:
         return {spec: Source(spec.name, spec.hfov_degrees, spec.horizon) for spec in specs}
@@ -213,7 +213,7 @@ def _played(told: list[str], specs: list[CameraSpec]) -> dict[CameraSpec, Source
 def stats(path: _Scenes = DEFAULT_SCENES, as_json: Json = False) -> None:
     """Count scenes per tag and per meta-action, and check the expert."""
     with reported_errors():
-        from clients.metadrive.stats import scene_stats
+        from looktwice.clients.metadrive.stats import scene_stats
 
         figures = scene_stats(path)
         if as_json:
@@ -237,8 +237,8 @@ def show(
 ) -> None:
     """Write a contact sheet: cameras and bird's-eye view of scenes."""
     with reported_errors():
-        from clients.metadrive.sheet import contact_sheet
-        from model.driving.scene_store import read_scenes
+        from looktwice.clients.metadrive.sheet import contact_sheet
+        from looktwice.model.driving.scene_store import read_scenes
 
         out.parent.mkdir(parents=True, exist_ok=True)
         contact_sheet(islice(read_scenes(path), 0, limit * every, every), out)
@@ -253,8 +253,8 @@ def pick(
 ) -> None:
     """Pick a few scenes that show every tag, each from another episode, without their dense targets."""
     with reported_errors():
-        from model.driving.scene_store import read_scenes, write_scenes
-        from model.driving.selection import pick_varied
+        from looktwice.model.driving.scene_store import read_scenes, write_scenes
+        from looktwice.model.driving.selection import pick_varied
 
         chosen = pick_varied(read_scenes(path, dense=False), count)
         typer.echo(f"{write_scenes(out, chosen)} scenes in {out}")

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
-from service.cli.evaluate import evenly, run_started
-from service.cli.options import DEFAULT_SCENES, Json, OptionalCheckpoint, ScenePath, reported_errors
+from looktwice.service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
+from looktwice.service.cli.evaluate import evenly, run_started
+from looktwice.service.cli.options import DEFAULT_SCENES, Json, OptionalCheckpoint, ScenePath, reported_errors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from model.driving.scene import LabelledScene
-    from model.driving.trajectory import FloatArray
-    from model.engines.engine import Controls, Draw, Engine
-    from model.evaluation.variants import Variant
+    from looktwice.model.driving.scene import LabelledScene
+    from looktwice.model.driving.trajectory import FloatArray
+    from looktwice.model.engines.engine import Controls, Draw, Engine
+    from looktwice.model.evaluation.variants import Variant
 
 
 def score(
@@ -48,9 +48,9 @@ def score(
     """Score a request's trajectories, or planners over scenes; docs/scoring.md tells how."""
     with reported_errors():
         if what.is_dir() or what.suffix == ".parquet":
-            from model.driving.scene_store import count_scenes, read_scenes
-            from model.engines.engine import Controls
-            from model.evaluation.scores import by_scene, score_table
+            from looktwice.model.driving.scene_store import count_scenes, read_scenes
+            from looktwice.model.engines.engine import Controls
+            from looktwice.model.evaluation.scores import by_scene, score_table
 
             labelled = list(evenly(read_scenes(what, dense=False), count_scenes(what), limit))
             planners = {}
@@ -80,9 +80,9 @@ def _agreed_draws(
 
     import numpy as np
 
-    from model.driving.trajectory import agreed
-    from model.evaluation.report import evaluate_variants
-    from model.evaluation.variants import Variant
+    from looktwice.model.driving.trajectory import agreed
+    from looktwice.model.evaluation.report import evaluate_variants
+    from looktwice.model.evaluation.variants import Variant
 
     found: dict[str, FloatArray] = {}
 
@@ -97,11 +97,11 @@ def _agreed_draws(
 
 
 def _score_request(request: Path, scenes: Path, *, as_json: bool) -> None:
-    from clients.wire_scores import ScoreRequest
-    from service.errors import validated
-    from service.inspector_scenes import BundledScenes
-    from service.problems import ProblemError
-    from service.scoring import scored
+    from looktwice.clients.wire_scores import ScoreRequest
+    from looktwice.service.errors import validated
+    from looktwice.service.inspector_scenes import BundledScenes
+    from looktwice.service.problems import ProblemError
+    from looktwice.service.scoring import scored
 
     text = sys.stdin.read() if str(request) == "-" else request.read_text()
     try:

@@ -12,8 +12,16 @@ from typing import Annotated, Any, Final
 import typer
 from pydantic_settings import BaseSettings
 
-from service.cli.engines import CacheMb, Device, EngineName, Reproducible, Rows, VllmArguments, make_engine
-from service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, reported_errors
+from looktwice.service.cli.engines import (
+    CacheMb,
+    Device,
+    EngineName,
+    Reproducible,
+    Rows,
+    VllmArguments,
+    make_engine,
+)
+from looktwice.service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, reported_errors
 
 _TURN_S: Final = 0.0001
 """After which a thread that computes in Python lets others go on. The engine's thread asks for its turn many
@@ -42,10 +50,10 @@ def serve(
     ] = False,
 ) -> None:
     """Serve a checkpoint over HTTP; the inspector page is at /."""
-    from model.network.allocator import return_large_buffers
-    from service.app import create_app
-    from service.server import make_server
-    from service.settings import Settings, TeacherSettings
+    from looktwice.model.network.allocator import return_large_buffers
+    from looktwice.service.app import create_app
+    from looktwice.service.server import make_server
+    from looktwice.service.settings import Settings, TeacherSettings
 
     if list_settings:
         for kind in (Settings, TeacherSettings):
@@ -67,7 +75,7 @@ def serve(
         )
         teacher = TeacherSettings().teacher()
         if no_model:
-            from service.no_model import NoModel
+            from looktwice.service.no_model import NoModel
 
             app = create_app(NoModel(), settings, teacher=teacher)
         else:

@@ -35,7 +35,7 @@ def served(
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     process = subprocess.Popen(
-        [sys.executable, "-m", "service.cli", "serve", "--port", str(port), *options],
+        [sys.executable, "-m", "looktwice.service.cli", "serve", "--port", str(port), *options],
         env=os.environ | settings,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE if unread_log else None,

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from clients.metadrive.pilots import Planned
-from model.driving.scene import Scene
-from model.network.small_planner import load_small, small_revision
+from looktwice.clients.metadrive.pilots import Planned
+from looktwice.model.driving.scene import Scene
+from looktwice.model.network.small_planner import load_small, small_revision
 
 
 class SmallPilot:

@@ -14,12 +14,12 @@ from typing import Final
 import typer
 from rich.progress import Progress, TextColumn
 
-from clients.metadrive.generate import GenerateConfig, generate
-from model.driving.scene import split_of_seed
-from model.network.codec import TrajectoryCodec
-from model.network.small_planner import WEIGHTS_FILE, SmallKind
-from model.training.small import SmallSettings, train_small
-from service.cli.small_pilot import SmallPilot
+from looktwice.clients.metadrive.generate import GenerateConfig, generate
+from looktwice.model.driving.scene import split_of_seed
+from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.network.small_planner import WEIGHTS_FILE, SmallKind
+from looktwice.model.training.small import SmallSettings, train_small
+from looktwice.service.cli.small_pilot import SmallPilot
 
 FIRST_ROUND_SEED: Final = 200_000
 """Training seeds that no scenes are made of by default; every round drives new ones."""

@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 if TYPE_CHECKING:
-    from clients.labelling.ledger import Ledger, Record, Run
-    from clients.labelling.pipeline import Job, Limits, Tally
+    from looktwice.clients.labelling.ledger import Ledger, Record, Run
+    from looktwice.clients.labelling.pipeline import Job, Limits, Tally
 
 
 def run_stage(
     folder: Path, work: Callable[[Ledger], Coroutine[Any, Any, tuple[Run, Tally]]], *, dry: bool
 ) -> tuple[Run, Tally]:
     """Run a stage on a folder's ledger, or on a copy that is thrown away."""
-    from clients.labelling.dead_letters import write_dead_letters
-    from clients.labelling.ledger import FILE, Ledger
+    from looktwice.clients.labelling.dead_letters import write_dead_letters
+    from looktwice.clients.labelling.ledger import FILE, Ledger
 
     if dry:
         with tempfile.TemporaryDirectory(prefix="looktwice-") as scratch:
@@ -51,7 +51,7 @@ async def do_jobs(
     quiet: bool,
 ) -> Tally:
     """Work through ``jobs`` under a bar; of ``total`` pieces of work, where all of them are to be done."""
-    from clients.labelling.pipeline import work_through
+    from looktwice.clients.labelling.pipeline import work_through
 
     with progress_bar(run, total if limits.at_most is None else None, quiet=quiet) as show:
         return await work_through(ledger, run, jobs, do, limits, show)
@@ -88,7 +88,7 @@ def progress_bar(run: Run, total: int | None, *, quiet: bool) -> Iterator[Callab
 
 def scenes_in(scenes: Path) -> int:
     """How many scenes a file or folder holds."""
-    from model.driving.scene_store import count_scenes
+    from looktwice.model.driving.scene_store import count_scenes
 
     return count_scenes(scenes)
 

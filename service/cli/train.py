@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from model.bundled import CHECKPOINT as BUNDLED_CHECKPOINT
-from service.cli.options import reported_errors
+from looktwice.model.bundled import CHECKPOINT as BUNDLED_CHECKPOINT
+from looktwice.service.cli.options import reported_errors
 
 
 def train(
@@ -100,18 +100,18 @@ def train(
 
     import torch
 
-    from model.driving.scene_store import count_scenes, read_scenes
-    from model.evaluation.curves import training_curves
-    from model.network.allocator import keep_freed_memory
-    from model.network.card import LOG_FILE
-    from model.network.precision import bfloat16_is_fast
-    from model.network.small_planner import DRIVING_KINDS
-    from model.training.recipes import NANO, PAPER, VISUAL_CODES, refining_with
-    from model.training.run import RunSettings, create, run
-    from model.training.small import SmallSettings
-    from model.training.visual_codes import train_visual_codes
-    from service.cli.ladder import climb
-    from service.cli.small_rounds import train_small_in_rounds
+    from looktwice.model.driving.scene_store import count_scenes, read_scenes
+    from looktwice.model.evaluation.curves import training_curves
+    from looktwice.model.network.allocator import keep_freed_memory
+    from looktwice.model.network.card import LOG_FILE
+    from looktwice.model.network.precision import bfloat16_is_fast
+    from looktwice.model.network.small_planner import DRIVING_KINDS
+    from looktwice.model.training.recipes import NANO, PAPER, VISUAL_CODES, refining_with
+    from looktwice.model.training.run import RunSettings, create, run
+    from looktwice.model.training.small import SmallSettings
+    from looktwice.model.training.visual_codes import train_visual_codes
+    from looktwice.service.cli.ladder import climb
+    from looktwice.service.cli.small_rounds import train_small_in_rounds
 
     if threads is not None:
         torch.set_num_threads(threads)

@@ -8,8 +8,8 @@ from typing import Final
 from fastapi import FastAPI
 from starlette.responses import FileResponse
 
-from service.openapi import problems
-from service.problems import NOT_FOUND, ProblemError
+from looktwice.service.openapi import problems
+from looktwice.service.problems import NOT_FOUND, ProblemError
 
 _FOLDER: Final = Path(__file__).parent
 _MEDIA_TYPES: Final = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}

@@ -19,17 +19,17 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from playwright.sync_api import expect, sync_playwright
 
-from clients.answers import PlannedDraw
-from clients.planner import PlannerClient, RetryPolicy
-from clients.wire import Controls
-from model.bundled import CHECKPOINT, SCENES
-from model.driving.facts import LANE_WIDTH_M
-from model.driving.route_frame import RouteFrame
-from model.driving.scene import LabelledScene, Scene
-from model.driving.scene_store import read_scenes
-from model.engines.torch.engine import TorchEngine
-from model.network.card import read_card
-from service.settings import Settings
+from looktwice.clients.answers import PlannedDraw
+from looktwice.clients.planner import PlannerClient, RetryPolicy
+from looktwice.clients.wire import Controls
+from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.driving.facts import LANE_WIDTH_M
+from looktwice.model.driving.route_frame import RouteFrame
+from looktwice.model.driving.scene import LabelledScene, Scene
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.engines.torch.engine import TorchEngine
+from looktwice.model.network.card import read_card
+from looktwice.service.settings import Settings
 from tests.browser.conftest import ARGUMENTS, CHROMIUM
 from tests.service.serving import serve
 
@@ -115,7 +115,16 @@ def main() -> None:
             place, seed, draw = chosen(planner, scenes)
             scene_id = scenes[place].scene.scene_id
             show_inspector(served.url, scene_id, seed, draw, folder / "inspector.png")
-        plan = [sys.executable, "-m", "service.cli", "plan", "--skip", str(place), "--seed", str(seed)]
+        plan = [
+            sys.executable,
+            "-m",
+            "looktwice.service.cli",
+            "plan",
+            "--skip",
+            str(place),
+            "--seed",
+            str(seed),
+        ]
         subprocess.run([*plan, "--n", str(DRAWS), "--out", kept], check=True, stdout=subprocess.DEVNULL)
         stamped(folder / f"{scene_id}.png", PLAN)
         stamped(folder / "inspector.png", INSPECTOR)

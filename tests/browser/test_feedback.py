@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from model.driving.scene_store import write_scenes
-from model.driving.trajectory import TEN_HZ_S
-from service.settings import Settings
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.driving.trajectory import TEN_HZ_S
+from looktwice.service.settings import Settings
 from tests.browser.test_inspector import (
     EXPERT_RGB,
     INSIDE_OF_DOTS_RGB,

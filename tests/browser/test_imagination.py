@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from model.driving.images import encode_png
-from model.driving.scene import NextFrame
-from model.driving.scene_store import write_scenes
-from service.settings import Settings
+from looktwice.model.driving.images import encode_png
+from looktwice.model.driving.scene import NextFrame
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.service.settings import Settings
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import Served, serve

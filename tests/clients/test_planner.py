@@ -9,8 +9,8 @@ import httpx
 import numpy as np
 import pytest
 
-from clients import wire
-from clients.planner import (
+from looktwice.clients import wire
+from looktwice.clients.planner import (
     Access,
     AsyncPlannerClient,
     BadAnswer,
@@ -27,10 +27,10 @@ from clients.planner import (
     plan_request,
     reflect_request,
 )
-from model.driving.plan import parse_plan
-from model.engines.engine import EngineError
-from service.keys import new_line
-from service.settings import Settings
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.engines.engine import EngineError
+from looktwice.service.keys import new_line
+from looktwice.service.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import serve

@@ -6,11 +6,11 @@ from typing import Any, get_args
 import pytest
 from pydantic import ValidationError
 
-from clients import wire
-from clients.wire_values import wire_tracks
-from model.driving import plan, scene, tracks, trajectory
-from model.engines import engine
-from model.families.cf_vla import CF_VLA
+from looktwice.clients import wire
+from looktwice.clients.wire_values import wire_tracks
+from looktwice.model.driving import plan, scene, tracks, trajectory
+from looktwice.model.engines import engine
+from looktwice.model.families.cf_vla import CF_VLA
 from tests.service.serving import body
 
 

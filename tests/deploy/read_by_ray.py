@@ -12,7 +12,7 @@ import yaml
 from pydantic import ValidationError
 from ray.serve.schema import ServeDeploySchema
 
-from deploy.ray import app
+from looktwice.deploy.ray import app
 
 
 def read(path: str) -> dict[str, Any]:

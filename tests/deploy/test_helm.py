@@ -11,7 +11,7 @@ import yaml
 from jsonschema import Draft202012Validator, ValidationError
 from typer.testing import CliRunner
 
-from service.cli.commands import app
+from looktwice.service.cli.commands import app
 from tests.deploy.tools import CHART, DASHBOARD, KUBERNETES, ROOT, RULES, check_kubernetes, render
 
 EVERYTHING: dict[str, Any] = {

@@ -21,11 +21,11 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from clients import wire
-from clients.planner import PlannerClient, RetryPolicy
-from model.bundled import SCENES
-from model.driving.scene import Scene
-from model.driving.scene_store import read_scenes
+from looktwice.clients import wire
+from looktwice.clients.planner import PlannerClient, RetryPolicy
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.scene_store import read_scenes
 from tests.deploy.tools import DEPLOY, ROOT
 from tests.service.serving import body
 from tests.sockets import free_port

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import yaml
 
-import clients.wire as wire
-from service.settings import Settings
+import looktwice.clients.wire as wire
+from looktwice.service.settings import Settings
 from tests.deploy.tools import CHART, DEPLOY, render, run
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import body, serve

@@ -300,7 +300,7 @@ def _installed(clone: Path) -> None:
     (packages,) = venv.glob("lib/python*/site-packages")
     (packages / "clone.pth").write_text(f"{clone}\n{sysconfig.get_path('purelib')}\n")
     command = venv / "bin" / "looktwice"
-    command.write_text(f"#!{venv}/bin/python\nfrom service.cli import main\nmain()\n")
+    command.write_text(f"#!{venv}/bin/python\nfrom looktwice.service.cli import main\nmain()\n")
     command.chmod(0o755)
     for stage in (".created", ".torch", ".serve"):  # of the Makefile, in order
         (venv / stage).touch()

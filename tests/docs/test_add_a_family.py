@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from model.bundled import SCENES
-from model.families.registry import GROUP
+from looktwice.model.bundled import SCENES
+from looktwice.model.families.registry import GROUP
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "add-a-family.md").read_text()

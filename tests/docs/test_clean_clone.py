@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clients.importers.comma2k19 import Film
-from clients.importers.recording import RecordingError
+from looktwice.clients.importers.comma2k19 import Film
+from looktwice.clients.importers.recording import RecordingError
 from tests.comma2k19 import SEGMENT
 from tests.docs.clean_clone import (
     ACTIVATE,

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.metadrive import simulator
-from model.bundled import SCENES
-from model.driving.images import decode_image
-from model.driving.scene_store import read_scenes
-from service.settings import Settings
+from looktwice.clients.metadrive import simulator
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.images import decode_image
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, serve
 
@@ -71,7 +71,7 @@ def test_the_drive_is_imported_by_the_figures_of_its_own_camera(tmp_path: Path) 
     run("drive_folder.py", str(tmp_path / "drive"))
     page = (ROOT / "docs" / "own-cameras.md").read_text()
     (command,) = re.findall(r"^looktwice (scenes import drive .*\\\n.*)$", page, re.MULTILINE)
-    told = finished(["-m", "service.cli", *shlex.split(command.replace("\\\n", " "))], tmp_path)
+    told = finished(["-m", "looktwice.service.cli", *shlex.split(command.replace("\\\n", " "))], tmp_path)
     assert "grey" not in told
     given, imported = (
         decode_image(next(read_scenes(path, dense=False)).scene.clips[0].images[-1]).astype(float)

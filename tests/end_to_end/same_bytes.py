@@ -15,11 +15,11 @@ from typing import Any
 
 import httpx
 
-from model.bundled import CHECKPOINT
-from model.driving.scene import Scene
-from model.driving.scene_store import read_scenes
-from model.engines.torch.engine import TorchEngine
-from service.settings import Settings
+from looktwice.model.bundled import CHECKPOINT
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.engines.torch.engine import TorchEngine
+from looktwice.service.settings import Settings
 from tests.service.serving import body, serve
 
 DRAWS, FEW = 6, 3

@@ -14,20 +14,20 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients import wire
-from clients.planner import PlannerClient, PlanResult, RetryPolicy
-from model.bundled import CHECKPOINT, SCENES
-from model.driving.plan import parse_plan
-from model.driving.scene import split_of_seed
-from model.driving.scene_store import read_scenes
-from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
-from model.engines.torch.engine import TorchEngine
-from model.evaluation.open_loop import BASELINES, evaluate_baselines, evaluate_trajectories
-from model.families.cf_vla import CF_VLA
-from model.formats.cursor import CompiledFormat
-from model.formats.text import parse
-from model.network.checkpoint import read_parts
-from service.settings import Settings
+from looktwice.clients import wire
+from looktwice.clients.planner import PlannerClient, PlanResult, RetryPolicy
+from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.scene import split_of_seed
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
+from looktwice.model.engines.torch.engine import TorchEngine
+from looktwice.model.evaluation.open_loop import BASELINES, evaluate_baselines, evaluate_trajectories
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.text import parse
+from looktwice.model.network.checkpoint import read_parts
+from looktwice.service.settings import Settings
 from tests.service.serving import Served, serve
 
 BUNDLED = list(read_scenes(SCENES))
@@ -178,7 +178,7 @@ def test_metrics_count_tokens_by_section(served: Served[TorchEngine], planner: P
 
 
 def looktwice(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from service.cli import main; main()", *arguments]
+    command = [sys.executable, "-c", "from looktwice.service.cli import main; main()", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=120)
 
 
@@ -186,7 +186,7 @@ def test_the_command_prints_a_plan_and_writes_a_picture(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-c",
-        "from service.cli import main; main()",
+        "from looktwice.service.cli import main; main()",
         "plan",
         "--json",
         "--out",

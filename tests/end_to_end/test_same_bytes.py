@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import base64
 
-from model.bundled import CHECKPOINT, SCENES
-from model.driving.scene_store import read_scenes
-from model.engines.torch.engine import TorchEngine
-from service.settings import Settings
+from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.engines.torch.engine import TorchEngine
+from looktwice.service.settings import Settings
 from tests.end_to_end.same_bytes import WAYS, compare, draws_of, told_last
 from tests.service.scripted_engine import KEEP_ON
 from tests.service.serving import body, serve

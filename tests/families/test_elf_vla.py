@@ -15,37 +15,37 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-import clients.wire as wire
-from clients.planner import PlannerClient, PlannerError
-from model.driving.high_level import action_of
-from model.driving.labeller import expert_plan
-from model.driving.lane_graph import LaneGraph
-from model.driving.reasoning import thoughts_of
-from model.driving.scene import LabelledScene
-from model.driving.thoughts import Thoughts, read_thoughts
-from model.engines.engine import Controls, Draw, PlanRequest, RequestError
-from model.engines.requests import begin
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.torch.runner import PromptRequest, Runner
-from model.evaluation.open_loop import evaluate_draws
-from model.evaluation.variants import standard_variants
-from model.families.elf_vla import ELF_VLA, ELF_VLA_REFINE
-from model.families.elf_vla.format import TIMES_S, read_poses, told_poses
-from model.families.elf_vla.inputs import command_of
-from model.families.elf_vla.targets import WEIGHTS
-from model.families.family import Attempt, FamilyError, Lesson
-from model.families.registry import families_of
-from model.formats.cursor import CompiledFormat
-from model.formats.grammar_export import to_lark
-from model.formats.pieces import FormatError
-from model.formats.text import parse
-from model.network.checkpoint import Loaded, load
-from model.network.settings import VlaSettings
-from model.training.batches import Item, ResponseDataset
-from model.training.examples import Examples
-from model.training.targets import make_target
-from service.settings import Settings
+import looktwice.clients.wire as wire
+from looktwice.clients.planner import PlannerClient, PlannerError
+from looktwice.model.driving.high_level import action_of
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.lane_graph import LaneGraph
+from looktwice.model.driving.reasoning import thoughts_of
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.thoughts import Thoughts, read_thoughts
+from looktwice.model.engines.engine import Controls, Draw, PlanRequest, RequestError
+from looktwice.model.engines.requests import begin
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.engines.torch.runner import PromptRequest, Runner
+from looktwice.model.evaluation.open_loop import evaluate_draws
+from looktwice.model.evaluation.variants import standard_variants
+from looktwice.model.families.elf_vla import ELF_VLA, ELF_VLA_REFINE
+from looktwice.model.families.elf_vla.format import TIMES_S, read_poses, told_poses
+from looktwice.model.families.elf_vla.inputs import command_of
+from looktwice.model.families.elf_vla.targets import WEIGHTS
+from looktwice.model.families.family import Attempt, FamilyError, Lesson
+from looktwice.model.families.registry import families_of
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.grammar_export import to_lark
+from looktwice.model.formats.pieces import FormatError
+from looktwice.model.formats.text import parse
+from looktwice.model.network.checkpoint import Loaded, load
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.training.batches import Item, ResponseDataset
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.targets import make_target
+from looktwice.service.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.model.driving.drives import MIDDLES_S, drive, labelled_scene
 from tests.model.driving.roads import mirrored_scene

@@ -9,13 +9,13 @@ from typing import Any, Final, get_args
 import numpy as np
 import pytest
 
-import clients.wire as wire
-from clients.planner import PlanEvent, PlannerClient, PlanResult, attempt_at, plan_request
-from model.driving.phrases import ReflectionLanguage
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.families.registry import OURS, family_named
-from model.network.settings import VlaSettings
-from service.settings import Settings
+import looktwice.clients.wire as wire
+from looktwice.clients.planner import PlanEvent, PlannerClient, PlanResult, attempt_at, plan_request
+from looktwice.model.driving.phrases import ReflectionLanguage
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.families.registry import OURS, family_named
+from looktwice.model.network.settings import VlaSettings
+from looktwice.service.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.service.serving import Served, serve
 

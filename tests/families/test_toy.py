@@ -13,29 +13,29 @@ import pytest
 import torch
 from prometheus_client import CollectorRegistry
 
-import clients.wire as wire
-from clients.planner import PlannerClient, plan_request
-from model.driving.agreement import agreement
-from model.driving.labeller import expert_plan
-from model.driving.trajectory import present_speed
-from model.engines.engine import Controls, Draw, PlanRequest, SectionFinished, TextWritten
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.torch.runner import Runner
-from model.evaluation.open_loop import evaluate_draws
-from model.families.family import Lesson
-from model.formats.cursor import CompiledFormat
-from model.formats.text import parse
-from model.network.checkpoint import Loaded, load
-from model.network.settings import VlaSettings
-from model.training.batches import Item, ResponseDataset
-from model.training.examples import Examples
-from model.training.targets import make_target
-from service.metrics import Metrics
-from service.planning import Judged, SceneEvent
-from service.settings import Settings
-from service.streaming import told_events
-from service.telling import PlanTeller
+import looktwice.clients.wire as wire
+from looktwice.clients.planner import PlannerClient, plan_request
+from looktwice.model.driving.agreement import agreement
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.trajectory import present_speed
+from looktwice.model.engines.engine import Controls, Draw, PlanRequest, SectionFinished, TextWritten
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.evaluation.open_loop import evaluate_draws
+from looktwice.model.families.family import Lesson
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.text import parse
+from looktwice.model.network.checkpoint import Loaded, load
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.training.batches import Item, ResponseDataset
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.targets import make_target
+from looktwice.service.metrics import Metrics
+from looktwice.service.planning import Judged, SceneEvent
+from looktwice.service.settings import Settings
+from looktwice.service.streaming import told_events
+from looktwice.service.telling import PlanTeller
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.families.toy import TOY, drive
 from tests.model.driving.drives import MIDDLES_S, labelled_scene

@@ -12,39 +12,39 @@ import numpy as np
 import pytest
 import torch
 
-import clients.wire as wire
-from clients.answers import PlannedDraw
-from clients.planner import PlannerClient
-from model.driving.cameras import CAMERA_SPECS
-from model.driving.images import encode_png
-from model.driving.labeller import expert_plan
-from model.driving.next_view import moved_view
-from model.driving.perceived import perceived_of
-from model.driving.scene import Clip, LabelledScene, NextFrame
-from model.driving.short_term import INERTIA
-from model.engines.engine import Controls, Draw, PlanRequest, RequestError
-from model.engines.requests import begin
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.torch.expected_picture import expected_picture
-from model.engines.torch.runner import Runner
-from model.engines.torch.shortcuts import Shortcuts
-from model.evaluation.open_loop import evaluate_draws
-from model.families.cf_vla import CF_VLA
-from model.families.family import FamilyError, Lesson, NextPicture
-from model.families.picture_codes import PICTURE_CODES
-from model.families.vla_world import VLA_WORLD
-from model.families.vla_world.format import TIMES_S, UNSEEN
-from model.families.vla_world.targets import WEIGHTS
-from model.formats.cursor import CompiledFormat
-from model.formats.grammar_export import to_lark
-from model.network.checkpoint import Loaded, load, save
-from model.network.settings import VlaSettings
-from model.network.visual_codes import VisualCodes, frame_of
-from model.network.vocabulary import END_OF_TEXT, Vocabulary
-from model.training.batches import Item, ResponseDataset
-from model.training.examples import Examples
-from service.settings import Settings
+import looktwice.clients.wire as wire
+from looktwice.clients.answers import PlannedDraw
+from looktwice.clients.planner import PlannerClient
+from looktwice.model.driving.cameras import CAMERA_SPECS
+from looktwice.model.driving.images import encode_png
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.next_view import moved_view
+from looktwice.model.driving.perceived import perceived_of
+from looktwice.model.driving.scene import Clip, LabelledScene, NextFrame
+from looktwice.model.driving.short_term import INERTIA
+from looktwice.model.engines.engine import Controls, Draw, PlanRequest, RequestError
+from looktwice.model.engines.requests import begin
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.engines.torch.expected_picture import expected_picture
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.engines.torch.shortcuts import Shortcuts
+from looktwice.model.evaluation.open_loop import evaluate_draws
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.family import FamilyError, Lesson, NextPicture
+from looktwice.model.families.picture_codes import PICTURE_CODES
+from looktwice.model.families.vla_world import VLA_WORLD
+from looktwice.model.families.vla_world.format import TIMES_S, UNSEEN
+from looktwice.model.families.vla_world.targets import WEIGHTS
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.grammar_export import to_lark
+from looktwice.model.network.checkpoint import Loaded, load, save
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.visual_codes import VisualCodes, frame_of
+from looktwice.model.network.vocabulary import END_OF_TEXT, Vocabulary
+from looktwice.model.training.batches import Item, ResponseDataset
+from looktwice.model.training.examples import Examples
+from looktwice.service.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.model.driving.drives import MIDDLES_S, agent, drive, labelled_scene
 from tests.model.driving.roads import mirrored_scene

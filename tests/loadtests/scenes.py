@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from functools import cache
 
-from loadtests.mix import Mix
-from loadtests.run import Setup
-from loadtests.sending import Target
-from model.bundled import SCENES
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import read_scenes
+from looktwice.loadtests.mix import Mix
+from looktwice.loadtests.run import Setup
+from looktwice.loadtests.sending import Target
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import read_scenes
 
 
 @cache

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from loadtests.accounting import Summary, faults, summarise
-from loadtests.exchange import MISSED, Branch, Exchange, Outcome, Verdict
-from loadtests.loads import Window
-from loadtests.mix import Kind
+from looktwice.loadtests.accounting import Summary, faults, summarise
+from looktwice.loadtests.exchange import MISSED, Branch, Exchange, Outcome, Verdict
+from looktwice.loadtests.loads import Window
+from looktwice.loadtests.mix import Kind
 
 WINDOW = Window("measured", 10, 20)
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from loadtests.loads import Phase, poisson_arrivals, windows
+from looktwice.loadtests.loads import Phase, poisson_arrivals, windows
 
 PHASES = st.lists(
     st.builds(Phase, st.just("any"), st.floats(0, 20), st.floats(0, 50)), min_size=1, max_size=4

@@ -7,9 +7,9 @@ import asyncio
 import httpx
 import pytest
 
-from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
-from clients.labelling.teachers.teacher import Question, TeacherBusy, TeacherError
-from loadtests.bad_teacher import bad_teacher
+from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from looktwice.clients.labelling.teachers.teacher import Question, TeacherBusy, TeacherError
+from looktwice.loadtests.bad_teacher import bad_teacher
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from clients import wire
-from clients.wire_imagine import ImagineRequest
-from loadtests.bodies import make_call, make_calls
-from loadtests.mix import BATCH_SCENES, Kind, Mix, Payload, Work
+from looktwice.clients import wire
+from looktwice.clients.wire_imagine import ImagineRequest
+from looktwice.loadtests.bodies import make_call, make_calls
+from looktwice.loadtests.mix import BATCH_SCENES, Kind, Mix, Payload, Work
 from tests.loadtests.scenes import labelled_scenes
 from tests.loadtests.stand_in import parsed
 

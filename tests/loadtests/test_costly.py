@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from loadtests.attacks import costly_calls, never_seen
-from loadtests.bodies import make_call
-from loadtests.mix import Kind
-from loadtests.scenarios.hostile import missed_goals
-from model.driving.images import decode_image
+from looktwice.loadtests.attacks import costly_calls, never_seen
+from looktwice.loadtests.bodies import make_call
+from looktwice.loadtests.mix import Kind
+from looktwice.loadtests.scenarios.hostile import missed_goals
+from looktwice.model.driving.images import decode_image
 from tests.model.driving.drives import labelled_scene
 
 MET: dict[str, Any] = {

@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from loadtests.bodies import drive, make_drives
-from loadtests.mix import Mix
+from looktwice.loadtests.bodies import drive, make_drives
+from looktwice.loadtests.mix import Mix
 from tests.loadtests.scenes import labelled_scenes
 
 SCENE = labelled_scenes()[0].scene

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from loadtests.scenarios.sweep import KneeSearch, knee_rps
+from looktwice.loadtests.scenarios.sweep import KneeSearch, knee_rps
 
 
 def searched(search: KneeSearch, capacity_rps: float) -> dict[float, bool]:

@@ -6,7 +6,7 @@ from hdrh.histogram import HdrHistogram
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from loadtests.accounting import PERCENTILES, Latencies
+from looktwice.loadtests.accounting import PERCENTILES, Latencies
 
 
 @settings(deadline=None, max_examples=30)

@@ -11,11 +11,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from loadtests.accounting import Summary, summarise
-from loadtests.bodies import make_calls
-from loadtests.loads import Fleet, OpenLoop, Phase, Planner, Window, poisson_arrivals, run_load
-from loadtests.mix import Mix
-from loadtests.sending import Target
+from looktwice.loadtests.accounting import Summary, summarise
+from looktwice.loadtests.bodies import make_calls
+from looktwice.loadtests.loads import Fleet, OpenLoop, Phase, Planner, Window, poisson_arrivals, run_load
+from looktwice.loadtests.mix import Mix
+from looktwice.loadtests.sending import Target
 from tests.loadtests.scenes import labelled_scenes
 from tests.loadtests.stand_in import StandIn, standing_in
 from tests.waiting import until
@@ -86,7 +86,7 @@ def test_a_generator_that_is_killed_sends_no_more() -> None:
     service = StandIn()
     asks = ["loadtest", "--rate", "20", "--seconds", "300", "--distinct", "4", "--service"]
     with standing_in(service) as url:
-        generator = subprocess.Popen([sys.executable, "-m", "service.cli", *asks, url])
+        generator = subprocess.Popen([sys.executable, "-m", "looktwice.service.cli", *asks, url])
         try:
             until(lambda: len(service.seen) > 5, 60)
         finally:

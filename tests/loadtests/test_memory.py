@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from loadtests.memory import Reading, growth
+from looktwice.loadtests.memory import Reading, growth
 
 
 def test_growth_is_the_slope_of_what_was_read() -> None:

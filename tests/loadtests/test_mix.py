@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 
-from loadtests.mix import Kind, Mix, parse_mix, parse_weights
+from looktwice.loadtests.mix import Kind, Mix, parse_mix, parse_weights
 
 
 def test_choices_occur_as_often_as_they_weigh() -> None:

@@ -3,11 +3,11 @@ from __future__ import annotations
 import httpx
 import pytest
 
-from loadtests.overhead import NoAnswer, measure
-from model.bundled import SCENES
-from model.driving.scene_store import read_scenes
-from model.engines.engine import EngineError
-from service.settings import Settings
+from looktwice.loadtests.overhead import NoAnswer, measure
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.engines.engine import EngineError
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from loadtests.exchange import BAD_ANSWER, Verdict, read_answer
-from loadtests.mix import Kind
+from looktwice.loadtests.exchange import BAD_ANSWER, Verdict, read_answer
+from looktwice.loadtests.mix import Kind
 
 
 def read(kind: Kind, status: int, content: Any) -> Verdict:

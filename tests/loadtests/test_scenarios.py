@@ -9,14 +9,14 @@ from html.parser import HTMLParser
 
 import pytest
 
-from loadtests.attacks import Hostility
-from loadtests.mix import Mix
-from loadtests.page import page
-from loadtests.report import Report
-from loadtests.run import Result, Setup
-from loadtests.scenarios.hostile import hostile
-from loadtests.scenarios.steady import burst, fleet, poisson, soak
-from loadtests.scenarios.sweep import KneeSearch, sweep
+from looktwice.loadtests.attacks import Hostility
+from looktwice.loadtests.mix import Mix
+from looktwice.loadtests.page import page
+from looktwice.loadtests.report import Report
+from looktwice.loadtests.run import Result, Setup
+from looktwice.loadtests.scenarios.hostile import hostile
+from looktwice.loadtests.scenarios.steady import burst, fleet, poisson, soak
+from looktwice.loadtests.scenarios.sweep import KneeSearch, sweep
 from tests.loadtests.scenes import setup
 from tests.loadtests.stand_in import StandIn, standing_in
 

@@ -7,10 +7,10 @@ import time
 
 import pytest
 
-from loadtests.bodies import make_call
-from loadtests.exchange import Exchange
-from loadtests.mix import BATCH_SCENES, Kind
-from loadtests.sending import Sender, Target, connected
+from looktwice.loadtests.bodies import make_call
+from looktwice.loadtests.exchange import Exchange
+from looktwice.loadtests.mix import BATCH_SCENES, Kind
+from looktwice.loadtests.sending import Sender, Target, connected
 from tests.loadtests.scenes import labelled_scenes
 from tests.loadtests.stand_in import StandIn, standing_in
 from tests.sockets import free_port

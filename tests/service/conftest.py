@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from model.driving.scene_store import write_scenes
-from service.settings import Settings
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.service.settings import Settings
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, serve

@@ -6,9 +6,9 @@ import json
 import tempfile
 from pathlib import Path
 
-from service.app import create_app
-from service.keys import new_line
-from service.settings import Settings
+from looktwice.service.app import create_app
+from looktwice.service.keys import new_line
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 
 

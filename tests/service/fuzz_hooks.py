@@ -11,12 +11,12 @@ import msgpack
 import schemathesis
 from pydantic import ValidationError
 
-import clients.wire as wire
-from clients.wire_feedback import FeedbackRequest
-from clients.wire_refine import RefineRequest
-from clients.wire_scores import ScoreRequest
-from service.examples import example_feedback, example_refinement, example_score
-from service.openai_chat import ChatRequest
+import looktwice.clients.wire as wire
+from looktwice.clients.wire_feedback import FeedbackRequest
+from looktwice.clients.wire_refine import RefineRequest
+from looktwice.clients.wire_scores import ScoreRequest
+from looktwice.service.examples import example_feedback, example_refinement, example_score
+from looktwice.service.openai_chat import ChatRequest
 from tests.service.serving import body
 
 REAL = body()["scene"]

@@ -12,8 +12,8 @@ from typing import Any
 
 import schemathesis
 
-from model.driving.scene import FRONT_WIDE
-from service.examples import example_score
+from looktwice.model.driving.scene import FRONT_WIDE
+from looktwice.service.examples import example_score
 from tests.service import fuzz_hooks
 from tests.service.fuzz_hooks import ATTEMPT, DRAFT, PICTURES, REAL
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN

@@ -7,7 +7,7 @@ import io
 import numpy as np
 from PIL import Image, ImageDraw
 
-from model.driving.scene import (
+from looktwice.model.driving.scene import (
     CLIP_FRAMES,
     FRONT_TELE,
     FRONT_WIDE,
@@ -17,7 +17,7 @@ from model.driving.scene import (
     LabelledScene,
     Scene,
 )
-from model.driving.trajectory import FloatArray
+from looktwice.model.driving.trajectory import FloatArray
 
 SPEED_MPS = 12.0
 

@@ -11,10 +11,17 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.perceived import Perceived, PerceivedAgent
-from model.driving.plan import GROUPS, Plan, parse_plan
-from model.driving.trajectory import FUTURE_STEPS, STEP_S, TEN_HZ_S, FloatArray, at_times, present_speed
-from model.engines.engine import (
+from looktwice.model.driving.perceived import Perceived, PerceivedAgent
+from looktwice.model.driving.plan import GROUPS, Plan, parse_plan
+from looktwice.model.driving.trajectory import (
+    FUTURE_STEPS,
+    STEP_S,
+    TEN_HZ_S,
+    FloatArray,
+    at_times,
+    present_speed,
+)
+from looktwice.model.engines.engine import (
     CodesWritten,
     Cut,
     DraftFinished,
@@ -29,9 +36,9 @@ from model.engines.engine import (
     Started,
     TextWritten,
 )
-from model.families.family import Foreseen, NextPicture
-from model.formats.pieces import Value
-from model.network.model_card import ModelCard
+from looktwice.model.families.family import Foreseen, NextPicture
+from looktwice.model.formats.pieces import Value
+from looktwice.model.network.model_card import ModelCard
 
 CARD: Final = ModelCard(
     name="scripted",
@@ -59,7 +66,7 @@ _LANE_SHIFT_M: Final = {"Left Lane Change": 3.5, "Right Lane Change": -3.5}
 
 
 class ScriptedEngine:
-    """`model.engines.engine.Engine` by rule.
+    """`looktwice.model.engines.engine.Engine` by rule.
 
     Attributes:
         failure: raised at the first iteration of every request.

@@ -16,13 +16,13 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
 from typing_extensions import TypeVar
 
-from clients.labelling.teachers.rules import RuleTeacher
-from clients.labelling.teachers.teacher import Teacher
-from model.driving.scene import Scene
-from model.engines.engine import Engine
-from service.app import create_app
-from service.server import make_server
-from service.settings import Settings
+from looktwice.clients.labelling.teachers.rules import RuleTeacher
+from looktwice.clients.labelling.teachers.teacher import Teacher
+from looktwice.model.driving.scene import Scene
+from looktwice.model.engines.engine import Engine
+from looktwice.service.app import create_app
+from looktwice.service.server import make_server
+from looktwice.service.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
 from tests.sockets import PATIENCE_S, listening

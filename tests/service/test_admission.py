@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.admission import PATIENCE_S, Admission, Full, whole_seconds
+from looktwice.service.admission import PATIENCE_S, Admission, Full, whole_seconds
 
 
 @dataclass

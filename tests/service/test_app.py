@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from model.engines.engine import EngineError
-from service.settings import Settings
+from looktwice.model.engines.engine import EngineError
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem

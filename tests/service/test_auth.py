@@ -7,8 +7,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.keys import Keys, hashed, new_line
-from service.settings import Settings
+from looktwice.service.keys import Keys, hashed, new_line
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem

@@ -6,10 +6,10 @@ from typing import Any
 import httpx
 import pytest
 
-import clients.wire as wire
-from model.engines.engine import EngineError
-from service.planning import Arrival, Planning
-from service.settings import Settings
+import looktwice.clients.wire as wire
+from looktwice.model.engines.engine import EngineError
+from looktwice.service.planning import Arrival, Planning
+from looktwice.service.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body

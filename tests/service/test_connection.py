@@ -12,8 +12,8 @@ import pytest
 import uvicorn
 from starlette.types import Receive, Scope, Send
 
-from service.connection import guarded_connection
-from service.settings import Settings
+from looktwice.service.connection import guarded_connection
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.sockets import listening

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from clients.wire import MSGPACK_MEDIA_TYPE, Problem
-from service.documents import MAX_MEMBERS, MAX_OBJECTS, MAX_VALUES, read_json, read_msgpack
-from service.problems import ProblemError
+from looktwice.clients.wire import MSGPACK_MEDIA_TYPE, Problem
+from looktwice.service.documents import MAX_MEMBERS, MAX_OBJECTS, MAX_VALUES, read_json, read_msgpack
+from looktwice.service.problems import ProblemError
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body
 from tests.service.test_errors import problem

@@ -14,9 +14,9 @@ import httpx
 import numpy as np
 import pytest
 
-from clients.wire import Problem
-from service.problems import KINDS, TYPE_BASE
-from service.settings import Settings
+from looktwice.clients.wire import Problem
+from looktwice.service.problems import KINDS, TYPE_BASE
+from looktwice.service.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve

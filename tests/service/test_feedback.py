@@ -13,13 +13,13 @@ import httpx
 import msgpack
 import pytest
 
-from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
-from clients.planner import AsyncPlannerClient, PlannerClient, RequestRefused
-from clients.wire_feedback import FeedbackRequest, FeedbackResponse
-from model.driving.pdm.feedback import Feedback, RuleFeedback, parse_feedback
-from service.examples import example_feedback, example_score
-from service.no_model import NoModel
-from service.settings import Settings
+from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from looktwice.clients.planner import AsyncPlannerClient, PlannerClient, RequestRefused
+from looktwice.clients.wire_feedback import FeedbackRequest, FeedbackResponse
+from looktwice.model.driving.pdm.feedback import Feedback, RuleFeedback, parse_feedback
+from looktwice.service.examples import example_feedback, example_score
+from looktwice.service.no_model import NoModel
+from looktwice.service.settings import Settings
 from tests.clients.labelling.builds import ChatServer
 from tests.service.serving import Served, serve
 from tests.service.test_errors import problem

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from model.driving.scene import FRONT_WIDE
-from service.keys import new_line
-from service.settings import Settings
+from looktwice.model.driving.scene import FRONT_WIDE
+from looktwice.service.keys import new_line
+from looktwice.service.settings import Settings
 from tests.service.fuzz_hooks import IMAGINES, REFINES
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve

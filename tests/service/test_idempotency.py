@@ -7,9 +7,9 @@ import httpx
 import pytest
 from starlette.responses import Response
 
-from model.engines.engine import EngineError
-from service.idempotency import Idempotency
-from service.settings import Settings
+from looktwice.model.engines.engine import EngineError
+from looktwice.service.idempotency import Idempotency
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import KEEP_ON, ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem

@@ -17,20 +17,26 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import clients.wire as wire
-from clients.planner import AsyncPlannerClient, PlannerClient, RequestRefused, ServiceBusy, imagine_request
-from clients.streams import ImagineEvent
-from clients.wire_imagine import CodesWritten, ImagineControls, ImagineRequest, ImagineResponse
-from model.driving.scene import CAMERAS
-from model.engines.engine import EngineError
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.torch.shortcuts import Shortcuts
-from model.network.checkpoint import load, save
-from model.network.settings import VlaSettings
-from model.network.visual_codes import VisualCodes, load_visual_codes
-from service.examples import example_imagining
-from service.no_model import NoModel
-from service.settings import Settings
+import looktwice.clients.wire as wire
+from looktwice.clients.planner import (
+    AsyncPlannerClient,
+    PlannerClient,
+    RequestRefused,
+    ServiceBusy,
+    imagine_request,
+)
+from looktwice.clients.streams import ImagineEvent
+from looktwice.clients.wire_imagine import CodesWritten, ImagineControls, ImagineRequest, ImagineResponse
+from looktwice.model.driving.scene import CAMERAS
+from looktwice.model.engines.engine import EngineError
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.engines.torch.shortcuts import Shortcuts
+from looktwice.model.network.checkpoint import load, save
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.visual_codes import VisualCodes, load_visual_codes
+from looktwice.service.examples import example_imagining
+from looktwice.service.no_model import NoModel
+from looktwice.service.settings import Settings
 from tests.checkpoints import write_untrained
 from tests.service.scenes import scene
 from tests.service.scripted_engine import CARD, ScriptedEngine

@@ -12,12 +12,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from model.driving.scene import NextFrame
-from model.driving.scene_store import write_scenes
-from service import inspector_scenes, scene_files
-from service.inspector_scenes import BundledScenes, scenes_of_file, view
-from service.problems import ProblemError
-from service.settings import Settings
+from looktwice.model.driving.scene import NextFrame
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.service import inspector_scenes, scene_files
+from looktwice.service.inspector_scenes import BundledScenes, scenes_of_file, view
+from looktwice.service.problems import ProblemError
+from looktwice.service.settings import Settings
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, serve

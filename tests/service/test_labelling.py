@@ -5,12 +5,12 @@ from typing import Any
 
 import pytest
 
-from clients.labelling.checks import FailedCheck, check_reflection
-from clients.labelling.teachers.teacher import Answer, Question, TeacherClosed, TeacherError
-from clients.wire import LabelResponse
-from model.driving.outcome import in_words
-from model.driving.plan import parse_plan
-from service.settings import Settings
+from looktwice.clients.labelling.checks import FailedCheck, check_reflection
+from looktwice.clients.labelling.teachers.teacher import Answer, Question, TeacherClosed, TeacherError
+from looktwice.clients.wire import LabelResponse
+from looktwice.model.driving.outcome import in_words
+from looktwice.model.driving.plan import parse_plan
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem

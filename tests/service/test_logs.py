@@ -7,7 +7,7 @@ import sys
 import pytest
 import structlog
 
-from service.logs import configure_logging, lines_lost
+from looktwice.service.logs import configure_logging, lines_lost
 
 
 def fail() -> None:

@@ -3,7 +3,7 @@ from __future__ import annotations
 from prometheus_client.openmetrics import parser as openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.metrics import LATENCY_BUCKETS_S
+from looktwice.service.metrics import LATENCY_BUCKETS_S
 from tests.service.serving import Served, body
 
 

@@ -14,14 +14,14 @@ import openai
 import pytest
 from openai.types.chat import ChatCompletionContentPartParam, ChatCompletionMessageParam
 
-from clients.wire_values import wire_tracks
-from model.bundled import CHECKPOINT
-from model.driving.scene import Scene
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.network.checkpoint import read_parts
-from service.keys import new_line
-from service.problems import INVALID_IMAGE, at
-from service.settings import Settings
+from looktwice.clients.wire_values import wire_tracks
+from looktwice.model.bundled import CHECKPOINT
+from looktwice.model.driving.scene import Scene
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.network.checkpoint import read_parts
+from looktwice.service.keys import new_line
+from looktwice.service.problems import INVALID_IMAGE, at
+from looktwice.service.settings import Settings
 from tests.checkpoints import made_up_tracks, noisy_scene
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from clients.wire import PlanRequest
-from service.app import create_app
-from service.auth import OPEN_PATHS
-from service.settings import Settings
+from looktwice.clients.wire import PlanRequest
+from looktwice.service.app import create_app
+from looktwice.service.auth import OPEN_PATHS
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served
 

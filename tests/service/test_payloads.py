@@ -8,9 +8,9 @@ from typing import Any
 import msgpack
 import pytest
 
-from clients.wire import MSGPACK_MEDIA_TYPE, PlanResponse
-from service import payloads
-from service.body_limit import LARGE_BYTES
+from looktwice.clients.wire import MSGPACK_MEDIA_TYPE, PlanResponse
+from looktwice.service import payloads
+from looktwice.service.body_limit import LARGE_BYTES
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body

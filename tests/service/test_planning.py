@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import clients.wire as wire
-from clients.planner import PlannerClient, PlanResult, plan_request
-from clients.wire import PlanResponse
-from model.driving.images import ImageError
-from model.driving.plan import parse_plan
-from model.driving.scene import SceneError
-from model.driving.trajectory import TEN_HZ_S
-from model.engines.engine import EngineError, RequestError
+import looktwice.clients.wire as wire
+from looktwice.clients.planner import PlannerClient, PlanResult, plan_request
+from looktwice.clients.wire import PlanResponse
+from looktwice.model.driving.images import ImageError
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.scene import SceneError
+from looktwice.model.driving.trajectory import TEN_HZ_S
+from looktwice.model.engines.engine import EngineError, RequestError
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body

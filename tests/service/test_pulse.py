@@ -11,9 +11,9 @@ from typing import Any
 import httpx
 import pytest
 
-from model.engines.engine import Load
-from service.documents import read_json
-from service.settings import Settings
+from looktwice.model.engines.engine import Load
+from looktwice.service.documents import read_json
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import body, serve
 from tests.service.test_errors import problem
@@ -82,7 +82,7 @@ def test_a_large_body_that_is_read_without_end_makes_it_not_ready(
         assert go_on.wait(30)
         return read_json(content)
 
-    monkeypatch.setattr("service.payloads.read_json", slow)
+    monkeypatch.setattr("looktwice.service.payloads.read_json", slow)
     large = json.dumps(body() | {"x": "y" * 2_000_000}).encode()
     answers: list[int] = []
     with serve(engine, Settings(stall_s=0.5)) as served:

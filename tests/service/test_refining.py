@@ -15,22 +15,22 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-import clients.wire as wire
-from clients.planner import (
+import looktwice.clients.wire as wire
+from looktwice.clients.planner import (
     AsyncPlannerClient,
     PlannerClient,
     RequestRefused,
     attempt_at,
     refine_request,
 )
-from clients.wire_refine import DraftJudged, RefineRequest, RefineResponse, SectionsGiven
-from model.driving.pdm.feedback import Feedback, parse_feedback
-from model.driving.scene import Track
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.network.settings import VlaSettings
-from service.examples import example_refinement
-from service.no_model import NoModel
-from service.settings import Settings
+from looktwice.clients.wire_refine import DraftJudged, RefineRequest, RefineResponse, SectionsGiven
+from looktwice.model.driving.pdm.feedback import Feedback, parse_feedback
+from looktwice.model.driving.scene import Track
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.network.settings import VlaSettings
+from looktwice.service.examples import example_refinement
+from looktwice.service.no_model import NoModel
+from looktwice.service.settings import Settings
 from tests.checkpoints import write_untrained
 from tests.service.scenes import scene
 from tests.service.scripted_engine import CARD, ScriptedEngine

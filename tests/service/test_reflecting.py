@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from clients.wire import ReflectResponse
-from model.driving.plan import parse_plan
+from looktwice.clients.wire import ReflectResponse
+from looktwice.model.driving.plan import parse_plan
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body
 from tests.service.test_errors import problem

@@ -12,11 +12,11 @@ import msgpack
 import psutil
 import pytest
 
-from clients.planner import PlannerClient
-from clients.wire_scores import ScoreRequest
-from service.examples import example_score
-from service.no_model import NoModel
-from service.settings import Settings
+from looktwice.clients.planner import PlannerClient
+from looktwice.clients.wire_scores import ScoreRequest
+from looktwice.service.examples import example_score
+from looktwice.service.no_model import NoModel
+from looktwice.service.settings import Settings
 from tests.service.serving import Served, body, serve
 from tests.service.test_errors import problem
 from tests.waiting import until
@@ -208,5 +208,7 @@ def test_who_leaves_ends_the_scoring(scorer: Served[NoModel]) -> None:
         with pytest.raises(httpx.ReadTimeout):
             scorer.http.post("/v1/score", json=long, timeout=httpx.Timeout(30.0, read=0.02))
     assert len(scorer.http.post("/v1/score", json=asked()).json()["scores"]) == 2
-    scoring = [each for each in psutil.Process().children() if "service.scorer" in " ".join(each.cmdline())]
+    scoring = [
+        each for each in psutil.Process().children() if "looktwice.service.scorer" in " ".join(each.cmdline())
+    ]
     assert len(scoring) == 1

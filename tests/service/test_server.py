@@ -23,19 +23,19 @@ from typing import IO
 import httpx
 import pytest
 
-from clients.labelling.checks import FailedCheck
-from clients.labelling.teachers.teacher import Answer, Question
-from loadtests.attacks import costly_calls, never_seen, scans
-from loadtests.bodies import make_call
-from loadtests.mix import Kind
-from model.bundled import CHECKPOINT
-from model.driving.images import decode_image
-from model.engines.engine import EngineError
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from service.app import create_app
-from service.keys import new_line
-from service.server import check_who_may_ask, make_server
-from service.settings import Settings
+from looktwice.clients.labelling.checks import FailedCheck
+from looktwice.clients.labelling.teachers.teacher import Answer, Question
+from looktwice.loadtests.attacks import costly_calls, never_seen, scans
+from looktwice.loadtests.bodies import make_call
+from looktwice.loadtests.mix import Kind
+from looktwice.model.bundled import CHECKPOINT
+from looktwice.model.driving.images import decode_image
+from looktwice.model.engines.engine import EngineError
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.service.app import create_app
+from looktwice.service.keys import new_line
+from looktwice.service.server import check_who_may_ask, make_server
+from looktwice.service.settings import Settings
 from tests.checkpoints import noisy_scene
 from tests.model.driving.drives import labelled_scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
@@ -71,7 +71,7 @@ def process(
     """`looktwice serve` with the bundled checkpoint, ready; ``settings`` by their variables' names."""
     port = free_port()
     started = subprocess.Popen(
-        [sys.executable, "-m", "service.cli", "serve", "--port", str(port)],
+        [sys.executable, "-m", "looktwice.service.cli", "serve", "--port", str(port)],
         env=os.environ | {"LOOKTWICE_DRAIN_NOTICE_S": "3", "LOOKTWICE_MAX_DRAWS": "24"} | settings,
         stderr=stderr,
         text=True,
@@ -210,7 +210,7 @@ def test_draining_finishes_batches_and_labels(engine: ScriptedEngine) -> None:
 def test_what_is_cut_off_at_the_end_of_a_drain_is_told_to_ask_elsewhere(
     engine: ScriptedEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.server._LAST_WORDS_S", 0.2)
+    monkeypatch.setattr("looktwice.service.server._LAST_WORDS_S", 0.2)
     settings = Settings(drain_notice_s=0.0)
     app = create_app(engine, settings)
     server = make_server(app, settings)
@@ -228,7 +228,7 @@ def test_what_is_cut_off_at_the_end_of_a_drain_is_told_to_ask_elsewhere(
 
 def test_a_drain_ends_although_an_engine_never_finishes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody sets ``may_finish``: only the end of the drain can end the request, the engine, and the rest."""
-    monkeypatch.setattr("service.server._LAST_WORDS_S", 0.2)
+    monkeypatch.setattr("looktwice.service.server._LAST_WORDS_S", 0.2)
     ended: list[str] = []
 
     class StuckEngine(ScriptedEngine):
@@ -406,13 +406,15 @@ def test_only_operators_replace_the_checkpoint(engine: ScriptedEngine, tmp_path:
 
 def test_keys_are_made_on_the_command_line() -> None:
     made = subprocess.run(
-        [sys.executable, "-m", "service.cli", "keys", "new", "car-7"], capture_output=True, text=True
+        [sys.executable, "-m", "looktwice.service.cli", "keys", "new", "car-7"],
+        capture_output=True,
+        text=True,
     )
     key, line = (text.split(": ", 1)[1].strip() for text in made.stdout.splitlines())
     assert re.fullmatch(r"car-7:[0-9a-f]{64}", line)
     assert key.startswith("lt_")
     strange = subprocess.run(
-        [sys.executable, "-m", "service.cli", "keys", "new", "a b"], capture_output=True, text=True
+        [sys.executable, "-m", "looktwice.service.cli", "keys", "new", "a b"], capture_output=True, text=True
     )
     assert strange.returncode == 2
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from clients.labelling.teachers.feedback import FeedbackQuestion
-from clients.labelling.teachers.openai import OpenAiTeacher
-from clients.labelling.teachers.teacher import Question
-from clients.wire import Controls
-from service.settings import Settings, TeacherSettings
+from looktwice.clients.labelling.teachers.feedback import FeedbackQuestion
+from looktwice.clients.labelling.teachers.openai import OpenAiTeacher
+from looktwice.clients.labelling.teachers.teacher import Question
+from looktwice.clients.wire import Controls
+from looktwice.service.settings import Settings, TeacherSettings
 from tests.clients.labelling.builds import GOOD, ChatServer
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN

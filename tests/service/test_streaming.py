@@ -7,8 +7,8 @@ from typing import Any
 import httpx
 import pytest
 
-import clients.wire as wire
-from model.engines.engine import EngineError
+import looktwice.clients.wire as wire
+from looktwice.model.engines.engine import EngineError
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body
 from tests.service.test_errors import problem

@@ -13,10 +13,10 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from opentelemetry.sdk.trace import TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 
-from model.engines.engine import EngineError
-from service.app import create_app
-from service.settings import Settings
-from service.traces import Traces, traces_from_environment
+from looktwice.model.engines.engine import EngineError
+from looktwice.service.app import create_app
+from looktwice.service.settings import Settings
+from looktwice.service.traces import Traces, traces_from_environment
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body
 from tests.sockets import listening

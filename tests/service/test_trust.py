@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.settings import Settings
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.service.test_server import process

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clients import wire
-from service.problems import INVALID_ATTEMPT, INVALID_TRACKS, ProblemError
-from service.validation import MAX_STEP_CHANGE_M, engine_request, geometry_of
+from looktwice.clients import wire
+from looktwice.service.problems import INVALID_ATTEMPT, INVALID_TRACKS, ProblemError
+from looktwice.service.validation import MAX_STEP_CHANGE_M, engine_request, geometry_of
 from tests.service.scripted_engine import CARD
 from tests.service.serving import body
 

@@ -1,7 +1,7 @@
 """Reflections in phrases from a vision-language teacher: it fills in fields, and the words are ours.
 
 What it may answer is a JSON schema, which most endpoints can be held to; its facts become a reflection in
-phrases (`model.driving.phrases`), so that checks read fields and no English.
+phrases (`looktwice.model.driving.phrases`), so that checks read fields and no English.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from model.driving.phrases import (
+from looktwice.model.driving.phrases import (
     FARTHEST_M,
     HEADS,
     STEP_M,

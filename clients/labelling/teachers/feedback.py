@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol, runtime_checkable
 
-from clients.labelling.checks import FailedCheck
-from clients.labelling.teachers.teacher import ATTEMPTS, Answer, ReflectionRefused
-from model.driving.pdm.failures import Fact
-from model.driving.pdm.feedback import BEGIN, END, SECTIONS, Feedback, FeedbackError, parse_feedback
-from model.driving.pdm.judged import JudgedPlan, Number, Waypoint, called, foreign_numbers, numbers
-from model.driving.pdm.rule_teacher import SHORT
-from model.driving.pdm.scoring import FACTORS, WEIGHTS
+from looktwice.clients.labelling.checks import FailedCheck
+from looktwice.clients.labelling.teachers.teacher import ATTEMPTS, Answer, ReflectionRefused
+from looktwice.model.driving.pdm.failures import Fact
+from looktwice.model.driving.pdm.feedback import BEGIN, END, SECTIONS, Feedback, FeedbackError, parse_feedback
+from looktwice.model.driving.pdm.judged import JudgedPlan, Number, Waypoint, called, foreign_numbers, numbers
+from looktwice.model.driving.pdm.rule_teacher import SHORT
+from looktwice.model.driving.pdm.scoring import FACTORS, WEIGHTS
 
 FEEDBACK_PROMPT_VERSION: Final = 1
 """Raised with every change of wording: other words, other answers."""
@@ -81,7 +81,8 @@ class FeedbackTeacher(Protocol):
         """Five sections; ``complaints`` say what was wrong with earlier ones.
 
         Raises:
-            TeacherError: it cannot answer; see `clients.labelling.teachers.teacher.Teacher.reflect`.
+            TeacherError: it cannot answer; see
+                `looktwice.clients.labelling.teachers.teacher.Teacher.reflect`.
         """
         ...
 

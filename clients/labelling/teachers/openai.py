@@ -11,24 +11,24 @@ from typing import Any, Final
 import httpx
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from clients.answers import retry_after_s
-from clients.labelling.checks import FailedCheck
-from clients.labelling.teachers.facts import RESPONSE_FORMAT, phrases_of
-from clients.labelling.teachers.feedback import (
+from looktwice.clients.answers import retry_after_s
+from looktwice.clients.labelling.checks import FailedCheck
+from looktwice.clients.labelling.teachers.facts import RESPONSE_FORMAT, phrases_of
+from looktwice.clients.labelling.teachers.feedback import (
     FEEDBACK_PROMPT_VERSION,
     FEEDBACK_SYSTEM,
     FeedbackQuestion,
 )
-from clients.labelling.teachers.prompt import PROMPT_VERSION, SYSTEM, Part, Text, user_message
-from clients.labelling.teachers.teacher import (
+from looktwice.clients.labelling.teachers.prompt import PROMPT_VERSION, SYSTEM, Part, Text, user_message
+from looktwice.clients.labelling.teachers.teacher import (
     Answer,
     Question,
     TeacherBusy,
     TeacherClosed,
     TeacherError,
 )
-from model.driving.images import media_type
-from model.driving.phrases import PhraseError, ReflectionLanguage
+from looktwice.model.driving.images import media_type
+from looktwice.model.driving.phrases import PhraseError, ReflectionLanguage
 
 _BUSY: Final = (408, 409, 425, 429, 500, 502, 503, 504, 529)
 _CLOSED: Final = (401, 402, 403, 404, 405)
@@ -94,7 +94,8 @@ class _Completion(BaseModel):
 
 
 class OpenAiTeacher:
-    """`clients.labelling.teachers.teacher.Teacher` over HTTP; asks once, others decide on asking again."""
+    """`looktwice.clients.labelling.teachers.teacher.Teacher` over HTTP; asks once, others decide on asking
+    again."""
 
     def __init__(self, settings: OpenAiSettings) -> None:
         self._settings = settings

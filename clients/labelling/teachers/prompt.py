@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, get_args
 
-from clients.labelling.checks import MOST_WORDS, FailedCheck
-from clients.labelling.teachers.facts import TABLE
-from clients.labelling.teachers.teacher import Question
-from model.driving.outcome import in_words
-from model.driving.phrases import FARTHEST_M, ReflectionLanguage, Spot
-from model.driving.plan import WORDS
-from model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE, Clip
+from looktwice.clients.labelling.checks import MOST_WORDS, FailedCheck
+from looktwice.clients.labelling.teachers.facts import TABLE
+from looktwice.clients.labelling.teachers.teacher import Question
+from looktwice.model.driving.outcome import in_words
+from looktwice.model.driving.phrases import FARTHEST_M, ReflectionLanguage, Spot
+from looktwice.model.driving.plan import WORDS
+from looktwice.model.driving.scene import CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE, Clip
 
 PROMPT_VERSION: Final = 2
 """Raised with every change of wording: other words, other answers."""

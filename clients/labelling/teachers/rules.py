@@ -1,9 +1,9 @@
 """The built-in teacher: says what is wrong with a plan from a scene's annotations, as far as cameras show it.
 
 It knows which plan is better and uses that to choose what to talk about; what it says is in the view of the
-front cameras (`model.driving.view`), or about the plan itself. Its reflections are facts in phrases
-(`model.driving.phrases`): one statement for each track that is to change and for whose change something is to
-be seen.
+front cameras (`looktwice.model.driving.view`), or about the plan itself. Its reflections are facts in phrases
+(`looktwice.model.driving.phrases`): one statement for each track that is to change and for whose change
+something is to be seen.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from clients.labelling.checks import FailedCheck
-from clients.labelling.teachers.teacher import AnnotationsMissing, Answer, NothingInView, Question
-from model.driving.direction import Change, wanted_changes
-from model.driving.phrases import Facts, Statement
-from model.driving.plan import TICKS, Plan
-from model.driving.reasons import reason
-from model.driving.view import View, view_of
+from looktwice.clients.labelling.checks import FailedCheck
+from looktwice.clients.labelling.teachers.teacher import AnnotationsMissing, Answer, NothingInView, Question
+from looktwice.model.driving.direction import Change, wanted_changes
+from looktwice.model.driving.phrases import Facts, Statement
+from looktwice.model.driving.plan import TICKS, Plan
+from looktwice.model.driving.reasons import reason
+from looktwice.model.driving.view import View, view_of
 
 
 class RuleTeacher:
-    """`clients.labelling.teachers.teacher.Teacher` by rule; nothing is asked of anybody."""
+    """`looktwice.clients.labelling.teachers.teacher.Teacher` by rule; nothing is asked of anybody."""
 
     name: Final = "rules"
     revision: Final = "6"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Self
 
-from clients.answers import BadAnswer, PlannerError, PlannerProblem, PlannerUnreachable, ServiceBusy
-from clients.labelling.checks import FailedCheck
-from clients.labelling.teachers.teacher import (
+from looktwice.clients.answers import BadAnswer, PlannerError, PlannerProblem, PlannerUnreachable, ServiceBusy
+from looktwice.clients.labelling.checks import FailedCheck
+from looktwice.clients.labelling.teachers.teacher import (
     Answer,
     NothingInView,
     Question,
@@ -15,8 +15,8 @@ from clients.labelling.teachers.teacher import (
     TeacherClosed,
     TeacherError,
 )
-from clients.planner import Access, AsyncPlannerClient, RetryPolicy
-from clients.wire import MAX_SEED, TeacherName
+from looktwice.clients.planner import Access, AsyncPlannerClient, RetryPolicy
+from looktwice.clients.wire import MAX_SEED, TeacherName
 
 RETRY_POLICY = RetryPolicy(timeout_s=120.0, attempts=1)
 """Who waits how long is the asker's to say."""
@@ -24,7 +24,7 @@ LABEL_REFUSED, NOTHING_IN_VIEW = "label-refused", "nothing-in-view"
 
 
 class ServiceTeacher:
-    """`clients.labelling.teachers.teacher.Teacher` over HTTP. Make one with `connect`."""
+    """`looktwice.clients.labelling.teachers.teacher.Teacher` over HTTP. Make one with `connect`."""
 
     def __init__(self, planner: AsyncPlannerClient, teacher: TeacherName) -> None:
         self._planner, self._teacher = planner, teacher

@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
-from clients.labelling.checks import FailedCheck, check_reflection
-from clients.labelling.retries import TryLater
-from model.driving.outcome import Outcome
-from model.driving.plan import Plan
-from model.driving.scene import Scene
-from model.driving.view import Surroundings
+from looktwice.clients.labelling.checks import FailedCheck, check_reflection
+from looktwice.clients.labelling.retries import TryLater
+from looktwice.model.driving.outcome import Outcome
+from looktwice.model.driving.plan import Plan
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.view import Surroundings
 
 ATTEMPTS: Final = 3
 

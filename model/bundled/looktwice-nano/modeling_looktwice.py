@@ -1,6 +1,6 @@
 """The network of this checkpoint, from the package `looktwice`, which has to be installed."""
 
-from model.network.vla import LookTwiceVla as _LookTwiceVla
+from looktwice.model.network.vla import LookTwiceVla as _LookTwiceVla
 
 
 class LookTwiceVla(_LookTwiceVla):

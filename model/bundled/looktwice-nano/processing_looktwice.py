@@ -1,6 +1,6 @@
 """The processor of this checkpoint, from the package `looktwice`, which has to be installed."""
 
-from model.network.processor import LookTwiceProcessor as _LookTwiceProcessor
+from looktwice.model.network.processor import LookTwiceProcessor as _LookTwiceProcessor
 
 
 class LookTwiceProcessor(_LookTwiceProcessor):

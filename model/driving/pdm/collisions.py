@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.pdm.geometry import Boxes, IndexArray, boxes_meet, near, segments_meet
-from model.driving.pdm.lanes import Areas
-from model.driving.pdm.world import STEP_S, STEPS, Array, BoolArray, TrackedBox
+from looktwice.model.driving.pdm.geometry import Boxes, IndexArray, boxes_meet, near, segments_meet
+from looktwice.model.driving.pdm.lanes import Areas
+from looktwice.model.driving.pdm.world import STEP_S, STEPS, Array, BoolArray, TrackedBox
 
 EGO_STOPPED_MPS: Final = 0.05
 LOOK_AHEAD: Final = (0, 3, 6, 9)

@@ -13,8 +13,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from model.driving.pdm.geometry import IndexArray
-from model.driving.pdm.world import (
+from looktwice.model.driving.pdm.geometry import IndexArray
+from looktwice.model.driving.pdm.world import (
     ACCELERATION,
     ACCELERATION_Y,
     HEADING,

@@ -7,8 +7,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from model.driving.pdm.profiles import wrapped
-from model.driving.pdm.world import STEP_S, STEPS, Array
+from looktwice.model.driving.pdm.profiles import wrapped
+from looktwice.model.driving.pdm.world import STEP_S, STEPS, Array
 
 Longitudinal = Literal["accelerate", "decelerate", "maintain speed", "stop"]
 Lateral = Literal["keep lane", "turn left", "turn right", "change to left lane", "change to right lane"]

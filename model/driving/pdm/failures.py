@@ -8,11 +8,19 @@ from typing import Final, Literal
 
 import numpy as np
 
-from model.driving.pdm.collisions import LOOK_AHEAD, track_boxes
-from model.driving.pdm.comfort import Excess, excesses, extended_excesses
-from model.driving.pdm.geometry import Boxes, IndexArray, Points, boxes_meet, gaps, on_line, to_edges
-from model.driving.pdm.lanes import DIRECTION_FINE_M, LANE_OFFSET_M
-from model.driving.pdm.scoring import (
+from looktwice.model.driving.pdm.collisions import LOOK_AHEAD, track_boxes
+from looktwice.model.driving.pdm.comfort import Excess, excesses, extended_excesses
+from looktwice.model.driving.pdm.geometry import (
+    Boxes,
+    IndexArray,
+    Points,
+    boxes_meet,
+    gaps,
+    on_line,
+    to_edges,
+)
+from looktwice.model.driving.pdm.lanes import DIRECTION_FINE_M, LANE_OFFSET_M
+from looktwice.model.driving.pdm.scoring import (
     COLLISIONS,
     COMFORT,
     DIRECTION,
@@ -27,7 +35,7 @@ from model.driving.pdm.scoring import (
     Scores,
     ego_boxes,
 )
-from model.driving.pdm.world import SPEED, SPEED_Y, STEP_S, STEPS, Area, Array, TrackedBox, World
+from looktwice.model.driving.pdm.world import SPEED, SPEED_Y, STEP_S, STEPS, Area, Array, TrackedBox, World
 
 
 @dataclass(frozen=True)
@@ -186,7 +194,7 @@ def facts_of(world: World, scores: Scores, others: Others = _NO_OTHERS) -> list[
     """What each plan fails at, in the order of time; what is judged as a whole comes last.
 
     Args:
-        world, scores: as `model.driving.pdm.scoring.score` took and gave them.
+        world, scores: as `looktwice.model.driving.pdm.scoring.score` took and gave them.
         others: what the plans were compared with; extended comfort is told only with the plan before.
     """
     ego = ego_boxes(world, scores.states)

@@ -10,11 +10,11 @@ from typing import Final, Literal
 
 import numpy as np
 
-from model.driving.agents import ROAD_USERS
-from model.driving.pdm.labelled import EGO, past_states, route_line
-from model.driving.pdm.world import LONG_STEPS, STEP_S, TrackedBox, World
-from model.driving.tracks import Track
-from model.driving.trajectory import FloatArray
+from looktwice.model.driving.agents import ROAD_USERS
+from looktwice.model.driving.pdm.labelled import EGO, past_states, route_line
+from looktwice.model.driving.pdm.world import LONG_STEPS, STEP_S, TrackedBox, World
+from looktwice.model.driving.tracks import Track
+from looktwice.model.driving.trajectory import FloatArray
 
 Foresight = Literal["constant_velocity"]
 CONSTANT_VELOCITY: Final[Foresight] = "constant_velocity"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.pdm.world import Area, Array, BoolArray
+from looktwice.model.driving.pdm.world import Area, Array, BoolArray
 
 IndexArray = npt.NDArray[np.intp]
 

@@ -9,11 +9,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.course import Course
-from model.driving.pdm.failures import Fact, Other
-from model.driving.pdm.feedback import SECTIONS, Feedback
-from model.driving.pdm.world import STEP_S, STEPS
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.course import Course
+from looktwice.model.driving.pdm.failures import Fact, Other
+from looktwice.model.driving.pdm.feedback import SECTIONS, Feedback
+from looktwice.model.driving.pdm.world import STEP_S, STEPS
 
 Unit = Literal["m", "s", "m/s", "m/s2", "m/s3", "rad", "rad/s", "rad/s2", "deg", "%", ""]
 THRESHOLD: Final = 0.8

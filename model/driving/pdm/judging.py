@@ -8,14 +8,14 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.course import course_of
-from model.driving.pdm.failures import facts_of
-from model.driving.pdm.judged import THRESHOLD, JudgedPlan, Waypoint
-from model.driving.pdm.labelled import plans_of, world_of
-from model.driving.pdm.scoring import Others, Scores, score
-from model.driving.pdm.world import ACCELERATION, Array, ScoreError, World
-from model.driving.scene import LabelledScene
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.course import course_of
+from looktwice.model.driving.pdm.failures import facts_of
+from looktwice.model.driving.pdm.judged import THRESHOLD, JudgedPlan, Waypoint
+from looktwice.model.driving.pdm.labelled import plans_of, world_of
+from looktwice.model.driving.pdm.scoring import Others, Scores, score
+from looktwice.model.driving.pdm.world import ACCELERATION, Array, ScoreError, World
+from looktwice.model.driving.scene import LabelledScene
 
 _EVERY: Final = {8: 1, 64: 5}
 """Waypoints are told every half a second."""

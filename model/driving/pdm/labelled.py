@@ -6,10 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.agents import ROAD_USERS, Agent
-from model.driving.lane_map import LaneArea
-from model.driving.pdm.simulator import reference_poses, simulate
-from model.driving.pdm.world import (
+from looktwice.model.driving.agents import ROAD_USERS, Agent
+from looktwice.model.driving.lane_map import LaneArea
+from looktwice.model.driving.pdm.simulator import reference_poses, simulate
+from looktwice.model.driving.pdm.world import (
     ACCELERATION,
     HEADING,
     LONG_STEPS,
@@ -27,17 +27,18 @@ from model.driving.pdm.world import (
     X,
     Y,
 )
-from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, LabelledScene
-from model.driving.trajectory import HISTORY_STEPS, FloatArray, to_ego_frame
+from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, LabelledScene
+from looktwice.model.driving.trajectory import HISTORY_STEPS, FloatArray, to_ego_frame
 
 _WHEELBASE_M: Final = 1.4166 + 1.0523
 """Of MetaDrive's car, behind and before its middle."""
 EGO: Final = Vehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2, EGO_LENGTH_M / 2, _WHEELBASE_M)
 """The ego of our scenes, measured from its middle: that is the point that never slips.
 
-Experts on their rails, and cars that follow plans (`clients.metadrive.tracking`), head where their middle
-goes. NAVSIM calls the point of which this is true the rear axle. Were it put where MetaDrive's axle is, an
-expert in a tight turn would slip by 8 degrees there, and NAVSIM's tracker, which cannot slip, be a metre off.
+Experts on their rails, and cars that follow plans (`looktwice.clients.metadrive.tracking`), head where their
+middle goes. NAVSIM calls the point of which this is true the rear axle. Were it put where MetaDrive's axle
+is, an expert in a tight turn would slip by 8 degrees there, and NAVSIM's tracker, which cannot slip, be a
+metre off.
 """
 _MOVING_MPS: Final = 0.5
 

@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.pdm.geometry import Boxes, IndexArray, Points, area_meets, beside_line, on_line
-from model.driving.pdm.world import STEPS, Array, BoolArray, World
+from looktwice.model.driving.pdm.geometry import Boxes, IndexArray, Points, area_meets, beside_line, on_line
+from looktwice.model.driving.pdm.world import STEPS, Array, BoolArray, World
 
 DIRECTION_STEPS: Final = 11
 """Steps of the window over which driving against the traffic is summed: 1 s and the step before."""

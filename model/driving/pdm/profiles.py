@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.pdm.world import STEP_S, Array
+from looktwice.model.driving.pdm.world import STEP_S, Array
 
 ACCELERATION_PENALTY: Final = 1e-4
 CURVATURE_RATE_PENALTY: Final = 1e-2

@@ -9,11 +9,11 @@ import re
 from collections.abc import Iterator
 from typing import Final
 
-from model.driving.pdm.course import Course
-from model.driving.pdm.failures import Fact, Other
-from model.driving.pdm.feedback import BEGIN, END, Feedback, RuleFeedback
-from model.driving.pdm.judged import HORIZON_S, JudgedPlan, called
-from model.driving.pdm.scoring import (
+from looktwice.model.driving.pdm.course import Course
+from looktwice.model.driving.pdm.failures import Fact, Other
+from looktwice.model.driving.pdm.feedback import BEGIN, END, Feedback, RuleFeedback
+from looktwice.model.driving.pdm.judged import HORIZON_S, JudgedPlan, called
+from looktwice.model.driving.pdm.scoring import (
     COLLISIONS,
     COMFORT,
     DIRECTION,
@@ -24,7 +24,7 @@ from model.driving.pdm.scoring import (
     PROGRESS,
     TIME_TO_COLLISION,
 )
-from model.driving.plan import PlanError, parse_plan
+from looktwice.model.driving.plan import PlanError, parse_plan
 
 NAME: Final = "rules"
 REVISION: Final = "1"

@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.pdm.collisions import at_fault, too_close, track_boxes
-from model.driving.pdm.comfort import Version, comfort, extended_comfort
-from model.driving.pdm.geometry import Boxes, IndexArray
-from model.driving.pdm.lanes import (
+from looktwice.model.driving.pdm.collisions import at_fault, too_close, track_boxes
+from looktwice.model.driving.pdm.comfort import Version, comfort, extended_comfort
+from looktwice.model.driving.pdm.geometry import Boxes, IndexArray
+from looktwice.model.driving.pdm.lanes import (
     DIRECTION_FINE_M,
     areas_of,
     direction_scores,
@@ -24,8 +24,8 @@ from model.driving.pdm.lanes import (
     progress_m,
     red_light_steps,
 )
-from model.driving.pdm.simulator import reference_poses, simulate
-from model.driving.pdm.world import (
+from looktwice.model.driving.pdm.simulator import reference_poses, simulate
+from looktwice.model.driving.pdm.world import (
     HEADING,
     LONG_STEPS,
     SPEED,

@@ -9,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.pdm.profiles import profiles, wrapped
-from model.driving.pdm.world import (
+from looktwice.model.driving.pdm.profiles import profiles, wrapped
+from looktwice.model.driving.pdm.world import (
     ACCELERATION,
     HEADING,
     SPEED,

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from model.engines.torch.kv import KvRows
-from model.engines.torch.layout import MIN_QUERIES, OrderedLayout, Part, reached, spans_of
+from looktwice.model.engines.torch.kv import KvRows
+from looktwice.model.engines.torch.layout import MIN_QUERIES, OrderedLayout, Part, reached, spans_of
 
 
 class PrefillChunk(NamedTuple):

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.torch.memory import Memory, RowInput, SlotMapping
+from looktwice.model.engines.torch.memory import Memory, RowInput, SlotMapping
 
 if TYPE_CHECKING:
-    from model.engines.torch.runner import Prompt  # a runner needs torch, batches do not
+    from looktwice.model.engines.torch.runner import Prompt  # a runner needs torch, batches do not
 
 Ids = npt.NDArray[np.int64]
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import Final
 
-from model.engines.requests import leads_to_reflection
-from model.families.family import Branch
-from model.formats.cursor import Cursor
+from looktwice.model.engines.requests import leads_to_reflection
+from looktwice.model.families.family import Branch
+from looktwice.model.formats.cursor import Cursor
 
 _WEIGHT: Final = 0.1
 """Weight of the latest observation in a running mean."""

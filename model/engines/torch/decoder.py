@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.binding import Binding, binding_of
-from model.engines.engine import (
+from looktwice.model.engines.binding import Binding, binding_of
+from looktwice.model.engines.engine import (
     DraftFinished,
     Draw,
     DrawFinished,
@@ -22,20 +22,20 @@ from model.engines.engine import (
     RequestError,
     Started,
 )
-from model.engines.least_error import LeastError
-from model.engines.logprobs import reported
-from model.engines.reason_mask import reason_mask_of
-from model.engines.requests import begin, read
-from model.engines.torch.batch import Batch, Feed
-from model.engines.torch.deadlines import LatencyModel, drafts_of
-from model.engines.torch.drafter import Drafter
-from model.engines.torch.expected_picture import expected_picture
-from model.engines.torch.integrity import check
-from model.engines.torch.request import Phase, Request, Tree
-from model.engines.torch.rows import Row
-from model.engines.torch.runner import ROWS_A_TREE, PromptRequest, Runner
-from model.engines.torch.scheduler import Scheduler
-from model.engines.torch.shortcuts import Shortcuts
+from looktwice.model.engines.least_error import LeastError
+from looktwice.model.engines.logprobs import reported
+from looktwice.model.engines.reason_mask import reason_mask_of
+from looktwice.model.engines.requests import begin, read
+from looktwice.model.engines.torch.batch import Batch, Feed
+from looktwice.model.engines.torch.deadlines import LatencyModel, drafts_of
+from looktwice.model.engines.torch.drafter import Drafter
+from looktwice.model.engines.torch.expected_picture import expected_picture
+from looktwice.model.engines.torch.integrity import check
+from looktwice.model.engines.torch.request import Phase, Request, Tree
+from looktwice.model.engines.torch.rows import Row
+from looktwice.model.engines.torch.runner import ROWS_A_TREE, PromptRequest, Runner
+from looktwice.model.engines.torch.scheduler import Scheduler
+from looktwice.model.engines.torch.shortcuts import Shortcuts
 
 Logits = npt.NDArray[np.float64]
 

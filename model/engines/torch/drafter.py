@@ -20,10 +20,10 @@ import numpy as np
 import numpy.typing as npt
 from cachetools import FIFOCache
 
-from model.engines.sampling import uniform
-from model.engines.torch.rows import Row
-from model.formats.cursor import AtCode, Cursor
-from model.formats.pieces import FormatError
+from looktwice.model.engines.sampling import uniform
+from looktwice.model.engines.torch.rows import Row
+from looktwice.model.formats.cursor import AtCode, Cursor
+from looktwice.model.formats.pieces import FormatError
 
 Ids = npt.NDArray[np.int64]
 

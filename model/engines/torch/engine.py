@@ -13,24 +13,24 @@ from typing import Final
 
 import torch
 
-from model.engines.binding import Binding, binding_of
-from model.engines.engine import DrawFinished, EngineError, Event, Load, PlanRequest, RequestError
-from model.engines.pictures import PictureThreads
-from model.engines.requests import painted, prompt_tokens
-from model.engines.torch.decoder import Counts, Decoder, Failed
-from model.engines.torch.expected_picture import expected_picture
-from model.engines.torch.frames import Frames
-from model.engines.torch.graphs import CudaGraph
-from model.engines.torch.runner import Runner
-from model.engines.torch.shortcuts import Shortcuts
-from model.engines.torch.threads import FreeCores, fit_threads
-from model.engines.torch.worker import Worker
-from model.engines.warm_up import warm_up
-from model.network.allocator import FreedMemory
-from model.network.checkpoint import load
-from model.network.model_card import ModelCard
-from model.network.precision import bfloat16_is_fast
-from model.network.visual_codes import Frame
+from looktwice.model.engines.binding import Binding, binding_of
+from looktwice.model.engines.engine import DrawFinished, EngineError, Event, Load, PlanRequest, RequestError
+from looktwice.model.engines.pictures import PictureThreads
+from looktwice.model.engines.requests import painted, prompt_tokens
+from looktwice.model.engines.torch.decoder import Counts, Decoder, Failed
+from looktwice.model.engines.torch.expected_picture import expected_picture
+from looktwice.model.engines.torch.frames import Frames
+from looktwice.model.engines.torch.graphs import CudaGraph
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.engines.torch.shortcuts import Shortcuts
+from looktwice.model.engines.torch.threads import FreeCores, fit_threads
+from looktwice.model.engines.torch.worker import Worker
+from looktwice.model.engines.warm_up import warm_up
+from looktwice.model.network.allocator import FreedMemory
+from looktwice.model.network.checkpoint import load
+from looktwice.model.network.model_card import ModelCard
+from looktwice.model.network.precision import bfloat16_is_fast
+from looktwice.model.network.visual_codes import Frame
 
 _DRAWS_A_SCENE: Final = 6
 """That most requests ask for."""
@@ -84,7 +84,7 @@ def _worker() -> Worker:
 
 
 class TorchEngine:
-    """`model.engines.engine.Engine` over a checkpoint folder; see there for the contract."""
+    """`looktwice.model.engines.engine.Engine` over a checkpoint folder; see there for the contract."""
 
     def __init__(self, checkpoint: Path, settings: TorchSettings = TorchSettings()) -> None:
         self._settings = settings

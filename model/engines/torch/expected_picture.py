@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from model.driving.cameras import CAMERA_SPECS
-from model.driving.images import ImageError
-from model.driving.next_view import moved_view
-from model.driving.short_term import INERTIA
-from model.engines.engine import PlanRequest
-from model.families.picture_codes import PICTURE
-from model.network.checkpoint import Parts
-from model.network.visual_codes import frame_of
+from looktwice.model.driving.cameras import CAMERA_SPECS
+from looktwice.model.driving.images import ImageError
+from looktwice.model.driving.next_view import moved_view
+from looktwice.model.driving.short_term import INERTIA
+from looktwice.model.engines.engine import PlanRequest
+from looktwice.model.families.picture_codes import PICTURE
+from looktwice.model.network.checkpoint import Parts
+from looktwice.model.network.visual_codes import frame_of
 
 
 def expected_picture(request: PlanRequest, parts: Parts) -> tuple[int, ...]:

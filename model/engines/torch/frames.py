@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from cachetools import LRUCache
 
-from model.driving.scene import Scene, SceneError
-from model.network.inputs import InputBuilder
+from looktwice.model.driving.scene import Scene, SceneError
+from looktwice.model.network.inputs import InputBuilder
 
 MAX_BYTES: Final = 64 << 20
 

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from model.engines.torch.layout import Part
+from looktwice.model.engines.torch.layout import Part
 
 LIMIT: Final = 512
 """Sizes that are captured; each takes a fraction of a second and some memory."""

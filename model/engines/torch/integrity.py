@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from model.engines.torch.memory import Memory
-from model.engines.torch.request import Phase, Request
+from looktwice.model.engines.torch.memory import Memory
+from looktwice.model.engines.torch.request import Phase, Request
 
 
 def check(requests: Sequence[Request], memory: Memory) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from model.engines.engine import Draw, DrawFinished, PlanRequest
-from model.engines.torch.decoder import Decoder, Failed
-from model.engines.torch.runner import Runner
+from looktwice.model.engines.engine import Draw, DrawFinished, PlanRequest
+from looktwice.model.engines.torch.decoder import Decoder, Failed
+from looktwice.model.engines.torch.runner import Runner
 
 
 def draws_of(runner: Runner, requests: Iterable[PlanRequest]) -> dict[str, list[Draw]]:

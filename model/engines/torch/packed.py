@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from model.network.precision import has_bfloat16_layout
+from looktwice.model.network.precision import has_bfloat16_layout
 
 
 class Attention(Protocol):

@@ -14,17 +14,17 @@ from enum import Enum
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from model.engines.binding import Binding
-from model.engines.engine import Controls, Draw, PlanRequest
-from model.engines.least_error import LeastError
-from model.engines.reason_mask import ReasonMask
-from model.engines.torch.memory import Memory
-from model.engines.torch.rows import Row
-from model.families.family import Family
-from model.formats.cursor import Cursor
+from looktwice.model.engines.binding import Binding
+from looktwice.model.engines.engine import Controls, Draw, PlanRequest
+from looktwice.model.engines.least_error import LeastError
+from looktwice.model.engines.reason_mask import ReasonMask
+from looktwice.model.engines.torch.memory import Memory
+from looktwice.model.engines.torch.rows import Row
+from looktwice.model.families.family import Family
+from looktwice.model.formats.cursor import Cursor
 
 if TYPE_CHECKING:
-    from model.engines.torch.runner import Prompt  # a runner needs torch, requests do not
+    from looktwice.model.engines.torch.runner import Prompt  # a runner needs torch, requests do not
 
 _arrivals = itertools.count()
 

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.engine import Event
-from model.engines.least_error import least_error
-from model.engines.requests import leads_to_reflection, told
-from model.engines.response import Response, SectionText
-from model.engines.sampling import choose, probabilities, uniforms
-from model.engines.torch.deadlines import TimeFor
-from model.formats.cursor import Allowed
-from model.network.vocabulary import Vocabulary
+from looktwice.model.engines.engine import Event
+from looktwice.model.engines.least_error import least_error
+from looktwice.model.engines.requests import leads_to_reflection, told
+from looktwice.model.engines.response import Response, SectionText
+from looktwice.model.engines.sampling import choose, probabilities, uniforms
+from looktwice.model.engines.torch.deadlines import TimeFor
+from looktwice.model.formats.cursor import Allowed
+from looktwice.model.network.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
-    from model.engines.torch.request import Request, Tree
+    from looktwice.model.engines.torch.request import Request, Tree
 
 
 @dataclass(eq=False)

@@ -12,22 +12,22 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from model.driving.scene import Scene
-from model.driving.trajectory import FloatArray
-from model.engines.torch.attention import (
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.engines.torch.attention import (
     DecodeAttention,
     OrderedDecode,
     OrderedPrefill,
     PrefillAttention,
     PrefillChunk,
 )
-from model.engines.torch.batch import Batch
-from model.engines.torch.clips import ClipCache
-from model.engines.torch.frames import Frames
-from model.engines.torch.graphs import Capture, Graphs, Numbers, Sizes
-from model.engines.torch.head import AllowedHead
-from model.engines.torch.kv import KvRows
-from model.engines.torch.layout import (
+from looktwice.model.engines.torch.batch import Batch
+from looktwice.model.engines.torch.clips import ClipCache
+from looktwice.model.engines.torch.frames import Frames
+from looktwice.model.engines.torch.graphs import Capture, Graphs, Numbers, Sizes
+from looktwice.model.engines.torch.head import AllowedHead
+from looktwice.model.engines.torch.kv import KvRows
+from looktwice.model.engines.torch.layout import (
     RowPath,
     Shape,
     bucket,
@@ -38,13 +38,13 @@ from model.engines.torch.layout import (
     reached,
     repeatable_bucket,
 )
-from model.engines.torch.memory import IntArray, Memory, SlotMapping
-from model.engines.torch.packed import Attention, PackedDecoder, Rotation
-from model.engines.torch.vision import Encoded, VisionEncoder
-from model.families.family import Attempt, Family
-from model.families.registry import families_of
-from model.formats.cursor import CompiledFormat
-from model.network.checkpoint import Loaded
+from looktwice.model.engines.torch.memory import IntArray, Memory, SlotMapping
+from looktwice.model.engines.torch.packed import Attention, PackedDecoder, Rotation
+from looktwice.model.engines.torch.vision import Encoded, VisionEncoder
+from looktwice.model.families.family import Attempt, Family
+from looktwice.model.families.registry import families_of
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.network.checkpoint import Loaded
 
 ROWS_A_TREE: Final = 12
 """Rows, drafts among them, that share a KV row at first."""
@@ -72,7 +72,7 @@ class Prompt:
         rotation: theirs.
         held: how many of them are prefilled.
         last_token: still to be fed.
-        position_offset: see `model.network.inputs.Prompt`.
+        position_offset: see `looktwice.model.network.inputs.Prompt`.
         shown: tells its format and pictures from others.
         pictures: tells apart what stands in the prompt for its pictures: with a resampler that depends on
             history and route as well.

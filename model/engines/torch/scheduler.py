@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final, NamedTuple
 
-from model.engines.torch.request import Phase, Request, Tree
+from looktwice.model.engines.torch.request import Phase, Request, Tree
 
 PATIENCE_S: Final = 4.0
 """A request without a deadline waits as if it had this one, so that others cannot starve it."""

@@ -11,10 +11,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from model.driving.scene import Scene
-from model.engines.torch.clips import ClipCache, digest
-from model.engines.torch.frames import Frames
-from model.network.checkpoint import Loaded
+from looktwice.model.driving.scene import Scene
+from looktwice.model.engines.torch.clips import ClipCache, digest
+from looktwice.model.engines.torch.frames import Frames
+from looktwice.model.network.checkpoint import Loaded
 
 
 class Encoded(NamedTuple):

@@ -11,18 +11,18 @@ import numpy.typing as npt
 import torch
 from transformers import DynamicCache
 
-from model.engines.binding import Binding, binding_of
-from model.engines.engine import PlanRequest
-from model.engines.least_error import LeastError, least_error
-from model.engines.logprobs import reported
-from model.engines.reason_mask import ReasonMask, reason_mask_of
-from model.engines.requests import leads_to_reflection
-from model.engines.response import Response, SectionText
-from model.engines.sampling import choose, probabilities, uniform
-from model.families.family import Family
-from model.formats.cursor import Allowed, Cursor
-from model.network.checkpoint import Loaded
-from model.network.inputs import ModelInputs
+from looktwice.model.engines.binding import Binding, binding_of
+from looktwice.model.engines.engine import PlanRequest
+from looktwice.model.engines.least_error import LeastError, least_error
+from looktwice.model.engines.logprobs import reported
+from looktwice.model.engines.reason_mask import ReasonMask, reason_mask_of
+from looktwice.model.engines.requests import leads_to_reflection
+from looktwice.model.engines.response import Response, SectionText
+from looktwice.model.engines.sampling import choose, probabilities, uniform
+from looktwice.model.families.family import Family
+from looktwice.model.formats.cursor import Allowed, Cursor
+from looktwice.model.network.checkpoint import Loaded
+from looktwice.model.network.inputs import ModelInputs
 
 Logits = npt.NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from model.engines.engine import (
+from looktwice.model.engines.engine import (
     DrawFinished,
     EngineError,
     Event,
@@ -20,23 +20,23 @@ from model.engines.engine import (
     RequestError,
     Started,
 )
-from model.engines.pictures import PictureThreads
-from model.engines.requests import begin, inputs_of, painted, prompt_tokens, read, told
-from model.engines.transformers.decoding import Decoding, Prepared
-from model.engines.warm_up import warm_up
-from model.families.registry import families_of
-from model.formats.cursor import CompiledFormat, Cursor
-from model.network.checkpoint import load
-from model.network.inputs import ModelInputs
-from model.network.model_card import ModelCard
-from model.network.visual_codes import Frame
+from looktwice.model.engines.pictures import PictureThreads
+from looktwice.model.engines.requests import begin, inputs_of, painted, prompt_tokens, read, told
+from looktwice.model.engines.transformers.decoding import Decoding, Prepared
+from looktwice.model.engines.warm_up import warm_up
+from looktwice.model.families.registry import families_of
+from looktwice.model.formats.cursor import CompiledFormat, Cursor
+from looktwice.model.network.checkpoint import load
+from looktwice.model.network.inputs import ModelInputs
+from looktwice.model.network.model_card import ModelCard
+from looktwice.model.network.visual_codes import Frame
 
 _Tell = Callable[[Event | Exception], bool]
 """Hands an event on; False where nobody waits for more."""
 
 
 class TransformersEngine:
-    """`model.engines.engine.Engine` over a checkpoint folder; see there for the contract.
+    """`looktwice.model.engines.engine.Engine` over a checkpoint folder; see there for the contract.
 
     One thread writes one draw after the other, a token a pass. Deadlines are refused: nothing is made ready
     beside a second look that could take its place.

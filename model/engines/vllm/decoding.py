@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model.engines.engine import (
+from looktwice.model.engines.engine import (
     MAX_DRAWS,
     DrawFinished,
     EngineError,
@@ -20,14 +20,14 @@ from model.engines.engine import (
     PlanRequest,
     Started,
 )
-from model.engines.least_error import Expected, LeastError, least_error
-from model.engines.logprobs import reported
-from model.engines.reason_mask import ReasonMask
-from model.engines.requests import leads_to_reflection, read, told
-from model.engines.response import Response, SectionText
-from model.families.family import Branch, Family
-from model.formats.cursor import Allowed, Cursor
-from model.network.checkpoint import Parts
+from looktwice.model.engines.least_error import Expected, LeastError, least_error
+from looktwice.model.engines.logprobs import reported
+from looktwice.model.engines.reason_mask import ReasonMask
+from looktwice.model.engines.requests import leads_to_reflection, read, told
+from looktwice.model.engines.response import Response, SectionText
+from looktwice.model.families.family import Branch, Family
+from looktwice.model.formats.cursor import Allowed, Cursor
+from looktwice.model.network.checkpoint import Parts
 
 IntArray = npt.NDArray[np.int64]
 

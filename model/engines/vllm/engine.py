@@ -14,22 +14,22 @@ from typing import Any, Final
 
 import numpy as np
 
-from model.driving.scene import Scene
-from model.engines.engine import EngineError, Event, Load, PlanRequest, RequestError
-from model.engines.least_error import LeastError
-from model.engines.pictures import PictureThreads
-from model.engines.reason_mask import reason_mask_of
-from model.engines.requests import begin, inputs_of, painted, prompt_tokens
-from model.engines.vllm.decoding import Decoding, VllmPrompt
-from model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
-from model.engines.warm_up import warm_up
-from model.families.family import Attempt
-from model.families.registry import families_of
-from model.formats.cursor import Active, CompiledFormat, Cursor, Rest
-from model.formats.grammar_export import to_lark
-from model.network.checkpoint import read_parts
-from model.network.model_card import ModelCard
-from model.network.visual_codes import Frame
+from looktwice.model.driving.scene import Scene
+from looktwice.model.engines.engine import EngineError, Event, Load, PlanRequest, RequestError
+from looktwice.model.engines.least_error import LeastError
+from looktwice.model.engines.pictures import PictureThreads
+from looktwice.model.engines.reason_mask import reason_mask_of
+from looktwice.model.engines.requests import begin, inputs_of, painted, prompt_tokens
+from looktwice.model.engines.vllm.decoding import Decoding, VllmPrompt
+from looktwice.model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
+from looktwice.model.engines.warm_up import warm_up
+from looktwice.model.families.family import Attempt
+from looktwice.model.families.registry import families_of
+from looktwice.model.formats.cursor import Active, CompiledFormat, Cursor, Rest
+from looktwice.model.formats.grammar_export import to_lark
+from looktwice.model.network.checkpoint import read_parts
+from looktwice.model.network.model_card import ModelCard
+from looktwice.model.network.visual_codes import Frame
 
 _ENVIRONMENT: Final = {"VLLM_NO_USAGE_STATS": "1", "HF_HUB_OFFLINE": "1", "VLLM_CPU_KVCACHE_SPACE": "2"}
 """Unless set otherwise: nothing is sent or fetched; 2 GiB of keys and values where there is no GPU."""
@@ -56,7 +56,7 @@ class VllmSettings:
 
 
 class VllmEngine:
-    """`model.engines.engine.Engine` over a checkpoint folder; see there for the contract.
+    """`looktwice.model.engines.engine.Engine` over a checkpoint folder; see there for the contract.
 
     vLLM writes tokens under a grammar, and a cursor walks along with every draw. Where the two part (a
     control decides the branch otherwise, or the grammar allows what the format forbids), the draw goes on

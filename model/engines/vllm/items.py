@@ -8,12 +8,12 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.tracks import MAX_TRACKS
-from model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS
-from model.network.inputs import ModelInputs
-from model.network.settings import VlaSettings
-from model.network.track_features import TRACK_FEATURES
-from model.network.vocabulary import HISTORY, ROUTE, TRACK, VIDEO_PAD
+from looktwice.model.driving.tracks import MAX_TRACKS
+from looktwice.model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS
+from looktwice.model.network.inputs import ModelInputs
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.track_features import TRACK_FEATURES
+from looktwice.model.network.vocabulary import HISTORY, ROUTE, TRACK, VIDEO_PAD
 
 CLIPS: Final = "video"
 """Clips go by vLLM's own name for moving pictures: its rotary positions know that."""

@@ -7,4 +7,4 @@ def register() -> None:
     """Entry point ``vllm.general_plugins``: cheap, and no harm when called again."""
     from vllm import ModelRegistry
 
-    ModelRegistry.register_model("LookTwiceVla", "model.engines.vllm.network:LookTwiceForVllm")
+    ModelRegistry.register_model("LookTwiceVla", "looktwice.model.engines.vllm.network:LookTwiceForVllm")

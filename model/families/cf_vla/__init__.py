@@ -2,10 +2,10 @@
 
 from typing import Final
 
-from model.families.cf_vla import format as its
-from model.families.cf_vla.read import read
-from model.families.cf_vla.targets import teach
-from model.families.family import Branch, Family
+from looktwice.model.families.cf_vla import format as its
+from looktwice.model.families.cf_vla.read import read
+from looktwice.model.families.cf_vla.targets import teach
+from looktwice.model.families.family import Branch, Family
 
 CF_VLA: Final = Family(
     format=its.FREE_TEXT,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from model.families.trajectory_codes import TRAJECTORY_CODES
-from model.formats.phrases import Reflection
-from model.formats.pieces import Choice, Format, FreeText, Literal, Option, Piece, Section, Sequence
-from model.formats.plan_tracks import PlanTracks, RevisedPlan
+from looktwice.model.families.trajectory_codes import TRAJECTORY_CODES
+from looktwice.model.formats.phrases import Reflection
+from looktwice.model.formats.pieces import Choice, Format, FreeText, Literal, Option, Piece, Section, Sequence
+from looktwice.model.formats.plan_tracks import PlanTracks, RevisedPlan
 
 PLAN: Final = "plan"
 BRANCH: Final = "branch"

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from model.driving.plan import Plan
-from model.families.cf_vla.format import BRANCH, PLAN, REVISED_PLAN, TRAJECTORY
-from model.families.family import Decode, Reading
-from model.families.trajectory_codes import codes_in
-from model.formats.pieces import Values
+from looktwice.model.driving.plan import Plan
+from looktwice.model.families.cf_vla.format import BRANCH, PLAN, REVISED_PLAN, TRAJECTORY
+from looktwice.model.families.family import Decode, Reading
+from looktwice.model.families.trajectory_codes import codes_in
+from looktwice.model.formats.pieces import Values
 
 
 def read(values: Values, decode: Decode) -> Reading:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from model.families.cf_vla.format import (
+from looktwice.model.families.cf_vla.format import (
     ACTION,
     BRANCH,
     PLAN,
@@ -15,8 +15,8 @@ from model.families.cf_vla.format import (
     THINKING,
     TRAJECTORY,
 )
-from model.families.family import Lesson
-from model.formats.pieces import Values
+from looktwice.model.families.family import Lesson
+from looktwice.model.formats.pieces import Values
 
 
 def _weights(words: float, trajectory: float) -> Mapping[str, float]:

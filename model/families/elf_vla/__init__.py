@@ -2,11 +2,11 @@
 
 from typing import Final
 
-from model.families.elf_vla import format as its
-from model.families.elf_vla.inputs import BASE, WITH_ATTEMPT
-from model.families.elf_vla.read import read
-from model.families.elf_vla.targets import teach
-from model.families.family import Family, TextInputs
+from looktwice.model.families.elf_vla import format as its
+from looktwice.model.families.elf_vla.inputs import BASE, WITH_ATTEMPT
+from looktwice.model.families.elf_vla.read import read
+from looktwice.model.families.elf_vla.targets import teach
+from looktwice.model.families.family import Family, TextInputs
 
 _TASK: Final = (
     "First think within <think> </think>: is the car close to a road boundary; which agents may affect it; "

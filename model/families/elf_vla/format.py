@@ -7,11 +7,11 @@ from typing import Final, cast
 
 import numpy as np
 
-from model.driving import sentences
-from model.driving.sentences import END, SPACE, ThoughtError, Word, Words, decisions, joined
-from model.driving.trajectory import HALF_SECONDS_S, FloatArray, wrap_angle
-from model.formats.compounds import DIGITS, Number, Repeat
-from model.formats.pieces import (
+from looktwice.model.driving import sentences
+from looktwice.model.driving.sentences import END, SPACE, ThoughtError, Word, Words, decisions, joined
+from looktwice.model.driving.trajectory import HALF_SECONDS_S, FloatArray, wrap_angle
+from looktwice.model.formats.compounds import DIGITS, Number, Repeat
+from looktwice.model.formats.pieces import (
     Choice,
     Compound,
     Format,
@@ -31,7 +31,7 @@ ANSWER: Final = "answer"
 
 TIMES_S: Final = HALF_SECONDS_S
 MAX_THINK_TOKENS: Final = 320
-"""Of free text; the sentences of `model.driving.sentences` are shorter."""
+"""Of free text; the sentences of `looktwice.model.driving.sentences` are shorter."""
 
 _NUMBERS: Final = {
     "x_m": Number(-20.0, 140.0, 0.1, name="x_m"),
@@ -89,7 +89,7 @@ def _then(word: Word) -> Piece:
 
 @dataclass(frozen=True)
 class _Sentences(Compound):
-    """Thoughts in the sentences of `model.driving.sentences`; their value is their text."""
+    """Thoughts in the sentences of `looktwice.model.driving.sentences`; their value is their text."""
 
     name: str | None = None
 
@@ -132,5 +132,5 @@ def free_text(name: str) -> Format:
 
 
 def phrases(name: str) -> Format:
-    """For small checkpoints: thoughts in `model.driving.sentences`, one token each number."""
+    """For small checkpoints: thoughts in `looktwice.model.driving.sentences`, one token each number."""
     return _elf_vla(name, Sequence((SENTENCES, Literal("</think>"))), tokens=True)

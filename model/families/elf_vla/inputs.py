@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Final, Literal, get_args
 
-from model.driving.pdm.feedback import BEGIN, END
-from model.driving.short_term import mission_goal
-from model.driving.trajectory import FloatArray, present_acceleration, present_speed
-from model.families.elf_vla.format import TIMES_S, poses, told_poses
-from model.families.family import FamilyError, Situation, TextInputs
-from model.formats import pieces
-from model.formats.compounds import Number
-from model.formats.pieces import Choice, Format, FreeText, Option, Section, Sequence, Value, Values
+from looktwice.model.driving.pdm.feedback import BEGIN, END
+from looktwice.model.driving.short_term import mission_goal
+from looktwice.model.driving.trajectory import FloatArray, present_acceleration, present_speed
+from looktwice.model.families.elf_vla.format import TIMES_S, poses, told_poses
+from looktwice.model.families.family import FamilyError, Situation, TextInputs
+from looktwice.model.formats import pieces
+from looktwice.model.formats.compounds import Number
+from looktwice.model.formats.pieces import Choice, Format, FreeText, Option, Section, Sequence, Value, Values
 
 Command = Literal["left", "straight", "right", "unknown"]
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from model.families.elf_vla.format import ANSWER, read_poses
-from model.families.family import Decode, Reading
-from model.formats.pieces import Values
+from looktwice.model.families.elf_vla.format import ANSWER, read_poses
+from looktwice.model.families.family import Decode, Reading
+from looktwice.model.formats.pieces import Values
 
 
 def read(values: Values, decode: Decode) -> Reading:

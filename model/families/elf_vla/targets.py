@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from model.driving.trajectory import TEN_HZ_S, at_times
-from model.families.elf_vla.format import ANSWER, THINK, TIMES_S, told_poses
-from model.families.family import FamilyError, Lesson
-from model.formats.pieces import Values
+from looktwice.model.driving.trajectory import TEN_HZ_S, at_times
+from looktwice.model.families.elf_vla.format import ANSWER, THINK, TIMES_S, told_poses
+from looktwice.model.families.family import FamilyError, Lesson
+from looktwice.model.formats.pieces import Values
 
 WEIGHTS: Final[Mapping[str, float]] = MappingProxyType({THINK: 1.0, ANSWER: 1.0})
 """The paper weighs all tokens of a response alike."""

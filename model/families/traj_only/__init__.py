@@ -2,10 +2,10 @@
 
 from typing import Final
 
-from model.families.cf_vla.format import ACTION, TRAJECTORY
-from model.families.family import Decode, Family, Lesson, Reading
-from model.families.trajectory_codes import TRAJECTORY_CODES, codes_in
-from model.formats.pieces import Format, Literal, Section, Sequence, Values
+from looktwice.model.families.cf_vla.format import ACTION, TRAJECTORY
+from looktwice.model.families.family import Decode, Family, Lesson, Reading
+from looktwice.model.families.trajectory_codes import TRAJECTORY_CODES, codes_in
+from looktwice.model.formats.pieces import Format, Literal, Section, Sequence, Values
 
 
 def read(values: Values, decode: Decode) -> Reading:

@@ -2,12 +2,12 @@
 
 from typing import Final
 
-from model.families.family import Family, Imagination
-from model.families.vla_world import format as its
-from model.families.vla_world.actions import ACTIONS
-from model.families.vla_world.inputs import INPUTS
-from model.families.vla_world.read import perceived, pictured, predicted, read, thoughts_text
-from model.families.vla_world.targets import teach
+from looktwice.model.families.family import Family, Imagination
+from looktwice.model.families.vla_world import format as its
+from looktwice.model.families.vla_world.actions import ACTIONS
+from looktwice.model.families.vla_world.inputs import INPUTS
+from looktwice.model.families.vla_world.read import perceived, pictured, predicted, read, thoughts_text
+from looktwice.model.families.vla_world.targets import teach
 
 _TASK: Final = (
     "Coordinates: X-axis is perpendicular, and Y-axis is parallel to the direction you're facing. You're at "

@@ -14,14 +14,14 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.trajectory import TEN_HZ_S, FloatArray, at_times
-from model.families.family import Actions
-from model.families.vla_world.format import DIRECTIONS, TIMES_S, Direction, Lateral, Speed
+from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, at_times
+from looktwice.model.families.family import Actions
+from looktwice.model.families.vla_world.format import DIRECTIONS, TIMES_S, Direction, Lateral, Speed
 
 SIDE_M: Final = 2.0
 """Metres to a side after 3 s that make a turn."""
 STOPPED_MS: Final = 0.5
-"""Who is slower in the end stops, as in plans (`model.driving.labeller`)."""
+"""Who is slower in the end stops, as in plans (`looktwice.model.driving.labeller`)."""
 CHANGED_MS: Final = 1.0
 """A change of speed by less is none: waypoints in decimetres tell 0.2 m/s."""
 QUICK: Final = 2.0

@@ -14,13 +14,13 @@ from typing import Literal as OneOf
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.agents import AGENT_KINDS
-from model.driving.paper_axes import from_paper_axes, to_paper_axes
-from model.driving.scene import CAMERAS
-from model.driving.trajectory import THREE_SECONDS_S, FloatArray
-from model.families.picture_codes import PICTURE, PICTURE_CODEBOOK, PICTURE_CODES
-from model.formats.compounds import Number, Repeat
-from model.formats.pieces import (
+from looktwice.model.driving.agents import AGENT_KINDS
+from looktwice.model.driving.paper_axes import from_paper_axes, to_paper_axes
+from looktwice.model.driving.scene import CAMERAS
+from looktwice.model.driving.trajectory import THREE_SECONDS_S, FloatArray
+from looktwice.model.families.picture_codes import PICTURE, PICTURE_CODEBOOK, PICTURE_CODES
+from looktwice.model.formats.compounds import Number, Repeat
+from looktwice.model.formats.pieces import (
     Choice,
     Codes,
     Format,

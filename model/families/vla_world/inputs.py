@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import Final
 
-from model.driving.short_term import mission_goal
-from model.driving.trajectory import STEP_S, FloatArray, present_acceleration, present_speed
-from model.families.family import Situation, TextInputs
-from model.families.vla_world.format import CAMERA_OPTIONS, points, told_points
-from model.formats.compounds import Number
-from model.formats.pieces import Choice, Format, Literal, Option, Piece, Section, Sequence, Values
+from looktwice.model.driving.short_term import mission_goal
+from looktwice.model.driving.trajectory import STEP_S, FloatArray, present_acceleration, present_speed
+from looktwice.model.families.family import Situation, TextInputs
+from looktwice.model.families.vla_world.format import CAMERA_OPTIONS, points, told_points
+from looktwice.model.formats.compounds import Number
+from looktwice.model.formats.pieces import Choice, Format, Literal, Option, Piece, Section, Sequence, Values
 
 GOALS: Final = ("LEFT", "FORWARD", "RIGHT", "UNKNOWN")
 """The last one where there is no route."""

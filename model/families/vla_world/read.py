@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, cast
 
-from model.driving.perceived import Perceived, PerceivedAgent
-from model.families.family import Decode, Foreseen, NextPicture, Predicted, Reading
-from model.families.vla_world import format as its
-from model.families.vla_world.actions import Action, counted
-from model.formats.pieces import Value, Values
+from looktwice.model.driving.perceived import Perceived, PerceivedAgent
+from looktwice.model.families.family import Decode, Foreseen, NextPicture, Predicted, Reading
+from looktwice.model.families.vla_world import format as its
+from looktwice.model.families.vla_world.actions import Action, counted
+from looktwice.model.formats.pieces import Value, Values
 
 _CAMERAS = {written: camera for camera, written in its.CAMERA_OPTIONS.items()}
 

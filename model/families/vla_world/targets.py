@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from model.driving.perceived import PerceivedAgent
-from model.driving.trajectory import TEN_HZ_S, at_times
-from model.families.family import FamilyError, Lesson
-from model.families.vla_world import format as its
-from model.families.vla_world.actions import action_of
-from model.formats.pieces import Value, Values
+from looktwice.model.driving.perceived import PerceivedAgent
+from looktwice.model.driving.trajectory import TEN_HZ_S, at_times
+from looktwice.model.families.family import FamilyError, Lesson
+from looktwice.model.families.vla_world import format as its
+from looktwice.model.families.vla_world.actions import action_of
+from looktwice.model.formats.pieces import Value, Values
 
 WEIGHTS: Final[Mapping[str, float]] = MappingProxyType(dict.fromkeys(its.VLA_WORLD_FORMAT.sections(), 1.0))
 """The paper weighs all tokens of a response alike."""

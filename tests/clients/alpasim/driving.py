@@ -30,12 +30,12 @@ from carla_driver_interface.protocol import (
     channel_options,
 )
 
-from clients.alpasim.driver import DriverConfig, Egodriver
-from clients.alpasim.messages import DebugFormat
-from clients.alpasim.server import start_server
-from clients.alpasim.session import CAMERAS
-from clients.planner import AsyncPlannerClient
-from service.settings import Settings
+from looktwice.clients.alpasim.driver import DriverConfig, Egodriver
+from looktwice.clients.alpasim.messages import DebugFormat
+from looktwice.clients.alpasim.server import start_server
+from looktwice.clients.alpasim.session import CAMERAS
+from looktwice.clients.planner import AsyncPlannerClient
+from looktwice.service.settings import Settings
 from tests.service.scenes import picture
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve

@@ -17,8 +17,8 @@ from carla_driver_interface.protocol import EgodriverServiceStub, channel_option
 from carla_driver_interface.server import build_server
 from carla_driver_interface.testing import FakeCamera, FakeLoop, LoopResult
 
-from clients.alpasim.driver import DriverConfig
-from clients.alpasim.session import CAMERAS
+from looktwice.clients.alpasim.driver import DriverConfig
+from looktwice.clients.alpasim.session import CAMERAS
 from tests.clients.alpasim.driving import (
     READY_US,
     STEP_US,

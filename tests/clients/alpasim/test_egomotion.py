@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from clients.alpasim.egomotion import EgoLog, Observed
-from clients.alpasim.errors import BadHistory, TooEarly
+from looktwice.clients.alpasim.egomotion import EgoLog, Observed
+from looktwice.clients.alpasim.errors import BadHistory, TooEarly
 
 NOW_US = 1_700_000_000_000_000
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)

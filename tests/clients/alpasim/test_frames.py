@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.alpasim.errors import BadHistory, BadObservation, TooEarly
-from clients.alpasim.frames import FrameLog, fitted
-from model.driving.images import check_image, decode_image
+from looktwice.clients.alpasim.errors import BadHistory, BadObservation, TooEarly
+from looktwice.clients.alpasim.frames import FrameLog, fitted
+from looktwice.model.driving.images import check_image, decode_image
 from tests.service.scenes import picture
 
 NOW_US = 10_000_000

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from clients.alpasim.route import route_ahead
+from looktwice.clients.alpasim.route import route_ahead
 
 
 def straight(begins_m: float, ends_m: float, apart_m: float = 2.0) -> npt.NDArray[np.float64]:

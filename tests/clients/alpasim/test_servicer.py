@@ -14,11 +14,11 @@ from carla_driver_interface.contract import CONTRACT_REVISION, negotiate
 from carla_driver_interface.geometry import Trajectory
 from carla_driver_interface.protocol import GroundTruthRequest
 
-from clients import wire
-from clients.alpasim.driver import DriverConfig
-from clients.alpasim.session import CAMERAS
-from model.driving.trajectory import agreed
-from model.engines.engine import EngineError
+from looktwice.clients import wire
+from looktwice.clients.alpasim.driver import DriverConfig
+from looktwice.clients.alpasim.session import CAMERAS
+from looktwice.model.driving.trajectory import agreed
+from looktwice.model.engines.engine import EngineError
 from tests.clients.alpasim.driving import (
     READY_US,
     SPEED_MPS,

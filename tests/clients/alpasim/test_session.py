@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from clients.alpasim.egomotion import Observed
-from clients.alpasim.errors import BadObservation, BadSession, TooEarly
-from clients.alpasim.session import CAMERAS, Session
+from looktwice.clients.alpasim.egomotion import Observed
+from looktwice.clients.alpasim.errors import BadObservation, BadSession, TooEarly
+from looktwice.clients.alpasim.session import CAMERAS, Session
 
 NOW_US = 5_000_000
 HEADING = math.pi / 2

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from clients.alpasim.driver import DriverConfig
-from clients.alpasim.throughput import Throughput, measure
+from looktwice.clients.alpasim.driver import DriverConfig
+from looktwice.clients.alpasim.throughput import Throughput, measure
 from tests.clients.alpasim.driving import driving
 from tests.service.scenes import scene
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from clients.importers.comma2k19 import read_segments
-from clients.importers.recording import RecordingError
-from clients.importers.resampling import OneCamera
-from model.driving.cameras import FRONT_CAMERAS
-from model.driving.images import decode_image
-from model.driving.scene_store import read_scenes
-from model.driving.trajectory import present_speed
-from service.cli.commands import app
+from looktwice.clients.importers.comma2k19 import read_segments
+from looktwice.clients.importers.recording import RecordingError
+from looktwice.clients.importers.resampling import OneCamera
+from looktwice.model.driving.cameras import FRONT_CAMERAS
+from looktwice.model.driving.images import decode_image
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.trajectory import present_speed
+from looktwice.service.cli.commands import app
 from tests.comma2k19 import SEGMENT
 
 WIDE, TELE = (spec.resized(336) for spec in FRONT_CAMERAS)

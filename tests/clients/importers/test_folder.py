@@ -10,14 +10,14 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from clients.importers.folder import read_folder
-from clients.importers.recording import RecordingError
-from clients.importers.resampling import Source, as_seen, fov_of, grey_share
-from model.driving.cameras import FRONT_CAMERAS
-from model.driving.images import decode_image
-from model.driving.scene_store import read_scenes
-from model.driving.trajectory import present_speed
-from service.cli.commands import app
+from looktwice.clients.importers.folder import read_folder
+from looktwice.clients.importers.recording import RecordingError
+from looktwice.clients.importers.resampling import Source, as_seen, fov_of, grey_share
+from looktwice.model.driving.cameras import FRONT_CAMERAS
+from looktwice.model.driving.images import decode_image
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.trajectory import present_speed
+from looktwice.service.cli.commands import app
 
 WIDE, TELE = (spec.resized(336) for spec in FRONT_CAMERAS)
 SPEED_MS, TURN_RADS = 12.0, 0.1

@@ -14,12 +14,12 @@ import pyarrow.parquet as pq
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
-from clients.labelling.ledger import Ledger, Run
-from clients.labelling.rollout import Sampling, config_of, key_of, packed
-from clients.wire import ModelName
-from model.driving.plan import parse_plan
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import write_scenes
+from looktwice.clients.labelling.ledger import Ledger, Run
+from looktwice.clients.labelling.rollout import Sampling, config_of, key_of, packed
+from looktwice.clients.wire import ModelName
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import write_scenes
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
-from clients.labelling.failures import (
+from looktwice.clients.labelling.failures import (
     Inference,
     Sample,
     feedback_config,
@@ -15,14 +15,14 @@ from clients.labelling.failures import (
     sampled,
     writer,
 )
-from clients.labelling.label import config_of, jobs, labeller, questions
-from clients.labelling.ledger import Ledger
-from clients.labelling.pipeline import Limits, work_through
-from clients.labelling.rollout import RETRY_POLICY
-from clients.labelling.rollout import jobs as rollout_jobs
-from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
-from clients.planner import AsyncPlannerClient
-from clients.wire import ModelName
+from looktwice.clients.labelling.label import config_of, jobs, labeller, questions
+from looktwice.clients.labelling.ledger import Ledger
+from looktwice.clients.labelling.pipeline import Limits, work_through
+from looktwice.clients.labelling.rollout import RETRY_POLICY
+from looktwice.clients.labelling.rollout import jobs as rollout_jobs
+from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from looktwice.clients.planner import AsyncPlannerClient
+from looktwice.clients.wire import ModelName
 
 AT_ONCE = 4
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from clients.labelling import checks, leaks
-from clients.labelling.checks import MOST_WORDS, check_reflection
-from clients.labelling.label import CHECKS_VERSION
-from model.driving import direction, phrases
-from model.driving.direction import agrees, wanted_changes
-from model.driving.plan import Plan, track_from_words
+from looktwice.clients.labelling import checks, leaks
+from looktwice.clients.labelling.checks import MOST_WORDS, check_reflection
+from looktwice.clients.labelling.label import CHECKS_VERSION
+from looktwice.model.driving import direction, phrases
+from looktwice.model.driving.direction import agrees, wanted_changes
+from looktwice.model.driving.plan import Plan, track_from_words
 
 
 def plan(longitudinal: str = "Keep Speed", lateral: str = "Straight", lane: str = "Keep Lane") -> Plan:

@@ -15,13 +15,13 @@ from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 from starlette.requests import ClientDisconnect
 
-from clients.labelling.label import config_of, jobs, questions
-from clients.labelling.ledger import Ledger
-from clients.labelling.rollout import Sampling, key_of
-from clients.labelling.rollout import config_of as rollout_config
-from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
-from model.driving.hashing import hash_of
-from model.driving.plan import Plan, format_tick, parse_plan
+from looktwice.clients.labelling.label import config_of, jobs, questions
+from looktwice.clients.labelling.ledger import Ledger
+from looktwice.clients.labelling.rollout import Sampling, key_of
+from looktwice.clients.labelling.rollout import config_of as rollout_config
+from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from looktwice.model.driving.hashing import hash_of
+from looktwice.model.driving.plan import Plan, format_tick, parse_plan
 from tests.clients.labelling.builds import GOOD, LEAKING, MODEL, completion, named, rollout_record, scenes
 from tests.clients.labelling.killed import AT_ONCE, label_all
 from tests.service.scenes import labelled

@@ -18,7 +18,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 from starlette.requests import ClientDisconnect
 
-from clients.labelling.failures import (
+from looktwice.clients.labelling.failures import (
     Inference,
     Sample,
     feedback_config,
@@ -28,14 +28,14 @@ from clients.labelling.failures import (
     rows,
     sampled,
 )
-from clients.labelling.ledger import Ledger, Run
-from clients.labelling.teachers.feedback import check_feedback, question_of
-from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
-from model.driving.feedback_store import FeedbackFileError, read_feedback, write_feedback
-from model.driving.pdm.feedback import Feedback
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import write_scenes
-from service.settings import Settings
+from looktwice.clients.labelling.ledger import Ledger, Run
+from looktwice.clients.labelling.teachers.feedback import check_feedback, question_of
+from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from looktwice.model.driving.feedback_store import FeedbackFileError, read_feedback, write_feedback
+from looktwice.model.driving.pdm.feedback import Feedback
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.service.settings import Settings
 from tests.clients.labelling.builds import MODEL, completion, named
 from tests.clients.labelling.killed import AT_ONCE, fail_all
 from tests.service.scenes import labelled

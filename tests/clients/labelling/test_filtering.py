@@ -2,10 +2,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from clients.labelling.filtering import Thresholds, filtered, summary
-from clients.labelling.ledger import Entry
-from clients.labelling.scatter import scatter
-from model.driving.images import decode_image
+from looktwice.clients.labelling.filtering import Thresholds, filtered, summary
+from looktwice.clients.labelling.ledger import Entry
+from looktwice.clients.labelling.scatter import scatter
+from looktwice.model.driving.images import decode_image
 from tests.clients.labelling.builds import rollout_record
 
 

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from clients.labelling.ledger import Ledger
-from clients.labelling.teachers.teacher import Answer
+from looktwice.clients.labelling.ledger import Ledger
+from looktwice.clients.labelling.teachers.teacher import Answer
 from tests.clients.labelling.builds import GOOD, rolled_out, scenes
 from tests.clients.labelling.test_label import Scripted, labelled
 
 SCENES = 3
 KILLED = """
 import os, signal, sys
-from service.cli.commands import app
+from looktwice.service.cli.commands import app
 
 def at_the_first_rename(event, args):
     if event == "os.rename":
@@ -58,7 +58,7 @@ def test_a_killed_export_is_no_result_and_leaves_nothing_to_the_next(
     left = files(folder)
     assert left, "it had written"
     assert not results & left, "what was not finished must not look so"
-    assert export("-m", "service.cli") == 0
+    assert export("-m", "looktwice.service.cli") == 0
     assert files(folder) == results
 
 

@@ -8,26 +8,26 @@ from pathlib import Path
 
 import pytest
 
-from clients.labelling import outcomes
-from clients.labelling.batch import BatchError, batch_requests, read_results, take_results
-from clients.labelling.checks import FailedCheck
-from clients.labelling.export import DATASET, PARTS_FILE, reflections, right_plans, write_messages
-from clients.labelling.label import LabelTask, config_of, jobs, labeller, predicted_plans, questions
-from clients.labelling.ledger import Entry, Ledger, LedgerError, Run
-from clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
-from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
-from clients.labelling.teachers.prompt import Text, user_message
-from clients.labelling.teachers.rules import RuleTeacher
-from clients.labelling.teachers.teacher import (
+from looktwice.clients.labelling import outcomes
+from looktwice.clients.labelling.batch import BatchError, batch_requests, read_results, take_results
+from looktwice.clients.labelling.checks import FailedCheck
+from looktwice.clients.labelling.export import DATASET, PARTS_FILE, reflections, right_plans, write_messages
+from looktwice.clients.labelling.label import LabelTask, config_of, jobs, labeller, predicted_plans, questions
+from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError, Run
+from looktwice.clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
+from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from looktwice.clients.labelling.teachers.prompt import Text, user_message
+from looktwice.clients.labelling.teachers.rules import RuleTeacher
+from looktwice.clients.labelling.teachers.teacher import (
     Answer,
     Question,
     Teacher,
     TeacherClosed,
     TeacherError,
 )
-from model.driving.outcome import Outcome
-from model.driving.reflection_store import ReflectionFileError, read_reflections, write_reflections
-from model.driving.scene_store import read_scenes, write_scenes
+from looktwice.model.driving.outcome import Outcome
+from looktwice.model.driving.reflection_store import ReflectionFileError, read_reflections, write_reflections
+from looktwice.model.driving.scene_store import read_scenes, write_scenes
 from tests.clients.labelling.builds import (
     GOOD,
     LEAKING,

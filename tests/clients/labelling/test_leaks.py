@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from clients.labelling.leaks import find_leaks
+from looktwice.clients.labelling.leaks import find_leaks
 
 LEAKS = [
     "The expert slows down here.",

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from clients.labelling.dead_letters import FILE as LETTERS
-from clients.labelling.dead_letters import write_dead_letters
-from clients.labelling.ledger import FILE, Ledger, LedgerError
-from clients.labelling.teachers.teacher import Answer
+from looktwice.clients.labelling.dead_letters import FILE as LETTERS
+from looktwice.clients.labelling.dead_letters import write_dead_letters
+from looktwice.clients.labelling.ledger import FILE, Ledger, LedgerError
+from looktwice.clients.labelling.teachers.teacher import Answer
 
 CONFIG = {"model": "nano", "seed": 0}
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from clients.labelling.ledger import Ledger
-from model.driving.scene_store import write_scenes
-from service.settings import Settings
+from looktwice.clients.labelling.ledger import Ledger
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.service.settings import Settings
 from tests.clients.labelling.builds import named, without_future
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import ScriptedEngine
@@ -43,7 +43,16 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def build(*arguments: object) -> dict[str, Any]:
-    command = [sys.executable, "-m", "service.cli", "build", *map(str, arguments), "--ray", "local", "--json"]
+    command = [
+        sys.executable,
+        "-m",
+        "looktwice.service.cli",
+        "build",
+        *map(str, arguments),
+        "--ray",
+        "local",
+        "--json",
+    ]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     assert ended.returncode == 0, ended.stderr
     told: dict[str, Any] = json.loads(ended.stdout.splitlines()[-1])

@@ -7,17 +7,17 @@ from typing import Any
 
 import pytest
 
-from clients.labelling.export import held_plans
-from clients.labelling.filtering import filtered_by_outcome, summary
-from clients.labelling.ledger import Entry, Ledger, LedgerError
-from clients.labelling.outcomes import (
+from looktwice.clients.labelling.export import held_plans
+from looktwice.clients.labelling.filtering import filtered_by_outcome, summary
+from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError
+from looktwice.clients.labelling.outcomes import (
     Followed,
     config_of,
     followed_plans,
     plans_that_fail,
     plans_that_hold,
 )
-from model.driving.outcome import FailureName, Outcome
+from looktwice.model.driving.outcome import FailureName, Outcome
 from tests.clients.labelling.builds import GO_FASTER, rolled_out, rollout_record
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from clients.labelling.concurrency import ConcurrencyLimit
-from clients.labelling.ledger import Ledger, Record
-from clients.labelling.pipeline import CannotBeDone, Job, Limits, StageStopped, Tally, work_through
-from clients.labelling.retries import TryLater
+from looktwice.clients.labelling.concurrency import ConcurrencyLimit
+from looktwice.clients.labelling.ledger import Ledger, Record
+from looktwice.clients.labelling.pipeline import CannotBeDone, Job, Limits, StageStopped, Tally, work_through
+from looktwice.clients.labelling.retries import TryLater
 
 
 def jobs(count: int, first: int = 0) -> Iterator[Job[int]]:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from fastapi import FastAPI
 
-from clients.labelling.ledger import Ledger, Run
-from clients.labelling.pipeline import Limits, StageStopped, Tally, work_through
-from clients.labelling.rollout import (
+from looktwice.clients.labelling.ledger import Ledger, Run
+from looktwice.clients.labelling.pipeline import Limits, StageStopped, Tally, work_through
+from looktwice.clients.labelling.rollout import (
     RETRY_POLICY,
     Sampling,
     config_of,
@@ -23,13 +23,13 @@ from clients.labelling.rollout import (
     roll_out,
     unpacked,
 )
-from clients.planner import AsyncPlannerClient
-from clients.wire import ModelName
-from model.driving.labeller import expert_plan
-from model.driving.metrics import displacement_errors
-from model.driving.scene_store import read_scenes
-from model.engines.engine import RequestError
-from service.settings import Settings
+from looktwice.clients.planner import AsyncPlannerClient
+from looktwice.clients.wire import ModelName
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.metrics import displacement_errors
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.engines.engine import RequestError
+from looktwice.service.settings import Settings
 from tests.clients.labelling.builds import MODEL, scenes, without_future
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import CARD, ScriptedEngine

@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 
-from clients.metadrive import simulator
+from looktwice.clients.metadrive import simulator
 
 if not simulator.is_installed():
     pytest.skip("MetaDrive is not installed (make sim)", allow_module_level=True)
 
-from clients.metadrive.episode import run_episode
-from clients.metadrive.episode_log import EpisodeLog
-from clients.metadrive.rig import Rig
-from clients.metadrive.windows import labelled_scenes
-from model.driving.scene import LabelledScene
+from looktwice.clients.metadrive.episode import run_episode
+from looktwice.clients.metadrive.episode_log import EpisodeLog
+from looktwice.clients.metadrive.rig import Rig
+from looktwice.clients.metadrive.windows import labelled_scenes
+from looktwice.model.driving.scene import LabelledScene
 
 SEED = 2
 DURATION_S = 14.0

@@ -3,12 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clients.metadrive.actors import Drift
-from clients.metadrive.episode import run_episode
-from clients.metadrive.episode_log import EpisodeLog
-from clients.metadrive.rig import Rig
-from clients.metadrive.windows import labelled_scenes
-from model.driving.labeller import expert_plan
+from looktwice.clients.metadrive.actors import Drift
+from looktwice.clients.metadrive.episode import run_episode
+from looktwice.clients.metadrive.episode_log import EpisodeLog
+from looktwice.clients.metadrive.rig import Rig
+from looktwice.clients.metadrive.windows import labelled_scenes
+from looktwice.model.driving.labeller import expert_plan
 
 SEED, DURATION_S = 904, 30.0
 

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients import wire
-from clients.metadrive.drive import EXPERT, TAKE_OVER, Drive, DriveConfig, Shot, drive
-from clients.metadrive.drive_table import driver_rows, format_table, to_json
-from clients.metadrive.episode import make_world, run_episode
-from clients.metadrive.episode_log import EpisodeLog
-from clients.metadrive.film import IMAGINED, Film
-from clients.metadrive.pilots import ConstantVelocity, Planned, ServicePilot
-from clients.metadrive.result_store import drive_store
-from clients.metadrive.rig import Rig
-from clients.metadrive.tracking import FreeVehicle, world_trajectory
-from clients.planner import PlannerClient
-from model.driving.scene import Scene
-from model.driving.trajectory import to_ego_frame
-from service.settings import Settings
+from looktwice.clients import wire
+from looktwice.clients.metadrive.drive import EXPERT, TAKE_OVER, Drive, DriveConfig, Shot, drive
+from looktwice.clients.metadrive.drive_table import driver_rows, format_table, to_json
+from looktwice.clients.metadrive.episode import make_world, run_episode
+from looktwice.clients.metadrive.episode_log import EpisodeLog
+from looktwice.clients.metadrive.film import IMAGINED, Film
+from looktwice.clients.metadrive.pilots import ConstantVelocity, Planned, ServicePilot
+from looktwice.clients.metadrive.result_store import drive_store
+from looktwice.clients.metadrive.rig import Rig
+from looktwice.clients.metadrive.tracking import FreeVehicle, world_trajectory
+from looktwice.clients.planner import PlannerClient
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.trajectory import to_ego_frame
+from looktwice.service.settings import Settings
 from tests.clients.metadrive.conftest import SEED
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import serve

@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.metadrive import simulator
-from clients.metadrive.generate import (
+from looktwice.clients.metadrive import simulator
+from looktwice.clients.metadrive.generate import (
     GenerateConfig,
     GenerationError,
     block_file,
     generate,
     write_block,
 )
-from clients.metadrive.sheet import contact_sheet
-from clients.metadrive.stats import scene_stats
-from model.driving.labeller import expert_plan
-from model.driving.scene import TAGS, LabelledScene, SceneError
-from model.driving.scene_store import MANIFEST, SceneFileError, read_scenes, write_scenes
+from looktwice.clients.metadrive.sheet import contact_sheet
+from looktwice.clients.metadrive.stats import scene_stats
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.scene import TAGS, LabelledScene, SceneError
+from looktwice.model.driving.scene_store import MANIFEST, SceneFileError, read_scenes, write_scenes
 from tests.clients.metadrive.conftest import Filmed
 
 CONFIG = GenerateConfig(stride_s=2.0, duration_s=10.0, block=1)

@@ -8,13 +8,20 @@ import numpy as np
 import pytest
 import shapely
 
-from clients.metadrive.lane_maps import AHEAD_M, LINE_AHEAD_M, REACH_M, LaneMaps, _intersections, _parts
-from clients.metadrive.roads import Lane, Road, RoadMap, Turn
-from model.driving.lane_map import LaneMap
-from model.driving.pdm.geometry import crosses_itself
-from model.driving.pdm.labelled import plans_of, world_of
-from model.driving.pdm.scoring import COLLISIONS, DIRECTION, EXTENDED_COMFORT, LIGHTS, Others, score
-from model.driving.scene import LabelledScene
+from looktwice.clients.metadrive.lane_maps import (
+    AHEAD_M,
+    LINE_AHEAD_M,
+    REACH_M,
+    LaneMaps,
+    _intersections,
+    _parts,
+)
+from looktwice.clients.metadrive.roads import Lane, Road, RoadMap, Turn
+from looktwice.model.driving.lane_map import LaneMap
+from looktwice.model.driving.pdm.geometry import crosses_itself
+from looktwice.model.driving.pdm.labelled import plans_of, world_of
+from looktwice.model.driving.pdm.scoring import COLLISIONS, DIRECTION, EXTENDED_COMFORT, LIGHTS, Others, score
+from looktwice.model.driving.scene import LabelledScene
 from tests.clients.metadrive.conftest import Filmed
 
 

@@ -5,10 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from clients.metadrive.episode import run_episode
-from clients.metadrive.episode_log import EpisodeLog
-from clients.metadrive.rig import Rig
-from clients.metadrive.windows import labelled_scenes
+from looktwice.clients.metadrive.episode import run_episode
+from looktwice.clients.metadrive.episode_log import EpisodeLog
+from looktwice.clients.metadrive.rig import Rig
+from looktwice.clients.metadrive.windows import labelled_scenes
 
 SEED, DURATION_S = 6011, 48.0
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, ImageDraw
 
-from clients.metadrive.lettering import font, wrap, write_in_box
+from looktwice.clients.metadrive.lettering import font, wrap, write_in_box
 
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
 texts = st.text(st.sampled_from("abW .,0\n"), max_size=120)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clients.metadrive.episode import World
-from clients.metadrive.fork import Forked, fork_expert
-from clients.metadrive.generate import GENERATOR_VERSION, GenerateConfig
-from clients.metadrive.outcomes import judged, outcomes_at
-from clients.metadrive.replay import (
+from looktwice.clients.metadrive.episode import World
+from looktwice.clients.metadrive.fork import Forked, fork_expert
+from looktwice.clients.metadrive.generate import GENERATOR_VERSION, GenerateConfig
+from looktwice.clients.metadrive.outcomes import judged, outcomes_at
+from looktwice.clients.metadrive.replay import (
     EpisodeSetting,
     Moment,
     ReplayError,
@@ -22,10 +22,10 @@ from clients.metadrive.replay import (
     replayed,
     setting_of,
 )
-from clients.metadrive.simulator import described
-from model.driving.outcome import FailureName, Outcome
-from model.driving.scene_store import MANIFEST
-from model.driving.trajectory import FUTURE_STEPS, FloatArray, constant_velocity
+from looktwice.clients.metadrive.simulator import described
+from looktwice.model.driving.outcome import FailureName, Outcome
+from looktwice.model.driving.scene_store import MANIFEST
+from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray, constant_velocity
 from tests.clients.metadrive.conftest import DURATION_S, SEED, Filmed
 from tests.clients.metadrive.test_fork import driven
 

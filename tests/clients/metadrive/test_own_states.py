@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.metadrive.drive import TAKE_OVER, DriveConfig
-from clients.metadrive.generate import GenerateConfig, GenerationError, generate
-from clients.metadrive.own_states import own_states
-from clients.metadrive.pilots import Careless, ConstantVelocity, Planned
-from clients.metadrive.replay import ReplayError, setting_of
-from model.driving.metrics import collides, leaves_road
-from model.driving.scene import Scene
-from model.driving.scene_store import read_scenes
-from model.driving.tracks import Track
-from service.cli.scenes import served_pilot
-from service.settings import Settings
+from looktwice.clients.metadrive.drive import TAKE_OVER, DriveConfig
+from looktwice.clients.metadrive.generate import GenerateConfig, GenerationError, generate
+from looktwice.clients.metadrive.own_states import own_states
+from looktwice.clients.metadrive.pilots import Careless, ConstantVelocity, Planned
+from looktwice.clients.metadrive.replay import ReplayError, setting_of
+from looktwice.model.driving.metrics import collides, leaves_road
+from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.tracks import Track
+from looktwice.service.cli.scenes import served_pilot
+from looktwice.service.settings import Settings
 from tests.clients.metadrive.conftest import SEED
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from clients.metadrive.episode import run_episode
-from clients.metadrive.tracks import tracks_at
-from clients.metadrive.windows import _Moment
-from model.driving.tracks import tracks_of
+from looktwice.clients.metadrive.episode import run_episode
+from looktwice.clients.metadrive.tracks import tracks_at
+from looktwice.clients.metadrive.windows import _Moment
+from looktwice.model.driving.tracks import tracks_of
 from tests.clients.metadrive.conftest import SEED
 
 

@@ -9,16 +9,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from clients import wire
-from clients.navsim.agent import NavsimMissing, NavsimPlanner, make_agent
-from clients.navsim.history import history_of
-from clients.navsim.inputs import InputError
-from clients.navsim.reprojection import seen_as
-from clients.planner import PlannerClient
-from model.driving.cameras import FRONT_CAMERAS
-from model.driving.images import check_image
-from model.driving.trajectory import agreed
-from service.settings import Settings
+from looktwice.clients import wire
+from looktwice.clients.navsim.agent import NavsimMissing, NavsimPlanner, make_agent
+from looktwice.clients.navsim.history import history_of
+from looktwice.clients.navsim.inputs import InputError
+from looktwice.clients.navsim.reprojection import seen_as
+from looktwice.clients.planner import PlannerClient
+from looktwice.model.driving.cameras import FRONT_CAMERAS
+from looktwice.model.driving.images import check_image
+from looktwice.model.driving.trajectory import agreed
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve
 

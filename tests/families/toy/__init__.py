@@ -4,10 +4,19 @@ from typing import Final
 
 import numpy as np
 
-from model.driving.trajectory import FloatArray, present_speed
-from model.families.family import Branch, Decode, Family, Lesson, Reading, Situation, TextInputs
-from model.formats.compounds import Number, Repeat
-from model.formats.pieces import Choice, Format, FreeText, Literal, Option, Section, Sequence, Values
+from looktwice.model.driving.trajectory import FloatArray, present_speed
+from looktwice.model.families.family import Branch, Decode, Family, Lesson, Reading, Situation, TextInputs
+from looktwice.model.formats.compounds import Number, Repeat
+from looktwice.model.formats.pieces import (
+    Choice,
+    Format,
+    FreeText,
+    Literal,
+    Option,
+    Section,
+    Sequence,
+    Values,
+)
 
 _TIMES_S: Final = (1.0, 2.0, 3.0, 4.0)
 _TOP_SPEED_MS: Final = 30

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import torch
 
-from model.bench.presets import PRESETS, Preset, write_random
-from model.bench.roofline import Work, work_of_plan
-from model.engines.engine import Controls, DrawFinished, PlanRequest
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.network.checkpoint import read_config
+from looktwice.model.bench.presets import PRESETS, Preset, write_random
+from looktwice.model.bench.roofline import Work, work_of_plan
+from looktwice.model.engines.engine import Controls, DrawFinished, PlanRequest
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.network.checkpoint import read_config
 from tests.checkpoints import noisy_scene
 
 

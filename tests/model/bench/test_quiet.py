@@ -8,8 +8,8 @@ from itertools import count, repeat
 
 import pytest
 
-from model.bench.quiet import wait_until_quiet
-from model.engines.torch.threads import CpuTimes, cpu_times
+from looktwice.model.bench.quiet import wait_until_quiet
+from looktwice.model.engines.torch.threads import CpuTimes, cpu_times
 
 SPINS = """
 import time

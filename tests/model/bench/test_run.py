@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from model.bench.contenders import SHORTCUTS
-from model.bench.memory import peak_bytes
-from model.bench.report import BenchReport, Roofline
-from model.bench.roofline import Machine, Work
-from model.bench.run import Job, Row, can_do, run
-from model.bench.workload import Workload
-from model.bundled import SCENES
-from model.engines.torch.shortcuts import Shortcuts
+from looktwice.model.bench.contenders import SHORTCUTS
+from looktwice.model.bench.memory import peak_bytes
+from looktwice.model.bench.report import BenchReport, Roofline
+from looktwice.model.bench.roofline import Machine, Work
+from looktwice.model.bench.run import Job, Row, can_do, run
+from looktwice.model.bench.workload import Workload
+from looktwice.model.bundled import SCENES
+from looktwice.model.engines.torch.shortcuts import Shortcuts
 
 
 def job(checkpoint: Path, *contenders: str, loads: tuple[Workload, ...]) -> Job:
@@ -77,7 +77,7 @@ def test_memory_of_this_process_is_known() -> None:
 
 
 _PEAKS = """
-from model.bench.memory import forget_peaks, peak_bytes
+from looktwice.model.bench.memory import forget_peaks, peak_bytes
 forget_peaks()
 before = peak_bytes()
 much = b"x" * (300 << 20)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from model.bench.scoring import measure, scene
-from model.driving.pdm.scoring import Others, score
+from looktwice.model.bench.scoring import measure, scene
+from looktwice.model.driving.pdm.scoring import Others, score
 
 
 def test_without_a_checkout_there_is_nothing_to_compare_with() -> None:

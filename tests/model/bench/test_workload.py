@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from model.bench.workload import Workload
+from looktwice.model.bench.workload import Workload
 from tests.checkpoints import noisy_scene
 
 

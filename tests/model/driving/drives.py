@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.images import encode_jpeg
-from model.driving.scene import (
+from looktwice.model.driving.images import encode_jpeg
+from looktwice.model.driving.scene import (
     FRONT_TELE,
     FRONT_WIDE,
     TRACK_STEPS,
@@ -17,7 +17,7 @@ from model.driving.scene import (
     LaneTrace,
     Scene,
 )
-from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
+from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
 
 Array = npt.NDArray[np.float64]
 

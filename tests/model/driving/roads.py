@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.driving.scene import LabelledScene, Light
-from model.driving.trajectory import FloatArray
+from looktwice.model.driving.scene import LabelledScene, Light
+from looktwice.model.driving.trajectory import FloatArray
 
 
 def arc(radius_m: float, turned_rad: float, start: tuple[float, float] = (0.0, 0.0)) -> FloatArray:

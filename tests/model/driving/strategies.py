@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from hypothesis import strategies as st
 
-from model.driving.direction import group_of
-from model.driving.phrases import (
+from looktwice.model.driving.direction import group_of
+from looktwice.model.driving.phrases import (
     FARTHEST_M,
     HEADS,
     STEP_M,
@@ -23,7 +23,7 @@ from model.driving.phrases import (
     change_of,
     consequences,
 )
-from model.driving.plan import GROUPS, Group
+from looktwice.model.driving.plan import GROUPS, Group
 
 _AHEAD = st.integers(1, FARTHEST_M // STEP_M).map(lambda steps: steps * STEP_M)
 _PLACES = ("my lane", "the left lane", "the right lane", "the left side", "the right side")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.agreement import (
+from looktwice.model.driving.agreement import (
     FOLLOWS_IOU,
     PARTS,
     agreement,
@@ -15,8 +15,8 @@ from model.driving.agreement import (
     reason_and_view,
     trajectory_iou,
 )
-from model.driving.labeller import expert_plan, label_plan
-from model.driving.phrases import (
+from looktwice.model.driving.labeller import expert_plan, label_plan
+from looktwice.model.driving.phrases import (
     NOTHING,
     Bend,
     Clear,
@@ -29,8 +29,8 @@ from model.driving.phrases import (
     consequences,
     head_of,
 )
-from model.driving.plan import MetaAction, Plan
-from model.driving.view import Sight, View
+from looktwice.model.driving.plan import MetaAction, Plan
+from looktwice.model.driving.view import Sight, View
 from tests.model.driving.drives import MIDDLES_S, labelled_scene
 
 STEADY = labelled_scene(10.0)

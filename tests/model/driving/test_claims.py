@@ -6,16 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from clients.labelling.teachers.rules import RuleTeacher
-from clients.labelling.teachers.teacher import NothingInView, Question
-from model.bundled import SCENES
-from model.driving.claims import claims, unfounded
-from model.driving.direction import wanted_changes
-from model.driving.labeller import expert_plan
-from model.driving.phrases import read_facts
-from model.driving.scene_store import read_scenes
-from model.driving.seen import all_shown
-from model.driving.view import Sight, Surroundings, View, view_of
+from looktwice.clients.labelling.teachers.rules import RuleTeacher
+from looktwice.clients.labelling.teachers.teacher import NothingInView, Question
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.claims import claims, unfounded
+from looktwice.model.driving.direction import wanted_changes
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.phrases import read_facts
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.seen import all_shown
+from looktwice.model.driving.view import Sight, Surroundings, View, view_of
 
 VAN = Sight("vehicle", 30.0, "my lane", 5.0)
 WALKER = Sight("pedestrian", 12.0, "the right side", 0.0)

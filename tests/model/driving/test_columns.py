@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from model.driving.columns import Columns, aligned, cell, cells, interval_cell, titles
+from looktwice.model.driving.columns import Columns, aligned, cell, cells, interval_cell, titles
 
 COLUMNS: Columns = {"ade_m": ("ADE m", "{:.2f}"), "share": ("share", "{:.1%}")}
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from model.driving.labeller import label_plan
-from model.driving.metrics import displacement_errors
-from model.driving.plan import TICKS, WORDS
-from model.driving.trajectory import (
+from looktwice.model.driving.labeller import label_plan
+from looktwice.model.driving.metrics import displacement_errors
+from looktwice.model.driving.plan import TICKS, WORDS
+from looktwice.model.driving.trajectory import (
     STEP_S,
     check_history,
     check_trajectory,

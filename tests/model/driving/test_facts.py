@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.agents import Agent
-from model.driving.facts import FACTS, facts_of, mirrored, scene_facts
-from model.driving.scene import EGO_LENGTH_M
-from model.driving.tracks import Track, tracks_of
+from looktwice.model.driving.agents import Agent
+from looktwice.model.driving.facts import FACTS, facts_of, mirrored, scene_facts
+from looktwice.model.driving.scene import EGO_LENGTH_M
+from looktwice.model.driving.tracks import Track, tracks_of
 from tests.model.driving.drives import agent, labelled_scene
 
 ROUTE = np.stack([4.0 * np.arange(1, 21), 0.3 * np.arange(1, 21)], axis=1).astype(np.float32)

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.bundled import SCENES
-from model.driving.hashing import annotations_hash, hash_of, judged_hash
-from model.driving.lane_map import LaneArea, LaneMap
-from model.driving.scene_store import read_scenes
-from model.driving.trajectory import constant_velocity
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.hashing import annotations_hash, hash_of, judged_hash
+from looktwice.model.driving.lane_map import LaneArea, LaneMap
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.trajectory import constant_velocity
 
 
 def test_hashes_tell_parts_apart() -> None:

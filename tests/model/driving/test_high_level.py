@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.high_level import (
+from looktwice.model.driving.high_level import (
     LATERAL,
     LONGITUDINAL,
     HighLevelAction,
@@ -15,8 +15,8 @@ from model.driving.high_level import (
     action_of,
     longitudinal_of,
 )
-from model.driving.lane_graph import LaneGraph
-from model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, at_times
+from looktwice.model.driving.lane_graph import LaneGraph
+from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, at_times
 from tests.model.driving.drives import MIDDLES_S, Array, drive, mirrored
 from tests.model.driving.roads import arc, flipped, junction, straight
 

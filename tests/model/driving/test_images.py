@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from model.driving import images
-from model.driving.images import (
+from looktwice.model.driving import images
+from looktwice.model.driving.images import (
     MAX_ENCODED_BYTES,
     MAX_FRAMES,
     MAX_SCANS,

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from model.driving.labeller import MIN_DURATION, label_plan
-from model.driving.plan import TICKS, Track
-from model.driving.scene import TRACK_STEPS, LaneTrace
-from model.driving.trajectory import GeometryError
+from looktwice.model.driving.labeller import MIN_DURATION, label_plan
+from looktwice.model.driving.plan import TICKS, Track
+from looktwice.model.driving.scene import TRACK_STEPS, LaneTrace
+from looktwice.model.driving.trajectory import GeometryError
 from tests.model.driving.drives import MIDDLES_S, ROWS_S, drive, mirrored
 
 LANES = 4

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from model.driving.agents import SceneError
-from model.driving.lane_map import LaneArea, LaneMap, to_the_centimetre
+from looktwice.model.driving.agents import SceneError
+from looktwice.model.driving.lane_map import LaneArea, LaneMap, to_the_centimetre
 from tests.model.driving.drives import rectangle
 
 LINE = np.array([[-20.0, 0.0], [160.0, 0.0]])

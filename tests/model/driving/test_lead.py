@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.lead import lead_within
+from looktwice.model.driving.lead import lead_within
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
 
 

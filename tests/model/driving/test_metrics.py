@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from shapely import Point, Polygon
 
-from model.driving.metrics import (
+from looktwice.model.driving.metrics import (
     box_corners,
     collides,
     corner_distances,
@@ -17,8 +17,8 @@ from model.driving.metrics import (
     leaves_road,
     points_inside,
 )
-from model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, Agent
-from model.driving.trajectory import FloatArray
+from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, Agent
+from looktwice.model.driving.trajectory import FloatArray
 from tests.model.driving.drives import agent, drive, rectangle
 
 

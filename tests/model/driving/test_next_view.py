@@ -4,8 +4,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from model.driving.cameras import CAMERA_SPECS
-from model.driving.next_view import FAR_M, moved_view
+from looktwice.model.driving.cameras import CAMERA_SPECS
+from looktwice.model.driving.next_view import FAR_M, moved_view
 
 FRONT = CAMERA_SPECS["front"]
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.agents import AGENT_KINDS, Agent
-from model.driving.perceived import (
+from looktwice.model.driving.agents import AGENT_KINDS, Agent
+from looktwice.model.driving.perceived import (
     MAX_PERCEIVED,
     ROW_SIZE,
     SAFE_TIMES_S,
@@ -20,7 +20,7 @@ from model.driving.perceived import (
     perceived_of,
     perceived_of_row,
 )
-from model.driving.scene import LabelledScene
+from looktwice.model.driving.scene import LabelledScene
 from tests.model.driving.drives import agent, labelled_scene
 from tests.model.driving.roads import mirrored_scene
 

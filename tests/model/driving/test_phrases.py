@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.direction import CHANGES, done, group_of, needed, track_changes, wanted_changes
-from model.driving.phrases import (
+from looktwice.model.driving.direction import CHANGES, done, group_of, needed, track_changes, wanted_changes
+from looktwice.model.driving.phrases import (
     NOTHING,
     Bend,
     Clear,
@@ -19,7 +19,7 @@ from model.driving.phrases import (
     facts_of,
     read_facts,
 )
-from model.driving.plan import GROUPS, Plan, parse_plan
+from looktwice.model.driving.plan import GROUPS, Plan, parse_plan
 from tests.model.driving.strategies import facts
 from tests.model.formats.strategies import plans
 

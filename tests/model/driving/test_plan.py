@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.plan import (
+from looktwice.model.driving.plan import (
     GROUPS,
     TICKS,
     WORDS,

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.agents import Agent, AgentKind
-from model.driving.high_level import HighLevelAction
-from model.driving.reasoning import edges_of, thoughts_of
-from model.driving.scene import LabelledScene
-from model.driving.thoughts import Crossing, Edges, Leader, Merging, Obstacle, Road, Thoughts
-from model.driving.trajectory import FloatArray
+from looktwice.model.driving.agents import Agent, AgentKind
+from looktwice.model.driving.high_level import HighLevelAction
+from looktwice.model.driving.reasoning import edges_of, thoughts_of
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.thoughts import Crossing, Edges, Leader, Merging, Obstacle, Road, Thoughts
+from looktwice.model.driving.trajectory import FloatArray
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene, rectangle
 from tests.model.driving.roads import arc, mirrored_scene, straight
 

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.facts import FACTS, facts_of
-from model.driving.phrases import Bend, Clear, Statement, Straight, Thing
-from model.driving.reasons import reasons_in, reasons_read, reasons_tracked
-from model.driving.seen import shown
-from model.driving.tracks import Track
-from model.driving.trajectory import FloatArray
-from model.driving.view import Sight, View, view_along
+from looktwice.model.driving.facts import FACTS, facts_of
+from looktwice.model.driving.phrases import Bend, Clear, Statement, Straight, Thing
+from looktwice.model.driving.reasons import reasons_in, reasons_read, reasons_tracked
+from looktwice.model.driving.seen import shown
+from looktwice.model.driving.tracks import Track
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.driving.view import Sight, View, view_along
 
 PLACES = ("my lane", "the left lane", "the right lane", "the left side", "the right side")
 SIGHTS = st.builds(

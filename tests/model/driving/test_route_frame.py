@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.route_frame import RouteFrame
-from model.driving.trajectory import FloatArray
+from looktwice.model.driving.route_frame import RouteFrame
+from looktwice.model.driving.trajectory import FloatArray
 
 LENGTHS = 4.0 * np.arange(1, 21)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.scene import (
+from looktwice.model.driving.scene import (
     FRONT_TELE,
     FRONT_WIDE,
     Agent,
@@ -16,7 +16,7 @@ from model.driving.scene import (
     SceneError,
     split_of_seed,
 )
-from model.driving.trajectory import GeometryError
+from looktwice.model.driving.trajectory import GeometryError
 from tests.model.driving.drives import agent, clips, drive, labelled_scene
 
 

@@ -13,9 +13,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from model.driving.lane_map import LaneArea, LaneMap
-from model.driving.scene import FRONT_WIDE, DenseTarget, LabelledScene, NextFrame, SceneError
-from model.driving.scene_store import (
+from looktwice.model.driving.lane_map import LaneArea, LaneMap
+from looktwice.model.driving.scene import FRONT_WIDE, DenseTarget, LabelledScene, NextFrame, SceneError
+from looktwice.model.driving.scene_store import (
     ROW_GROUP,
     SCENE_VERSION,
     SceneFileError,
@@ -235,7 +235,7 @@ def test_a_failing_source_leaves_the_old_file_and_nothing_else(tmp_path: Path) -
 KILLED_WRITER = """
 import os, signal, sys
 from pathlib import Path
-from model.driving.scene_store import ROW_GROUP, write_scenes
+from looktwice.model.driving.scene_store import ROW_GROUP, write_scenes
 from tests.model.driving.drives import labelled_scene
 
 def scenes():

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from model.driving.scene import TAGS, LabelledScene, Tag
-from model.driving.selection import pick_varied
+from looktwice.model.driving.scene import TAGS, LabelledScene, Tag
+from looktwice.model.driving.selection import pick_varied
 from tests.model.driving.drives import labelled_scene
 
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.agents import Agent
-from model.driving.paper_axes import from_paper_axes, to_paper_axes
-from model.driving.scene import LabelledScene
-from model.driving.short_term import (
+from looktwice.model.driving.agents import Agent
+from looktwice.model.driving.paper_axes import from_paper_axes, to_paper_axes
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.short_term import (
     INERTIA,
     GoalFit,
     ShortTermError,
@@ -23,7 +23,7 @@ from model.driving.short_term import (
     mission_goal,
     steps,
 )
-from model.driving.trajectory import FloatArray, from_ego_frame, wrap_angle
+from looktwice.model.driving.trajectory import FloatArray, from_ego_frame, wrap_angle
 from tests.model.driving.drives import ROWS_S, agent, drive, labelled_scene
 
 speeds_ms = st.floats(-3, 30)

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.high_level import HighLevelAction
-from model.driving.phrases import FARTHEST_M, STEP_M
-from model.driving.sentences import ThoughtError, decisions, joined
-from model.driving.thoughts import (
+from looktwice.model.driving.high_level import HighLevelAction
+from looktwice.model.driving.phrases import FARTHEST_M, STEP_M
+from looktwice.model.driving.sentences import ThoughtError, decisions, joined
+from looktwice.model.driving.thoughts import (
     Crossing,
     Edges,
     Leader,

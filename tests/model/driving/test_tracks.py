@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.agents import Agent, SceneError
-from model.driving.hashing import scene_hash
-from model.driving.tracks import MAX_TRACKS, Track, nearest_tracks, track_of, tracks_of
+from looktwice.model.driving.agents import Agent, SceneError
+from looktwice.model.driving.hashing import scene_hash
+from looktwice.model.driving.tracks import MAX_TRACKS, Track, nearest_tracks, track_of, tracks_of
 from tests.service.scenes import agent, scene
 
 CAR = Track(20.0, 0.0, 0.0, 8.0, 4.5, 1.9, "vehicle", frozenset({"brake", "left"}))
@@ -83,7 +83,7 @@ def test_tracks_change_a_scene_s_hash_and_no_process_changes_it() -> None:
     assert len({scene_hash(without), scene_hash(nobody), scene_hash(one)}) == 3
     code = (
         "from dataclasses import replace\n"
-        "from model.driving.hashing import scene_hash\n"
+        "from looktwice.model.driving.hashing import scene_hash\n"
         "from tests.model.driving.test_tracks import CAR\n"
         "from tests.service.scenes import scene\n"
         "print(scene_hash(replace(scene(), tracks=(CAR,))))"

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.trajectory import (
+from looktwice.model.driving.trajectory import (
     GeometryError,
     agreed,
     at_10_hz,

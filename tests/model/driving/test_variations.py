@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.driving.images import decode_image
-from model.driving.variations import fresh, moved
+from looktwice.model.driving.images import decode_image
+from looktwice.model.driving.variations import fresh, moved
 from tests.checkpoints import noisy_scene
 
 

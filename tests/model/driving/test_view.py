@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model.driving.scene import Agent, LabelledScene
-from model.driving.view import Surroundings, View
-from model.driving.view import view_of as view_of_scene
+from looktwice.model.driving.scene import Agent, LabelledScene
+from looktwice.model.driving.view import Surroundings, View
+from looktwice.model.driving.view import view_of as view_of_scene
 from tests.service.scenes import labelled
 
 

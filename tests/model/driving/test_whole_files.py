@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from model.driving.whole_files import written_whole
+from looktwice.model.driving.whole_files import written_whole
 
 
 def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
@@ -32,7 +32,7 @@ def test_what_a_killed_process_left_goes_and_what_another_writes_stays(tmp_path:
     path = tmp_path / "file"
     killed = (
         "import os, sys; from pathlib import Path\n"
-        "from model.driving.whole_files import written_whole\n"
+        "from looktwice.model.driving.whole_files import written_whole\n"
         "with written_whole(Path(sys.argv[1])) as temporary:\n"
         "    temporary.write_text('half'); os.kill(os.getpid(), 9)"
     )

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from model.engines.torch.decoder import Decoder
-from model.network.checkpoint import Loaded, load
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.network.checkpoint import Loaded, load
 from tests.model.engines.reference import exactly
 
 

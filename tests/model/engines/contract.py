@@ -10,10 +10,10 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
-from model.driving.images import ImageError
-from model.driving.plan import parse_plan
-from model.driving.scene import Clip, Scene
-from model.engines.engine import (
+from looktwice.model.driving.images import ImageError
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.scene import Clip, Scene
+from looktwice.model.engines.engine import (
     Controls,
     Draw,
     DrawFinished,
@@ -26,7 +26,7 @@ from model.engines.engine import (
     Started,
     TextWritten,
 )
-from model.families.registry import family_named
+from looktwice.model.families.registry import family_named
 
 Check = Callable[[Engine, Scene], Awaitable[None]]
 GIVEN: Final = parse_plan("- longitudinal\n  - 0.0s-2.5s: Keep Speed\n  - 2.5s-6.4s: Accelerate\n")

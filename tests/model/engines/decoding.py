@@ -8,14 +8,14 @@ from typing import Any
 
 from torch import Tensor
 
-from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
-from model.engines.least_error import LeastError
-from model.engines.torch.decoder import Decoder, Failed
-from model.engines.torch.request import Request, Tree
-from model.engines.torch.rows import Row
-from model.families.cf_vla import CF_VLA
-from model.formats.cursor import CompiledFormat
-from model.network.checkpoint import Loaded
+from looktwice.model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
+from looktwice.model.engines.least_error import LeastError
+from looktwice.model.engines.torch.decoder import Decoder, Failed
+from looktwice.model.engines.torch.request import Request, Tree
+from looktwice.model.engines.torch.rows import Row
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.network.checkpoint import Loaded
 from tests.checkpoints import noisy_scene
 
 

@@ -9,14 +9,14 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor, nn
 
-from model.engines.engine import Draw, PlanRequest
-from model.engines.requests import decided, given_plans, read
-from model.engines.sampling import probabilities
-from model.engines.transformers.decoding import Decoding
-from model.families.family import Family
-from model.families.registry import families_of
-from model.formats.cursor import CompiledFormat
-from model.network.checkpoint import Loaded
+from looktwice.model.engines.engine import Draw, PlanRequest
+from looktwice.model.engines.requests import decided, given_plans, read
+from looktwice.model.engines.sampling import probabilities
+from looktwice.model.engines.transformers.decoding import Decoding
+from looktwice.model.families.family import Family
+from looktwice.model.families.registry import families_of
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.network.checkpoint import Loaded
 
 
 class _ExactRotary(nn.Module):

@@ -5,15 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.agreement import trajectory_iou
-from model.driving.labeller import label_plan
-from model.driving.plan import WORDS, MetaAction, Plan, parse_plan, plan_from_bins
-from model.engines.binding import BOUND_IOU, Binding, first_codes
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.runner import Runner
-from model.families.cf_vla import CF_VLA
-from model.formats.cursor import Token
-from model.network.checkpoint import Loaded
+from looktwice.model.driving.agreement import trajectory_iou
+from looktwice.model.driving.labeller import label_plan
+from looktwice.model.driving.plan import WORDS, MetaAction, Plan, parse_plan, plan_from_bins
+from looktwice.model.engines.binding import BOUND_IOU, Binding, first_codes
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.formats.cursor import Token
+from looktwice.model.network.checkpoint import Loaded
 from tests.checkpoints import noisy_scene
 from tests.model.engines.decoding import decode, request
 from tests.model.engines.reference import reference_draws

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import torch
 
-from model.driving.scene import Clip, Scene
-from model.engines.torch.clips import ClipCache
-from model.engines.torch.runner import PromptRequest, Runner
-from model.network.checkpoint import load
+from looktwice.model.driving.scene import Clip, Scene
+from looktwice.model.engines.torch.clips import ClipCache
+from looktwice.model.engines.torch.runner import PromptRequest, Runner
+from looktwice.model.network.checkpoint import load
 from tests.checkpoints import noisy_scene
 
 SLICES = 4

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from model.bundled import CHECKPOINT, SCENES
-from model.driving.scene_store import read_scenes
-from model.engines.engine import Engine, RequestError
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.transformers.engine import TransformersEngine
+from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.engines.engine import Engine, RequestError
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.engines.transformers.engine import TransformersEngine
 from tests.model.engines.contract import CONTRACT, TELLING, Check, asked, plan
 from tests.service.scripted_engine import ScriptedEngine
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from model.driving.plan import plan_from_bins
-from model.engines.engine import (
+from looktwice.model.driving.plan import plan_from_bins
+from looktwice.model.engines.engine import (
     DraftFinished,
     Draw,
     DrawFinished,
@@ -14,11 +14,11 @@ from model.engines.engine import (
     SectionFinished,
     Started,
 )
-from model.engines.torch.deadlines import LatencyModel, TimeFor
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.runner import Runner
-from model.formats.pieces import Value, Values
-from model.network.checkpoint import Loaded
+from looktwice.model.engines.torch.deadlines import LatencyModel, TimeFor
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.formats.pieces import Value, Values
+from looktwice.model.network.checkpoint import Loaded
 from tests.model.engines.decoding import beginning, decode, request
 from tests.model.engines.reference import reference_draws
 

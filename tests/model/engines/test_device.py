@@ -10,11 +10,11 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from model.engines.engine import Controls, DrawFinished, PlanRequest
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.graphs import Capture
-from model.engines.torch.runner import Runner
-from model.network.checkpoint import load
+from looktwice.model.engines.engine import Controls, DrawFinished, PlanRequest
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.graphs import Capture
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.network.checkpoint import load
 from tests.checkpoints import noisy_scene
 from tests.model.engines.decoding import Again
 

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from model.engines.requests import leads_to_reflection
-from model.engines.sampling import uniform
-from model.engines.torch.drafter import _CONTEXTS, Drafter, _Ngrams, _Responses
-from model.engines.torch.rows import Row
-from model.families.cf_vla import CF_VLA
-from model.families.cf_vla.format import BRANCH
-from model.network.checkpoint import Loaded, load
+from looktwice.model.engines.requests import leads_to_reflection
+from looktwice.model.engines.sampling import uniform
+from looktwice.model.engines.torch.drafter import _CONTEXTS, Drafter, _Ngrams, _Responses
+from looktwice.model.engines.torch.rows import Row
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.cf_vla.format import BRANCH
+from looktwice.model.network.checkpoint import Loaded, load
 from tests.model.engines.decoding import beginning
 
 

@@ -25,22 +25,22 @@ import torch
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
-from model.driving.plan import plan_from_bins
-from model.driving.scene import CAMERAS
-from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thinking
-from model.engines.sampling import probabilities
-from model.engines.torch.deadlines import TimeFor
-from model.engines.torch.decoder import Decoder, Failed
-from model.engines.torch.request import Request
-from model.engines.torch.rows import Row
-from model.engines.torch.runner import Prompt, Runner
-from model.engines.torch.shortcuts import Shortcuts
-from model.families.cf_vla import CF_VLA
-from model.families.family import Attempt, Family
-from model.families.registry import OURS, families_of, family_named
-from model.formats.pieces import Format
-from model.network.checkpoint import Loaded, load
-from model.network.settings import NANO_SETTINGS, VlaSettings
+from looktwice.model.driving.plan import plan_from_bins
+from looktwice.model.driving.scene import CAMERAS
+from looktwice.model.engines.engine import Controls, Draw, DrawFinished, PlanRequest, Thinking
+from looktwice.model.engines.sampling import probabilities
+from looktwice.model.engines.torch.deadlines import TimeFor
+from looktwice.model.engines.torch.decoder import Decoder, Failed
+from looktwice.model.engines.torch.request import Request
+from looktwice.model.engines.torch.rows import Row
+from looktwice.model.engines.torch.runner import Prompt, Runner
+from looktwice.model.engines.torch.shortcuts import Shortcuts
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.family import Attempt, Family
+from looktwice.model.families.registry import OURS, families_of, family_named
+from looktwice.model.formats.pieces import Format
+from looktwice.model.network.checkpoint import Loaded, load
+from looktwice.model.network.settings import NANO_SETTINGS, VlaSettings
 from tests.checkpoints import made_up_tracks, noisy_scene, write_untrained
 from tests.model.engines.decoding import Again
 from tests.model.engines.reference import Shares, exactly, reference

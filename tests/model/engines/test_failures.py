@@ -8,14 +8,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from model.engines.engine import Controls, Draw, PlanRequest, RequestError
-from model.engines.torch.deadlines import TimeFor
-from model.engines.torch.decoder import Decoder, Failed
-from model.engines.torch.drafter import Drafter
-from model.engines.torch.rows import Row
-from model.engines.torch.runner import Runner
-from model.engines.torch.shortcuts import Shortcuts
-from model.network.checkpoint import Loaded
+from looktwice.model.engines.engine import Controls, Draw, PlanRequest, RequestError
+from looktwice.model.engines.torch.deadlines import TimeFor
+from looktwice.model.engines.torch.decoder import Decoder, Failed
+from looktwice.model.engines.torch.drafter import Drafter
+from looktwice.model.engines.torch.rows import Row
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.engines.torch.shortcuts import Shortcuts
+from looktwice.model.network.checkpoint import Loaded
 from tests.model.engines.decoding import decode_some, request
 from tests.model.engines.reference import reference_draws
 

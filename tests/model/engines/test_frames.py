@@ -12,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from model.driving.images import ImageError
-from model.driving.scene import Clip, Scene
-from model.engines.engine import Controls, DrawFinished, PlanRequest
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.torch.frames import Frames
-from model.network.checkpoint import load
-from model.network.inputs import InputBuilder
+from looktwice.model.driving.images import ImageError
+from looktwice.model.driving.scene import Clip, Scene
+from looktwice.model.engines.engine import Controls, DrawFinished, PlanRequest
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.engines.torch.frames import Frames
+from looktwice.model.network.checkpoint import load
+from looktwice.model.network.inputs import InputBuilder
 from tests.checkpoints import noisy_scene
 
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.engines.torch import graphs
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.graphs import Capture, Captured, CudaGraph, Graphs, Numbers, Sizes
-from model.engines.torch.layout import Part
-from model.engines.torch.runner import Runner
-from model.network.checkpoint import Loaded, load
+from looktwice.model.engines.torch import graphs
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.graphs import Capture, Captured, CudaGraph, Graphs, Numbers, Sizes
+from looktwice.model.engines.torch.layout import Part
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.network.checkpoint import Loaded, load
 from tests.model.engines.decoding import Again, decode, request
 
 SMALL, LARGE = (Sizes((Part(0, 1, 1, 32),), (count,)) for count in (2, 5))

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.engines.engine import Controls
-from model.engines.least_error import Expected, LeastError, least_error
-from model.engines.sampling import probabilities
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.runner import Runner
-from model.formats.cursor import Allowed
-from model.network.checkpoint import Loaded, load
+from looktwice.model.engines.engine import Controls
+from looktwice.model.engines.least_error import Expected, LeastError, least_error
+from looktwice.model.engines.sampling import probabilities
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.formats.cursor import Allowed
+from looktwice.model.network.checkpoint import Loaded, load
 from tests.checkpoints import noisy_scene
 from tests.model.engines.decoding import decode, request
 from tests.model.engines.reference import reference_draws

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from model.driving.agreement import reason_and_change
-from model.driving.phrases import corrected, read_facts
-from model.driving.plan import Plan, parse_plan
-from model.engines.torch.deadlines import LatencyModel
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.runner import Runner
-from model.network.checkpoint import Loaded, load
+from looktwice.model.driving.agreement import reason_and_change
+from looktwice.model.driving.phrases import corrected, read_facts
+from looktwice.model.driving.plan import Plan, parse_plan
+from looktwice.model.engines.torch.deadlines import LatencyModel
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.network.checkpoint import Loaded, load
 from tests.model.engines.decoding import decode, request
 from tests.model.engines.reference import exactly, reference_draws
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from model.engines.engine import Draw, DrawFinished, PlanRequest
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.request import Phase
-from model.engines.torch.runner import Runner
-from model.network.checkpoint import Loaded
+from looktwice.model.engines.engine import Draw, DrawFinished, PlanRequest
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.request import Phase
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.network.checkpoint import Loaded
 from tests.model.engines.decoding import Draws, decode, request
 
 pytestmark = pytest.mark.usefixtures("inference")
@@ -103,6 +103,6 @@ def test_kv_rows_have_room_for_usual_responses(exact: Loaded) -> None:
 def test_scheduling_needs_no_torch() -> None:
     modules = ("batch", "deadlines", "drafter", "layout", "memory", "request", "rows", "scheduler")
     script = "import sys; sys.modules['torch'] = None\n" + "".join(
-        f"import model.engines.torch.{module}\n" for module in modules
+        f"import looktwice.model.engines.torch.{module}\n" for module in modules
     )
     subprocess.run([sys.executable, "-c", script], check=True)

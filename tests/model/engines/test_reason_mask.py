@@ -12,20 +12,20 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.facts import FACTS
-from model.driving.phrases import HEADS, NOTHING, Statement, read_facts
-from model.driving.tracks import Track
-from model.engines.engine import Controls, PlanRequest, RequestError
-from model.engines.reason_mask import ReasonMask, reason_mask_of
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.runner import Runner
-from model.families.cf_vla import CF_VLA
-from model.families.traj_only import TRAJ_ONLY
-from model.formats.cursor import CompiledFormat, Token
-from model.formats.phrases import Phrases
-from model.formats.pieces import Format, Section, Sequence
-from model.formats.pieces import Literal as Text
-from model.network.checkpoint import Loaded, load
+from looktwice.model.driving.facts import FACTS
+from looktwice.model.driving.phrases import HEADS, NOTHING, Statement, read_facts
+from looktwice.model.driving.tracks import Track
+from looktwice.model.engines.engine import Controls, PlanRequest, RequestError
+from looktwice.model.engines.reason_mask import ReasonMask, reason_mask_of
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.traj_only import TRAJ_ONLY
+from looktwice.model.formats.cursor import CompiledFormat, Token
+from looktwice.model.formats.phrases import Phrases
+from looktwice.model.formats.pieces import Format, Section, Sequence
+from looktwice.model.formats.pieces import Literal as Text
+from looktwice.model.network.checkpoint import Loaded, load
 from tests.checkpoints import noisy_scene
 from tests.model.driving.strategies import facts
 from tests.model.engines.decoding import decode, request

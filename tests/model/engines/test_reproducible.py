@@ -10,13 +10,13 @@ from itertools import count
 import pytest
 import torch
 
-from model.bundled import CHECKPOINT, SCENES
-from model.driving.scene_store import read_scenes
-from model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.torch.layout import repeatable_bucket
-from model.engines.torch.packed import _Product
-from model.network.precision import bfloat16_is_fast, fast_dtype
+from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.engines.torch.layout import repeatable_bucket
+from looktwice.model.engines.torch.packed import _Product
+from looktwice.model.network.precision import bfloat16_is_fast, fast_dtype
 
 _SCENES = [labelled.scene for labelled in read_scenes(SCENES)][:6]
 _IDS = count()

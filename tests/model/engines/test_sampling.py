@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.engines.sampling import choose, probabilities, uniform
+from looktwice.model.engines.sampling import choose, probabilities, uniform
 
 LOGITS = np.array([0.0, 1.0, 2.0, -1.0])
 

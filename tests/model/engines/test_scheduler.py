@@ -2,11 +2,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from model.engines.engine import Controls, PlanRequest
-from model.engines.torch.memory import Memory
-from model.engines.torch.request import Phase, Request
-from model.engines.torch.scheduler import Scheduler
-from model.families.cf_vla import CF_VLA
+from looktwice.model.engines.engine import Controls, PlanRequest
+from looktwice.model.engines.torch.memory import Memory
+from looktwice.model.engines.torch.request import Phase, Request
+from looktwice.model.engines.torch.scheduler import Scheduler
+from looktwice.model.families.cf_vla import CF_VLA
 from tests.checkpoints import noisy_scene
 
 SCENE = noisy_scene(0)

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from model.engines.torch import threads
-from model.engines.torch.threads import CpuTimes, FreeCores, cpu_times
-from model.engines.torch.worker import Worker
+from looktwice.model.engines.torch import threads
+from looktwice.model.engines.torch.threads import CpuTimes, FreeCores, cpu_times
+from looktwice.model.engines.torch.worker import Worker
 
 
 @pytest.mark.parametrize(

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 import torch
 
-from model.driving.plan import parse_plan
-from model.engines.engine import (
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.engines.engine import (
     Draw,
     RequestError,
     SectionFinished,
     TextWritten,
 )
-from model.engines.torch.decoder import Counts, Decoder
-from model.engines.torch.runner import Runner
-from model.engines.torch.shortcuts import Shortcuts
-from model.families.cf_vla import CF_VLA
-from model.families.cf_vla.format import BRANCH
-from model.formats.cursor import CompiledFormat
-from model.formats.text import parse
-from model.network.checkpoint import Loaded, load
+from looktwice.model.engines.torch.decoder import Counts, Decoder
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.engines.torch.shortcuts import Shortcuts
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.cf_vla.format import BRANCH
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.text import parse
+from looktwice.model.network.checkpoint import Loaded, load
 from tests.model.engines.decoding import Again, decode, request
 from tests.model.engines.reference import reference_draws
 

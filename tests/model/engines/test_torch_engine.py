@@ -11,15 +11,22 @@ import numpy as np
 import pytest
 import torch
 
-from model.driving.images import ImageError
-from model.driving.scene import Clip, Scene
-from model.engines.binding import Binding
-from model.engines.engine import Controls, Draw, DrawFinished, EngineError, PlanRequest, RequestError
-from model.engines.torch.decoder import Decoder, StepEvent
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.torch.runner import Runner
-from model.evaluation.ladder import at_threshold
-from model.network.card import CheckpointError
+from looktwice.model.driving.images import ImageError
+from looktwice.model.driving.scene import Clip, Scene
+from looktwice.model.engines.binding import Binding
+from looktwice.model.engines.engine import (
+    Controls,
+    Draw,
+    DrawFinished,
+    EngineError,
+    PlanRequest,
+    RequestError,
+)
+from looktwice.model.engines.torch.decoder import Decoder, StepEvent
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.evaluation.ladder import at_threshold
+from looktwice.model.network.card import CheckpointError
 from tests.checkpoints import noisy_scene
 
 

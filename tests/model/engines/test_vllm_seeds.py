@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from model.engines.engine import MAX_DRAWS
-from model.engines.vllm.decoding import seed_of
+from looktwice.model.engines.engine import MAX_DRAWS
+from looktwice.model.engines.vllm.decoding import seed_of
 
 
 def test_neighbouring_seeds_share_no_draws() -> None:

@@ -8,9 +8,9 @@ from collections.abc import AsyncGenerator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.plan import Plan
-from model.driving.trajectory import FloatArray, constant_velocity
-from model.engines.engine import (
+from looktwice.model.driving.plan import Plan
+from looktwice.model.driving.trajectory import FloatArray, constant_velocity
+from looktwice.model.engines.engine import (
     Draw,
     DrawFinished,
     EngineError,
@@ -20,7 +20,7 @@ from model.engines.engine import (
     RequestError,
     SectionFinished,
 )
-from model.network.model_card import ModelCard
+from looktwice.model.network.model_card import ModelCard
 
 
 def draw_of(

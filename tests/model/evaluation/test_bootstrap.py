@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.evaluation.bootstrap import compare, mean_interval
-from model.evaluation.open_loop import SceneResult, evaluate_trajectories
+from looktwice.model.evaluation.bootstrap import compare, mean_interval
+from looktwice.model.evaluation.open_loop import SceneResult, evaluate_trajectories
 from tests.model.driving.drives import labelled_scene
 
 SCENE = labelled_scene()

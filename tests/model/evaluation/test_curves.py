@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from model.evaluation.curves import training_curves
+from looktwice.model.evaluation.curves import training_curves
 
 
 def log_of(path: Path, rows: list[object]) -> Path:

@@ -8,11 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.driving.perceived import Perceived, PerceivedAgent
-from model.driving.plan import parse_plan
-from model.engines.engine import Controls, Draw, DrawFinished, Engine, EngineError, Event, PlanRequest
-from model.evaluation.draw_store import DrawStore
-from model.families.family import Attempt, Foreseen, NextPicture
+from looktwice.model.driving.perceived import Perceived, PerceivedAgent
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.engines.engine import (
+    Controls,
+    Draw,
+    DrawFinished,
+    Engine,
+    EngineError,
+    Event,
+    PlanRequest,
+)
+from looktwice.model.evaluation.draw_store import DrawStore
+from looktwice.model.families.family import Attempt, Foreseen, NextPicture
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import FakeEngine, draw_of
 

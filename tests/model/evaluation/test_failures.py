@@ -9,13 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model.driving.pdm.judging import SceneJudge
-from model.driving.scene import LabelledScene
-from model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S, FloatArray, at_times, constant_velocity
-from model.engines.engine import Controls, Draw, DrawFinished, Event, PlanRequest
-from model.evaluation.failures import Stage, evaluate_stage, formats_of, stage_variants
-from model.evaluation.failures_report import FailuresReport, failures_report
-from model.network.model_card import ModelCard
+from looktwice.model.driving.pdm.judging import SceneJudge
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.trajectory import (
+    HALF_SECONDS_S,
+    TEN_HZ_S,
+    FloatArray,
+    at_times,
+    constant_velocity,
+)
+from looktwice.model.engines.engine import Controls, Draw, DrawFinished, Event, PlanRequest
+from looktwice.model.evaluation.failures import Stage, evaluate_stage, formats_of, stage_variants
+from looktwice.model.evaluation.failures_report import FailuresReport, failures_report
+from looktwice.model.network.model_card import ModelCard
 from tests.model.evaluation.fakes import FakeEngine, draw_of
 from tests.model.evaluation.test_scores import braking_for_a_wall, cruising
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model.driving.images import decode_image
-from model.driving.labeller import expert_plan
-from model.driving.plan import parse_plan
-from model.engines.engine import Controls
-from model.evaluation.ladder import (
+from looktwice.model.driving.images import decode_image
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.engines.engine import Controls
+from looktwice.model.evaluation.ladder import (
     COUNTERFACTUAL,
     LADDER,
     META_ACT,
@@ -26,9 +26,9 @@ from model.evaluation.ladder import (
     threshold_results,
     threshold_variants,
 )
-from model.evaluation.ladder_plots import difficulty_plot, temperature_plot, threshold_plot
-from model.evaluation.open_loop import SceneResult, evaluate_draws
-from model.evaluation.variants import Variant
+from looktwice.model.evaluation.ladder_plots import difficulty_plot, temperature_plot, threshold_plot
+from looktwice.model.evaluation.open_loop import SceneResult, evaluate_draws
+from looktwice.model.evaluation.variants import Variant
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import draw_of
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.cameras import CAMERA_SPECS
-from model.driving.images import encode_png
-from model.driving.scene import Clip, LabelledScene, NextFrame
-from model.evaluation.next_frames import (
+from looktwice.model.driving.cameras import CAMERA_SPECS
+from looktwice.model.driving.images import encode_png
+from looktwice.model.driving.scene import Clip, LabelledScene, NextFrame
+from looktwice.model.evaluation.next_frames import (
     copied,
     frechet_distance,
     frechet_interval,
@@ -16,7 +16,7 @@ from model.evaluation.next_frames import (
     warped,
     what_came,
 )
-from model.network.visual_codes import Frame
+from looktwice.model.network.visual_codes import Frame
 from tests.model.driving.drives import labelled_scene
 
 RANDOM = np.random.default_rng(0)

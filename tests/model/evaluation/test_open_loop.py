@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.labeller import expert_plan
-from model.driving.plan import MetaAction, Plan, plan_iou
-from model.evaluation.open_loop import (
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.plan import MetaAction, Plan, plan_iou
+from looktwice.model.evaluation.open_loop import (
     BASELINES,
     EXPERT,
     MEASURES,

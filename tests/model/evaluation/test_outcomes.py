@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.outcome import FailureName, Outcome
-from model.evaluation.outcomes import FollowedDraw, outcome_table
-from model.evaluation.perception import auc
+from looktwice.model.driving.outcome import FailureName, Outcome
+from looktwice.model.evaluation.outcomes import FollowedDraw, outcome_table
+from looktwice.model.evaluation.perception import auc
 
 
 def outcome(*fails: FailureName) -> Outcome:

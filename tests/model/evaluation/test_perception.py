@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.bundled import SCENES
-from model.driving.facts import FACTS, SPEED_SCALE_MS, scene_facts
-from model.driving.scene_store import read_scenes
-from model.evaluation.perception import Reading, auc, format_perception, perception_rows, read_facts
-from model.network.checkpoint import load
-from model.training.perception_gate import format_gate, perception_gate
-from model.training.small import SmallSettings
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.facts import FACTS, SPEED_SCALE_MS, scene_facts
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.evaluation.perception import Reading, auc, format_perception, perception_rows, read_facts
+from looktwice.model.network.checkpoint import load
+from looktwice.model.training.perception_gate import format_gate, perception_gate
+from looktwice.model.training.small import SmallSettings
 from tests.model.network.motions import made_up_motions
 
 BUNDLED = list(read_scenes(SCENES, dense=False))

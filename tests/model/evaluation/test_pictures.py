@@ -11,14 +11,14 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from model.driving.images import ImageError
-from model.driving.labeller import expert_plan
-from model.driving.plan import MetaAction, Plan
-from model.driving.scene import CAMERAS, Clip, LabelledScene, Scene
-from model.engines.engine import Draw
-from model.evaluation.birds_eye import DIRECT_COLOUR, REFLECTED_COLOUR
-from model.evaluation.pictures import HEIGHT_PX, WIDTH_PX, plan_picture
-from model.evaluation.timeline import WORD_COLOURS
+from looktwice.model.driving.images import ImageError
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.plan import MetaAction, Plan
+from looktwice.model.driving.scene import CAMERAS, Clip, LabelledScene, Scene
+from looktwice.model.engines.engine import Draw
+from looktwice.model.evaluation.birds_eye import DIRECT_COLOUR, REFLECTED_COLOUR
+from looktwice.model.evaluation.pictures import HEIGHT_PX, WIDTH_PX, plan_picture
+from looktwice.model.evaluation.timeline import WORD_COLOURS
 from tests.model.driving.drives import agent, labelled_scene, picture
 from tests.model.evaluation.fakes import draw_of, offset
 

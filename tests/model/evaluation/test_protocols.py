@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.evaluation.protocols import (
+from looktwice.model.evaluation.protocols import (
     CELLS,
     Array,
     BoolArray,

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.scene import FRONT_WIDE
-from model.driving.trajectory import FloatArray
-from model.engines.engine import Controls, DrawFinished, Event, PlanRequest
-from model.evaluation.open_loop import SceneResult
-from model.evaluation.report import LEAD_SUBGROUP, SOON_SUBGROUP, Report, evaluate_checkpoint
-from model.evaluation.variants import Variant, standard_variants
+from looktwice.model.driving.scene import FRONT_WIDE
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.engines.engine import Controls, DrawFinished, Event, PlanRequest
+from looktwice.model.evaluation.open_loop import SceneResult
+from looktwice.model.evaluation.report import LEAD_SUBGROUP, SOON_SUBGROUP, Report, evaluate_checkpoint
+from looktwice.model.evaluation.variants import Variant, standard_variants
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
 from tests.model.evaluation.fakes import FakeEngine, draw_of
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.lane_map import LaneArea, LaneMap
-from model.driving.pdm.labelled import plans_of, states_of
-from model.driving.pdm.scoring import (
+from looktwice.model.driving.lane_map import LaneArea, LaneMap
+from looktwice.model.driving.pdm.labelled import plans_of, states_of
+from looktwice.model.driving.pdm.scoring import (
     COLLISIONS,
     DIRECTION,
     EXTENDED_COMFORT,
@@ -15,10 +15,10 @@ from model.driving.pdm.scoring import (
     LIGHTS,
     PROGRESS,
 )
-from model.driving.scene import LabelledScene
-from model.driving.trajectory import FloatArray
-from model.evaluation.open_loop import EXPERT
-from model.evaluation.scores import SceneScore, ScoreRow, by_scene, expert_way, score_table
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.evaluation.open_loop import EXPERT
+from looktwice.model.evaluation.scores import SceneScore, ScoreRow, by_scene, expert_way, score_table
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene, rectangle
 
 LANE_MAP = LaneMap(

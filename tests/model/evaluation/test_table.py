@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from model.driving.labeller import expert_plan
-from model.evaluation.bootstrap import compare
-from model.evaluation.open_loop import MEASURES, evaluate_baselines, evaluate_draws
-from model.evaluation.table import Row, format_table, to_json
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.evaluation.bootstrap import compare
+from looktwice.model.evaluation.open_loop import MEASURES, evaluate_baselines, evaluate_draws
+from looktwice.model.evaluation.table import Row, format_table, to_json
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import draw_of, offset
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.labeller import expert_plan
-from model.driving.scene import LabelledScene
-from model.driving.tracks import tracks_of
-from model.engines.engine import Controls, EngineError
-from model.evaluation.open_loop import SceneResult
-from model.evaluation.variants import (
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.tracks import tracks_of
+from looktwice.model.engines.engine import Controls, EngineError
+from looktwice.model.evaluation.open_loop import SceneResult
+from looktwice.model.evaluation.variants import (
     Variant,
     evaluate_engine,
     request_for,

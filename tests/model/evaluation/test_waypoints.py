@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.trajectory import TEN_HZ_S, THREE_SECONDS_S
-from model.evaluation.waypoints import WaypointScene, action_scores, waypoints_of
-from model.families.family import Actions
+from looktwice.model.driving.trajectory import TEN_HZ_S, THREE_SECONDS_S
+from looktwice.model.evaluation.waypoints import WaypointScene, action_scores, waypoints_of
+from looktwice.model.families.family import Actions
 from tests.model.driving.drives import agent, labelled_scene
 
 

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 from hypothesis import given
 
-from model.driving.phrases import Facts
-from model.evaluation.words import unknown_words, words_of
+from looktwice.model.driving.phrases import Facts
+from looktwice.model.evaluation.words import unknown_words, words_of
 from tests.model.driving.strategies import facts
 
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from model.families.cf_vla import CF_VLA
-from model.families.family import Branch, FamilyError
-from model.families.traj_only import TRAJ_ONLY
-from model.formats.pieces import NOTHING, Choice, Format, Literal, Option, Section, Sequence, Values
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.family import Branch, FamilyError
+from looktwice.model.families.traj_only import TRAJ_ONLY
+from looktwice.model.formats.pieces import NOTHING, Choice, Format, Literal, Option, Section, Sequence, Values
 
 
 def branching(*texts: str, times: int = 1) -> Format:

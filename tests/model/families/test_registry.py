@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from model.families.cf_vla import CF_VLA
-from model.families.cf_vla.format import PHRASES
-from model.families.family import FamilyError
-from model.families.registry import GROUP, families_of, family_named
-from model.families.traj_only import TRAJ_ONLY
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.cf_vla.format import PHRASES
+from looktwice.model.families.family import FamilyError
+from looktwice.model.families.registry import GROUP, families_of, family_named
+from looktwice.model.families.traj_only import TRAJ_ONLY
 
 MODULE = """
-from model.families.family import Family, Reading
-from model.formats.pieces import Format, Literal, Section
+from looktwice.model.families.family import Family, Reading
+from looktwice.model.formats.pieces import Format, Literal, Section
 
 POEM = Family(
     Format("poem", Section("verse", Literal("Roses are red"))),

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.driving.labeller import expert_plan
-from model.driving.perceived import Perceived, PerceivedAgent
-from model.driving.scene import CAMERAS
-from model.driving.trajectory import constant_turn_rate
-from model.families.family import FamilyError, Lesson, NextPicture, Situation
-from model.families.picture_codes import PICTURE, PICTURE_CODEBOOK, PICTURE_CODES
-from model.families.vla_world import VLA_WORLD
-from model.families.vla_world.actions import action_of
-from model.families.vla_world.format import (
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.perceived import Perceived, PerceivedAgent
+from looktwice.model.driving.scene import CAMERAS
+from looktwice.model.driving.trajectory import constant_turn_rate
+from looktwice.model.families.family import FamilyError, Lesson, NextPicture, Situation
+from looktwice.model.families.picture_codes import PICTURE, PICTURE_CODEBOOK, PICTURE_CODES
+from looktwice.model.families.vla_world import VLA_WORLD
+from looktwice.model.families.vla_world.actions import action_of
+from looktwice.model.families.vla_world.format import (
     CAMERA_OPTIONS,
     FORWARD_M,
     IMAGINED,
@@ -34,12 +34,12 @@ from model.families.vla_world.format import (
     told_points,
     told_thoughts,
 )
-from model.families.vla_world.inputs import describe
-from model.families.vla_world.read import read
-from model.formats.cursor import CompiledFormat
-from model.formats.pieces import FormatError, Values
-from model.formats.text import parse
-from model.network.visual_codes import CODEBOOK_SIZE, CODES
+from looktwice.model.families.vla_world.inputs import describe
+from looktwice.model.families.vla_world.read import read
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.pieces import FormatError, Values
+from looktwice.model.formats.text import parse
+from looktwice.model.network.visual_codes import CODEBOOK_SIZE, CODES
 from tests.model.driving.drives import MIDDLES_S, drive, labelled_scene
 from tests.model.driving.test_perceived import PERCEIVED
 from tests.model.formats.strategies import values_of

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from typing import Final
 
-from model.families.cf_vla.format import ACTION, BRANCH, THINKING
-from model.families.trajectory_codes import CODES, TRAJECTORY
-from model.formats.compounds import Number, Repeat
-from model.formats.pieces import Choice, Codes, Format, Literal, Maybe, Option, Record, Section, Sequence
-from model.formats.plan_tracks import PlanTracks
+from looktwice.model.families.cf_vla.format import ACTION, BRANCH, THINKING
+from looktwice.model.families.trajectory_codes import CODES, TRAJECTORY
+from looktwice.model.formats.compounds import Number, Repeat
+from looktwice.model.formats.pieces import (
+    Choice,
+    Codes,
+    Format,
+    Literal,
+    Maybe,
+    Option,
+    Record,
+    Section,
+    Sequence,
+)
+from looktwice.model.formats.plan_tracks import PlanTracks
 
 
 def words(name: str, *texts: str) -> Choice:

@@ -8,12 +8,12 @@ from itertools import pairwise
 from hypothesis import assume
 from hypothesis import strategies as st
 
-from model.driving.plan import GROUPS, TICKS, WORDS, Group, MetaAction, Plan, plan_from_bins
-from model.families.cf_vla.format import ACTION, BRANCH, THINKING
-from model.families.trajectory_codes import CODES, TRAJECTORY
-from model.formats.compounds import Number, Repeat
-from model.formats.cursor import CompiledFormat
-from model.formats.pieces import (
+from looktwice.model.driving.plan import GROUPS, TICKS, WORDS, Group, MetaAction, Plan, plan_from_bins
+from looktwice.model.families.cf_vla.format import ACTION, BRANCH, THINKING
+from looktwice.model.families.trajectory_codes import CODES, TRAJECTORY
+from looktwice.model.formats.compounds import Number, Repeat
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.pieces import (
     Choice,
     Codes,
     Compound,
@@ -32,7 +32,7 @@ from model.formats.pieces import (
     Values,
     holds,
 )
-from model.formats.plan_tracks import MAX_SEGMENTS, PlanTracks
+from looktwice.model.formats.plan_tracks import MAX_SEGMENTS, PlanTracks
 from tests.model.formats.vocabulary import TENTHS, ByteVocabulary
 
 

@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, parse_plan
-from model.families.cf_vla import CF_VLA
-from model.families.cf_vla.format import MAX_THINKING_TOKENS
-from model.families.traj_only import TRAJ_ONLY
-from model.formats.cursor import CompiledFormat
-from model.formats.pieces import Format, FormatError, Value, Values
-from model.formats.plan_tracks import MAX_SEGMENTS
-from model.formats.text import parse
+from looktwice.model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, parse_plan
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.cf_vla.format import MAX_THINKING_TOKENS
+from looktwice.model.families.traj_only import TRAJ_ONLY
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.pieces import Format, FormatError, Value, Values
+from looktwice.model.formats.plan_tracks import MAX_SEGMENTS
+from looktwice.model.formats.text import parse
 from tests.model.formats.strategies import VOCABULARY, branching_formats, cf_vla_values, plans
 from tests.model.formats.test_laws import walk
 

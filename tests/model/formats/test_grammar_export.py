@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.driving.plan import WORDS
-from model.families.cf_vla import CF_VLA
-from model.families.traj_only import TRAJ_ONLY
-from model.formats.cursor import AtChoice, CompiledFormat, Cursor
-from model.formats.grammar_export import to_lark
-from model.formats.pieces import Values
-from model.formats.plan_tracks import TrackWord
+from looktwice.model.driving.plan import WORDS
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.traj_only import TRAJ_ONLY
+from looktwice.model.formats.cursor import AtChoice, CompiledFormat, Cursor
+from looktwice.model.formats.grammar_export import to_lark
+from looktwice.model.formats.pieces import Values
+from looktwice.model.formats.plan_tracks import TrackWord
 from tests.model.formats.phrases import PHRASES
 from tests.model.formats.strategies import VOCABULARY, cf_vla_values, compiled_formats
 from tests.model.formats.test_laws import walk

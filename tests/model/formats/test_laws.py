@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.formats.cursor import CompiledFormat, Cursor, Token
-from model.formats.pieces import FormatError
-from model.formats.text import parse, parse_beginning
+from looktwice.model.formats.cursor import CompiledFormat, Cursor, Token
+from looktwice.model.formats.pieces import FormatError
+from looktwice.model.formats.text import parse, parse_beginning
 from tests.model.formats.strategies import VOCABULARY, compiled_formats, values_of
 
 

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.driving.direction import CHANGES, needed
-from model.driving.phrases import NOTHING, Facts, agrees, corrected, read_facts
-from model.driving.plan import TICKS, Plan, parse_plan
-from model.families.cf_vla.format import PHRASES
-from model.formats.cursor import CompiledFormat, Cursor, Token
-from model.formats.pieces import FormatError, Values
-from model.formats.text import parse
+from looktwice.model.driving.direction import CHANGES, needed
+from looktwice.model.driving.phrases import NOTHING, Facts, agrees, corrected, read_facts
+from looktwice.model.driving.plan import TICKS, Plan, parse_plan
+from looktwice.model.families.cf_vla.format import PHRASES
+from looktwice.model.formats.cursor import CompiledFormat, Cursor, Token
+from looktwice.model.formats.pieces import FormatError, Values
+from looktwice.model.formats.text import parse
 from tests.model.driving.strategies import facts
 from tests.model.formats.strategies import VOCABULARY, plans
 from tests.model.formats.test_grammar_export import allowed_by, in_plan, matcher

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.plan import GROUPS, WORDS, parse_plan
-from model.families.trajectory_codes import CODES, TRAJECTORY
-from model.formats.compounds import MAX_REPEATS, Number, Repeat, number_alphabets
-from model.formats.cursor import CompiledFormat, Cursor
-from model.formats.pieces import (
+from looktwice.model.driving.plan import GROUPS, WORDS, parse_plan
+from looktwice.model.families.trajectory_codes import CODES, TRAJECTORY
+from looktwice.model.formats.compounds import MAX_REPEATS, Number, Repeat, number_alphabets
+from looktwice.model.formats.cursor import CompiledFormat, Cursor
+from looktwice.model.formats.pieces import (
     Choice,
     Codes,
     Format,
@@ -27,8 +27,8 @@ from model.formats.pieces import (
     Value,
     Values,
 )
-from model.formats.plan_tracks import PlanTracks
-from model.formats.text import parse
+from looktwice.model.formats.plan_tracks import PlanTracks
+from looktwice.model.formats.text import parse
 from tests.model.formats.phrases import PHRASES
 from tests.model.formats.strategies import VOCABULARY, values_of
 from tests.model.formats.test_laws import can_write, ids_of, walk

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import pytest
 
-from model.families.cf_vla import CF_VLA
-from model.formats.cursor import CompiledFormat
-from model.formats.pieces import FormatError
-from model.formats.text import parse
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.pieces import FormatError
+from looktwice.model.formats.text import parse
 from tests.model.formats.vocabulary import ByteVocabulary, code_text
 
 COMPILED = CompiledFormat(CF_VLA.format, ByteVocabulary())

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import numpy.typing as npt
 
-from model.families.trajectory_codes import CODES
+from looktwice.model.families.trajectory_codes import CODES
 
 SPECIAL = ("<|im_end|>", "<|traj_future_start|>", "<|traj_future_end|>", "<|endoftext|>")
 WORDS = (

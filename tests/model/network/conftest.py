@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from model.driving.images import encode_jpeg
-from model.driving.scene import FRONT_TELE, FRONT_WIDE, Clip, Scene
-from model.network.checkpoint import Loaded, create_nano, load
-from model.network.codec import TrajectoryCodec
-from model.network.corpus import nano_corpus
-from model.network.vocabulary import Vocabulary, build_nano_tokenizer
+from looktwice.model.driving.images import encode_jpeg
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, Clip, Scene
+from looktwice.model.network.checkpoint import Loaded, create_nano, load
+from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.network.corpus import nano_corpus
+from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from tests.model.network.motions import made_up_motions
 
 CODEC_SIZE = 16

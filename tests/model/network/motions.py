@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S
+from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S
 
 FloatArray = npt.NDArray[np.float32]
 

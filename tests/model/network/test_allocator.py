@@ -11,7 +11,7 @@ import pytest
 _PROBE = """
 import resource, sys
 import torch
-from model.network.allocator import keep_freed_memory
+from looktwice.model.network.allocator import keep_freed_memory
 if sys.argv[1] == "kept":
     assert keep_freed_memory()
 for _ in range(30):  # until small blocks have found their places between the large ones
@@ -25,7 +25,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 _HOLES = """
 import os
-from model.network.allocator import FreedMemory
+from looktwice.model.network.allocator import FreedMemory
 blocks = [bytearray(100_000) for _ in range(2000)]
 del blocks[:-1:2], blocks[:-1:2]  # all but one of four, so that holes are left
 resident = lambda: int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -41,7 +41,7 @@ print(before - resident())
 """
 _BODIES = """
 import os, sys
-from model.network.allocator import return_large_buffers
+from looktwice.model.network.allocator import return_large_buffers
 if sys.argv[1] == "returned":
     assert return_large_buffers()
 resident = lambda: int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

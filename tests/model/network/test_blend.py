@@ -7,10 +7,10 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from model.network.blend import blend
-from model.network.card import CheckpointError
-from model.network.checkpoint import Loaded, load, save
-from service.cli.commands import app
+from looktwice.model.network.blend import blend
+from looktwice.model.network.card import CheckpointError
+from looktwice.model.network.checkpoint import Loaded, load, save
+from looktwice.service.cli.commands import app
 
 KEPT = (
     *("model.visual.", "resampler.facts.", "resampler.layers.", "resampler.queries"),

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load_file, save_file
 
-from model.driving.trajectory import STEP_S, present_speed
-from model.network import quantiser
-from model.network.codec import CODEC_FILE, HEADING_WEIGHT_M, CodecError, TrajectoryCodec
-from model.network.splines import clamped_basis
+from looktwice.model.driving.trajectory import STEP_S, present_speed
+from looktwice.model.network import quantiser
+from looktwice.model.network.codec import CODEC_FILE, HEADING_WEIGHT_M, CodecError, TrajectoryCodec
+from looktwice.model.network.splines import clamped_basis
 from tests.comma2k19 import windows
 from tests.model.network.motions import made_up_motions
 

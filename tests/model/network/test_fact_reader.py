@@ -2,8 +2,8 @@
 
 import torch
 
-from model.driving.facts import FACT_GROUPS, FACTS, IS_YES_OR_NO
-from model.network.fact_reader import FactReader, likely, weighed
+from looktwice.model.driving.facts import FACT_GROUPS, FACTS, IS_YES_OR_NO
+from looktwice.model.network.fact_reader import FactReader, likely, weighed
 
 OWN, SPEED, ROAD = (FACTS.index(name) for name in ("own_0_present", "own_0_speed", "road_left_8m"))
 

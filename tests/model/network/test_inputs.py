@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.scene import FRONT_TELE, FRONT_WIDE, Scene, SceneError
-from model.families.family import FamilyError
-from model.network.inputs import InputBuilder, rotary_positions
-from model.network.prompts import prompt_text
-from model.network.settings import NANO_SETTINGS, SettingsError, VlaSettings
-from model.network.vocabulary import HISTORY, ROUTE, VIDEO_PAD, Vocabulary
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, Scene, SceneError
+from looktwice.model.families.family import FamilyError
+from looktwice.model.network.inputs import InputBuilder, rotary_positions
+from looktwice.model.network.prompts import prompt_text
+from looktwice.model.network.settings import NANO_SETTINGS, SettingsError, VlaSettings
+from looktwice.model.network.vocabulary import HISTORY, ROUTE, VIDEO_PAD, Vocabulary
 from tests.model.network.conftest import made_up_scene
 
 SETTINGS = VlaSettings(codec_size=16)

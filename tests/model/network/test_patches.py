@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
-from model.network.patches import PIXEL_MEAN, PIXEL_STD, normalise, patchify, resize
-from model.network.settings import VlaSettings
+from looktwice.model.network.patches import PIXEL_MEAN, PIXEL_STD, normalise, patchify, resize
+from looktwice.model.network.settings import VlaSettings
 
 SETTINGS = VlaSettings(image_width=112, image_height=56)
 

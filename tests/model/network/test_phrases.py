@@ -1,8 +1,8 @@
 from __future__ import annotations
 
-from model.bundled import CHECKPOINT
-from model.driving.phrases import CONSEQUENCES, CORRECTIONS, GOING_ON, HEADS, details
-from model.network.checkpoint import read_parts
+from looktwice.model.bundled import CHECKPOINT
+from looktwice.model.driving.phrases import CONSEQUENCES, CORRECTIONS, GOING_ON, HEADS, details
+from looktwice.model.network.checkpoint import read_parts
 
 SPELT_OUT = {"The road runs straight on"}
 """Phrases that are younger than this tokenizer. Only their first token is a decision."""

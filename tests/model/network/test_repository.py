@@ -20,16 +20,16 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from typer.testing import CliRunner
 
-from model.bundled import CHECKPOINT, SCENES
-from model.driving.scene_store import read_scenes
-from model.families.registry import family_named
-from model.network.card import CheckpointError, read_card
-from model.network.checkpoint import load, read_parts
-from model.network.processor import LookTwiceProcessor
-from model.network.prompts import chat_template, prompt_text
-from model.network.repository import write_repository
-from model.network.settings import VlaSettings
-from service.cli.commands import app
+from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.families.registry import family_named
+from looktwice.model.network.card import CheckpointError, read_card
+from looktwice.model.network.checkpoint import load, read_parts
+from looktwice.model.network.processor import LookTwiceProcessor
+from looktwice.model.network.prompts import chat_template, prompt_text
+from looktwice.model.network.repository import write_repository
+from looktwice.model.network.settings import VlaSettings
+from looktwice.service.cli.commands import app
 from tests.checkpoints import write_untrained
 from tests.sockets import listening
 
@@ -38,8 +38,8 @@ LOADED_BY_NAME = """
 import sys
 from safetensors.torch import save_file
 from transformers import AutoModel, AutoModelForImageTextToText, AutoProcessor
-from model.bundled import SCENES
-from model.driving.scene_store import read_scenes
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.scene_store import read_scenes
 
 folder, out = sys.argv[1:]
 processor = AutoProcessor.from_pretrained(folder, trust_remote_code=True)
@@ -143,7 +143,7 @@ def test_a_stock_folder_is_refused(tmp_path: Path) -> None:
         write_repository(tmp_path)
 
 
-PLAN = ("-m", "service.cli", "plan", "--n", 1, "--json")
+PLAN = ("-m", "looktwice.service.cli", "plan", "--n", 1, "--json")
 
 
 def test_a_name_on_the_hub_is_a_checkpoint(tmp_path: Path) -> None:

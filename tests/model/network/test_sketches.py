@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from model.network.checkpoint import Loaded, create_nano, load, save, with_sketches
-from model.network.codec import DIMENSIONS, TrajectoryCodec
-from model.network.intent import INTENT_TOKENS, SketchBooks, SketchCodes
-from model.network.settings import NANO_SETTINGS, SettingsError, VlaSettings
-from model.network.track_features import TRACK_FEATURES
-from model.network.trajectory_head import spread_of
-from model.network.vocabulary import Vocabulary
+from looktwice.model.network.checkpoint import Loaded, create_nano, load, save, with_sketches
+from looktwice.model.network.codec import DIMENSIONS, TrajectoryCodec
+from looktwice.model.network.intent import INTENT_TOKENS, SketchBooks, SketchCodes
+from looktwice.model.network.settings import NANO_SETTINGS, SettingsError, VlaSettings
+from looktwice.model.network.track_features import TRACK_FEATURES
+from looktwice.model.network.trajectory_head import spread_of
+from looktwice.model.network.vocabulary import Vocabulary
 from tests.model.network.conftest import CODEC_SIZE
 from tests.model.network.motions import made_up_motions
 

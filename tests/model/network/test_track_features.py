@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.driving.tracks import Track
-from model.network.track_features import MIRRORED, TRACK_FEATURES, track_features
+from looktwice.model.driving.tracks import Track
+from looktwice.model.network.track_features import MIRRORED, TRACK_FEATURES, track_features
 
 ROUTE = np.stack([4.0 * np.arange(1, 21), 0.02 * (4.0 * np.arange(1, 21)) ** 1.5], axis=1).astype(np.float32)
 CAR = Track(20.0, 3.0, 0.2, 8.0, 4.5, 1.9, "vehicle", frozenset({"left"}))

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
-from model.driving.images import encode_png
-from model.network.visual_codes import (
+from looktwice.model.driving.images import encode_png
+from looktwice.model.network.visual_codes import (
     CODEBOOK_SIZE,
     CODES,
     LEVELS,

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 from transformers import DynamicCache, Qwen2_5_VLConfig
 
-from model.driving.scene import Scene
-from model.network.attention import MATMUL_ATTENTION, attend
-from model.network.checkpoint import Loaded
-from model.network.vision import attends_to_whole_pictures
-from model.network.vla import LookTwiceVla
+from looktwice.model.driving.scene import Scene
+from looktwice.model.network.attention import MATMUL_ATTENTION, attend
+from looktwice.model.network.checkpoint import Loaded
+from looktwice.model.network.vision import attends_to_whole_pictures
+from looktwice.model.network.vla import LookTwiceVla
 from tests.model.network.conftest import made_up_scene
 
 

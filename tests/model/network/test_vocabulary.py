@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from tokenizers import Tokenizer, models
 from transformers import AutoTokenizer, PreTrainedTokenizerFast
 
-from model.network import vocabulary as words
-from model.network.corpus import driving_sentences, nano_corpus, random_plans
-from model.network.vocabulary import (
+from looktwice.model.network import vocabulary as words
+from looktwice.model.network.corpus import driving_sentences, nano_corpus, random_plans
+from looktwice.model.network.vocabulary import (
     FUTURE_START,
     Vocabulary,
     VocabularyError,

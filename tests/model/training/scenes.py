@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.driving.scene import FRONT_TELE, FRONT_WIDE, DenseTarget, LabelledScene
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, DenseTarget, LabelledScene
 from tests.model.driving.drives import agent, labelled_scene
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from model.network.checkpoint import Loaded
-from model.training.batches import Sample, collate
-from model.training.learner import ResponseLearner
+from looktwice.model.network.checkpoint import Loaded
+from looktwice.model.training.batches import Sample, collate
+from looktwice.model.training.learner import ResponseLearner
 
 
 def two_losses(loaded: Loaded, sample: Sample) -> tuple[float, float]:

@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.driving.feedback_store import FeedbackFileError, FeedbackRow, write_feedback
-from model.driving.reasoning import thoughts_of
-from model.driving.scene import FRONT_WIDE
-from model.driving.scene_store import write_scenes
-from model.driving.trajectory import HALF_SECONDS_S
-from model.families.elf_vla.targets import WEIGHTS
-from model.families.family import JudgedAttempt
-from model.network.checkpoint import Loaded, load, with_formats
-from model.training.attempts import attempts_on
-from model.training.batches import Item, ResponseDataset, TaskSampler
-from model.training.examples import Examples
-from model.training.recipes import NANO
-from model.training.run import RunSettings, run
+from looktwice.model.driving.feedback_store import FeedbackFileError, FeedbackRow, write_feedback
+from looktwice.model.driving.reasoning import thoughts_of
+from looktwice.model.driving.scene import FRONT_WIDE
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.driving.trajectory import HALF_SECONDS_S
+from looktwice.model.families.elf_vla.targets import WEIGHTS
+from looktwice.model.families.family import JudgedAttempt
+from looktwice.model.network.checkpoint import Loaded, load, with_formats
+from looktwice.model.training.attempts import attempts_on
+from looktwice.model.training.batches import Item, ResponseDataset, TaskSampler
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.recipes import NANO
+from looktwice.model.training.run import RunSettings, run
 from tests.model.driving.test_thoughts import SOME
 from tests.model.training.scenes import training_scene
 

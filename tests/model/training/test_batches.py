@@ -9,17 +9,17 @@ import pytest
 import torch
 from accelerate.data_loader import BatchSamplerShard
 
-from model.driving.plan import parse_plan
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
-from model.driving.trajectory import present_speed
-from model.families.cf_vla.targets import PAPER_WEIGHTS
-from model.families.family import Reflection, Situation
-from model.formats.pieces import FormatError
-from model.network.checkpoint import Loaded, load
-from model.network.vocabulary import FUTURE_START, TRACK, VIDEO_PAD
-from model.training.batches import Item, ResponseDataset, Sample, TaskSampler, collate
-from model.training.examples import Examples
-from model.training.learner import ResponseLearner
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
+from looktwice.model.driving.trajectory import present_speed
+from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
+from looktwice.model.families.family import Reflection, Situation
+from looktwice.model.formats.pieces import FormatError
+from looktwice.model.network.checkpoint import Loaded, load
+from looktwice.model.network.vocabulary import FUTURE_START, TRACK, VIDEO_PAD
+from looktwice.model.training.batches import Item, ResponseDataset, Sample, TaskSampler, collate
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.learner import ResponseLearner
 from tests.model.training.scenes import training_scene
 
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.cameras import CAMERA_SPECS
-from model.driving.scene import FRONT_WIDE, SEMANTIC_CLASSES, DenseTarget
-from model.training.dense import DENSE_SHAPE, UNLABELLED, coarse, no_target, relative_motion
+from looktwice.model.driving.cameras import CAMERA_SPECS
+from looktwice.model.driving.scene import FRONT_WIDE, SEMANTIC_CLASSES, DenseTarget
+from looktwice.model.training.dense import DENSE_SHAPE, UNLABELLED, coarse, no_target, relative_motion
 from tests.model.driving.drives import agent, labelled_scene
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from model.driving.images import decode_image
-from model.driving.labeller import expert_plan
-from model.driving.perceived import perceived_of
-from model.driving.reasoning import thoughts_of
-from model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE, NextFrame
-from model.driving.scene_store import write_scenes
-from model.training.dense import UNLABELLED, coarse
-from model.training.examples import Examples, load_examples
+from looktwice.model.driving.images import decode_image
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.perceived import perceived_of
+from looktwice.model.driving.reasoning import thoughts_of
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE, NextFrame
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.training.dense import UNLABELLED, coarse
+from looktwice.model.training.examples import Examples, load_examples
 from tests.model.training.scenes import training_scene
 
 CAMERAS = (FRONT_WIDE, FRONT_TELE)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from model.driving.facts import FACTS, mirrored
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
-from model.network.checkpoint import Loaded, load
-from model.training.dense import DENSE_SHAPE, UNLABELLED
-from model.training.examples import Examples
-from model.training.grounding import (
+from looktwice.model.driving.facts import FACTS, mirrored
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
+from looktwice.model.network.checkpoint import Loaded, load
+from looktwice.model.training.dense import DENSE_SHAPE, UNLABELLED
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.grounding import (
     GroundingDataset,
     GroundingLearner,
     Look,

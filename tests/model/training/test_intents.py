@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from model.driving.facts import IS_YES_OR_NO, mirrored
-from model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
-from model.network.card import weights_revision
-from model.network.checkpoint import Loaded, load, save
-from model.network.intent import INTENT_TOKENS
-from model.network.small_planner import WEIGHTS_FILE, SmallPlannerError, load_small, small_revision
-from model.network.track_features import TRACK_FEATURES
-from model.network.vla import LookTwiceVla, with_settings
-from model.training.examples import Examples
-from model.training.intents import (
+from looktwice.model.driving.facts import IS_YES_OR_NO, mirrored
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
+from looktwice.model.network.card import weights_revision
+from looktwice.model.network.checkpoint import Loaded, load, save
+from looktwice.model.network.intent import INTENT_TOKENS
+from looktwice.model.network.small_planner import WEIGHTS_FILE, SmallPlannerError, load_small, small_revision
+from looktwice.model.network.track_features import TRACK_FEATURES
+from looktwice.model.network.vla import LookTwiceVla, with_settings
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.intents import (
     IntentDataset,
     IntentLearner,
     Source,
@@ -24,7 +24,7 @@ from model.training.intents import (
     read_errors,
     read_facts,
 )
-from model.training.vision_cache import open_vision
+from looktwice.model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
 
 SCENES = [training_scene(index) for index in range(6)]

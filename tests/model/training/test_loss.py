@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from model.training.loss import LOSS_UNIT, STAGE_WEIGHTS, response_loss
+from looktwice.model.training.loss import LOSS_UNIT, STAGE_WEIGHTS, response_loss
 
 VOCABULARY, FIRST_CODE, SIZE = 30, 10, 3
 

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from model.driving.facts import FACTS, IS_YES_OR_NO
-from model.training.misread import misread
+from looktwice.model.driving.facts import FACTS, IS_YES_OR_NO
+from looktwice.model.training.misread import misread
 
 GAP, PRESENT, SPEED = (FACTS.index(f"own_0_{field}") for field in ("gap_log_m", "present", "speed"))
 

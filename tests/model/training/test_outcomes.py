@@ -9,19 +9,25 @@ import numpy as np
 import pytest
 import torch
 
-from model.driving.pdm.judging import SceneJudge
-from model.driving.plan import parse_plan
-from model.driving.scene_store import write_scenes
-from model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S, FloatArray, at_times, constant_velocity
-from model.engines.engine import Draw, PlanRequest
-from model.formats.replay import decisions
-from model.network.checkpoint import load
-from model.network.settings import NANO_SETTINGS
-from model.training.batches import Item, collate
-from model.training.outcomes import OutcomeLearner
-from model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_with
-from model.training.rewards import RewardWeights, form_reward, goal_reward, rewards
-from model.training.run import RunSettings, run
+from looktwice.model.driving.pdm.judging import SceneJudge
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.driving.trajectory import (
+    HALF_SECONDS_S,
+    TEN_HZ_S,
+    FloatArray,
+    at_times,
+    constant_velocity,
+)
+from looktwice.model.engines.engine import Draw, PlanRequest
+from looktwice.model.formats.replay import decisions
+from looktwice.model.network.checkpoint import load
+from looktwice.model.network.settings import NANO_SETTINGS
+from looktwice.model.training.batches import Item, collate
+from looktwice.model.training.outcomes import OutcomeLearner
+from looktwice.model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_with
+from looktwice.model.training.rewards import RewardWeights, form_reward, goal_reward, rewards
+from looktwice.model.training.run import RunSettings, run
 from tests.checkpoints import write_untrained
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
 from tests.model.evaluation.fakes import draw_of

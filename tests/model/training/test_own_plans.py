@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.driving.plan import parse_plan
-from model.driving.scene import FRONT_TELE, FRONT_WIDE
-from model.families.cf_vla.targets import PAPER_WEIGHTS
-from model.network.checkpoint import Loaded, load
-from model.training.batches import Item, ResponseDataset
-from model.training.examples import Examples
-from model.training.own_plans import OwnPlans
-from model.training.targets import Target
-from model.training.vision_cache import open_vision
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
+from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
+from looktwice.model.network.checkpoint import Loaded, load
+from looktwice.model.training.batches import Item, ResponseDataset
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.own_plans import OwnPlans
+from looktwice.model.training.targets import Target
+from looktwice.model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
 
 EXAMPLES = Examples.from_scenes((training_scene(index) for index in range(8)), (FRONT_WIDE, FRONT_TELE))

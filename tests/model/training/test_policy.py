@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.training.policy import advantages, policy_loss
+from looktwice.model.training.policy import advantages, policy_loss
 
 
 def test_draws_are_compared_with_their_own_scene() -> None:

@@ -2,13 +2,13 @@ from __future__ import annotations
 
 import pytest
 
-from model.driving.phrases import PhraseError
-from model.driving.plan import parse_plan
-from model.driving.reflection_store import LabelledReflection
-from model.driving.scene import FRONT_WIDE
-from model.families.family import Reflection
-from model.training.examples import Examples
-from model.training.reflections import mirrored, reflections_on
+from looktwice.model.driving.phrases import PhraseError
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.reflection_store import LabelledReflection
+from looktwice.model.driving.scene import FRONT_WIDE
+from looktwice.model.families.family import Reflection
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.reflections import mirrored, reflections_on
 from tests.model.training.scenes import training_scene
 
 PLAN = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from model.engines.engine import Draw, PlanRequest
-from model.engines.torch.decoder import Decoder
-from model.engines.torch.runner import Runner
-from model.families.registry import families_of
-from model.formats.cursor import CompiledFormat, Cursor
-from model.formats.pieces import FormatError
-from model.formats.replay import decisions
-from model.network.checkpoint import Loaded, load
-from model.training.batches import collate
-from model.training.learner import ResponseLearner
-from model.training.rollouts import rollout
+from looktwice.model.engines.engine import Draw, PlanRequest
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.families.registry import families_of
+from looktwice.model.formats.cursor import CompiledFormat, Cursor
+from looktwice.model.formats.pieces import FormatError
+from looktwice.model.formats.replay import decisions
+from looktwice.model.network.checkpoint import Loaded, load
+from looktwice.model.training.batches import collate
+from looktwice.model.training.learner import ResponseLearner
+from looktwice.model.training.rollouts import rollout
 from tests.model.engines.decoding import decode, request
 from tests.model.engines.reference import exactly, reference
 

@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 import torch
 
-from model.driving.images import encode_jpeg
-from model.driving.labeller import expert_plan
-from model.driving.plan import parse_plan
-from model.driving.reflection_store import LabelledReflection, write_reflections
-from model.driving.scene import LabelledScene, NextFrame
-from model.driving.scene_store import write_scenes
-from model.network.checkpoint import load, with_sketches
-from model.network.settings import NANO_SETTINGS
-from model.network.visual_codes import VisualCodes
-from model.training.recipes import NANO, Recipe
-from model.training.run import RunSettings, last_whole_state, run
+from looktwice.model.driving.images import encode_jpeg
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.reflection_store import LabelledReflection, write_reflections
+from looktwice.model.driving.scene import LabelledScene, NextFrame
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.network.checkpoint import load, with_sketches
+from looktwice.model.network.settings import NANO_SETTINGS
+from looktwice.model.network.visual_codes import VisualCodes
+from looktwice.model.training.recipes import NANO, Recipe
+from looktwice.model.training.run import RunSettings, last_whole_state, run
 from tests.checkpoints import write_untrained
 from tests.model.training.scenes import training_scene
 
@@ -185,8 +185,8 @@ _SCRIPT = """
 import sys
 from pathlib import Path
 from dataclasses import replace
-from model.training.recipes import NANO
-from model.training.run import RunSettings, run
+from looktwice.model.training.recipes import NANO
+from looktwice.model.training.run import RunSettings, run
 scenes, source, target, cache = map(Path, sys.argv[1:])
 recipe = replace(NANO["language"], steps=12, batch_size=4, warmup_steps=1)
 run(recipe, scenes, source, target, RunSettings(cache, save_every=2, bf16=False))

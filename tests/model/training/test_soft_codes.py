@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from model.network.codec import TrajectoryCodec
-from model.training.soft_codes import SoftCodes
+from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.training.soft_codes import SoftCodes
 from tests.model.network.motions import made_up_motions
 
 

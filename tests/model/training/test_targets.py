@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.driving.phrases import Statement, Thing
-from model.driving.plan import Plan, parse_plan
-from model.driving.trajectory import HISTORY_STEPS, constant_velocity
-from model.families.cf_vla import CF_VLA
-from model.families.cf_vla.format import PHRASES
-from model.families.cf_vla.targets import PAPER_WEIGHTS
-from model.families.family import Lesson, Reflection
-from model.families.traj_only import TRAJ_ONLY
-from model.formats.cursor import CompiledFormat
-from model.formats.pieces import FormatError, Values
-from model.formats.text import parse
-from model.training.targets import make_target
+from looktwice.model.driving.phrases import Statement, Thing
+from looktwice.model.driving.plan import Plan, parse_plan
+from looktwice.model.driving.trajectory import HISTORY_STEPS, constant_velocity
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.cf_vla.format import PHRASES
+from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
+from looktwice.model.families.family import Lesson, Reflection
+from looktwice.model.families.traj_only import TRAJ_ONLY
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.pieces import FormatError, Values
+from looktwice.model.formats.text import parse
+from looktwice.model.training.targets import make_target
 from tests.model.formats.vocabulary import ByteVocabulary
 
 VOCABULARY = ByteVocabulary()

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from torch.utils.data import DataLoader, Dataset, Subset
 
-from model.driving.scene_store import write_scenes
-from model.training.recipes import NANO
-from model.training.run import RunSettings, run
-from model.training.trainer import draw_apart
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.training.recipes import NANO
+from looktwice.model.training.run import RunSettings, run
+from looktwice.model.training.trainer import draw_apart
 from tests.model.training.scenes import training_scene
 
 # torch warns where there are fewer cores than workers.

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
-from model.families.cf_vla.targets import PAPER_WEIGHTS
-from model.network.checkpoint import Loaded, load
-from model.network.patches import patchify
-from model.training.batches import Item, ResponseDataset, collate
-from model.training.examples import Examples, example_frames
-from model.training.learner import ResponseLearner
-from model.training.vision_cache import VisionCache, open_vision
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
+from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
+from looktwice.model.network.checkpoint import Loaded, load
+from looktwice.model.network.patches import patchify
+from looktwice.model.training.batches import Item, ResponseDataset, collate
+from looktwice.model.training.examples import Examples, example_frames
+from looktwice.model.training.learner import ResponseLearner
+from looktwice.model.training.vision_cache import VisionCache, open_vision
 from tests.model.training.scenes import training_scene
 
 CAMERAS = (FRONT_WIDE, FRONT_TELE)

@@ -15,12 +15,12 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from typer.testing import CliRunner
 
-from model.driving.images import encode_png
-from model.driving.scene import FRONT_TELE, FRONT_WIDE, Clip, LabelledScene
-from model.driving.scene_store import write_scenes
-from model.network.visual_codes import VisualCodes, frame_of, load_visual_codes, psnr
-from model.training.recipes import VISUAL_CODES
-from model.training.visual_codes import (
+from looktwice.model.driving.images import encode_png
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, Clip, LabelledScene
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.network.visual_codes import VisualCodes, frame_of, load_visual_codes, psnr
+from looktwice.model.training.recipes import VISUAL_CODES
+from looktwice.model.training.visual_codes import (
     SHEET_FILE,
     FrameDataset,
     VisualCodesLearner,
@@ -30,7 +30,7 @@ from model.training.visual_codes import (
     spread,
     train_visual_codes,
 )
-from service.cli.commands import app
+from looktwice.service.cli.commands import app
 from tests.model.driving.drives import labelled_scene
 
 SHORT = replace(VISUAL_CODES, steps=60, batch_size=4, warmup_steps=5, learning_rate=3e-3)
@@ -144,8 +144,8 @@ _SCRIPT = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from model.training.recipes import VISUAL_CODES
-from model.training.visual_codes import train_visual_codes
+from looktwice.model.training.recipes import VISUAL_CODES
+from looktwice.model.training.visual_codes import train_visual_codes
 recipe = replace(VISUAL_CODES, steps=20, batch_size=2, warmup_steps=1)
 few = {"width": 24, "measured_clips": 1, "save_every": 2, "validate_every": 1}
 train_visual_codes(recipe, Path(sys.argv[1]), Path(sys.argv[2]), **few)

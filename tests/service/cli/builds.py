@@ -7,7 +7,7 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from service.cli.commands import app
+from looktwice.service.cli.commands import app
 
 
 def ran(*arguments: object, code: int = 0) -> str:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from clients.metadrive import simulator
-from clients.metadrive.generate import GenerateConfig, write_block, write_manifest
+from looktwice.clients.metadrive import simulator
+from looktwice.clients.metadrive.generate import GenerateConfig, write_block, write_manifest
 
 
 @pytest.fixture(scope="session")

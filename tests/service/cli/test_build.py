@@ -15,18 +15,18 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from clients.labelling.ledger import Run
-from clients.labelling.retries import TryLater, with_retries
-from model.bundled import CHECKPOINT, SCENES
-from model.driving.phrases import agrees, read_facts
-from model.driving.reflection_store import read_reflections, write_reflections
-from model.driving.scene_store import read_scenes, write_scenes
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.network.checkpoint import read_config
-from model.network.settings import VlaSettings
-from service.cli.commands import app
-from service.cli.stages import progress_bar
-from service.settings import Settings
+from looktwice.clients.labelling.ledger import Run
+from looktwice.clients.labelling.retries import TryLater, with_retries
+from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.driving.phrases import agrees, read_facts
+from looktwice.model.driving.reflection_store import read_reflections, write_reflections
+from looktwice.model.driving.scene_store import read_scenes, write_scenes
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.network.checkpoint import read_config
+from looktwice.model.network.settings import VlaSettings
+from looktwice.service.cli.commands import app
+from looktwice.service.cli.stages import progress_bar
+from looktwice.service.settings import Settings
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer
 from tests.service.cli.builds import ran, told
 from tests.service.serving import serve
@@ -126,8 +126,8 @@ def trained(source: Path, reflections: Path, target: Path) -> Result:
 
 FULL = """
 import resource
-from clients.labelling.ledger import Ledger
-from service.cli.commands import app
+from looktwice.clients.labelling.ledger import Ledger
+from looktwice.service.cli.commands import app
 
 entered = Ledger.__enter__
 

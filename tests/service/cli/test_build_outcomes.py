@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from clients.labelling.ledger import FILE, Ledger
-from clients.labelling.outcomes import Followed
-from model.bundled import CHECKPOINT, SCENES
-from model.driving.reflection_store import read_reflections
-from model.driving.scene_store import MANIFEST
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from service.settings import Settings
+from looktwice.clients.labelling.ledger import FILE, Ledger
+from looktwice.clients.labelling.outcomes import Followed
+from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.driving.reflection_store import read_reflections
+from looktwice.model.driving.scene_store import MANIFEST
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.service.settings import Settings
 from tests.service.cli.builds import ran, told
 from tests.service.serving import serve
 
@@ -77,7 +77,7 @@ def test_killed_at_any_moment_it_goes_on_with_the_same_outcomes(
     shutil.copytree(rolled, whole)
     arguments = ("outcomes", build, generated, "--workers", 1, "--json")
     process = subprocess.Popen(
-        [sys.executable, "-m", "service.cli", "build", *map(str, arguments)], start_new_session=True
+        [sys.executable, "-m", "looktwice.service.cli", "build", *map(str, arguments)], start_new_session=True
     )
     while count_outcomes(build) == 0:
         assert process.poll() is None, "it was to be killed in the middle"

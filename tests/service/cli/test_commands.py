@@ -15,10 +15,10 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from model.bundled import CHECKPOINT
-from model.engines.torch.engine import TorchEngine
-from service.cli.commands import app
-from service.settings import Settings, TeacherSettings
+from looktwice.model.bundled import CHECKPOINT
+from looktwice.model.engines.torch.engine import TorchEngine
+from looktwice.service.cli.commands import app
+from looktwice.service.settings import Settings, TeacherSettings
 from tests.service.serving import body, serve
 
 ROOT: Final = Path(__file__).parents[3]
@@ -77,7 +77,7 @@ def test_a_missing_gpu_is_told_in_a_line() -> None:
 
 
 def test_a_service_says_where_it_is_and_where_its_page_is() -> None:
-    command = [sys.executable, "-m", "service.cli", "serve", "--no-model", "--port", "0"]
+    command = [sys.executable, "-m", "looktwice.service.cli", "serve", "--no-model", "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as started:
         assert started.stdout is not None
         told = started.stdout.readline()
@@ -145,7 +145,7 @@ def test_what_is_no_request_is_told_in_a_line(tmp_path: Path, content: str) -> N
 
 def test_help_needs_neither_torch_nor_the_service() -> None:
     code = (
-        "import sys; from service.cli.commands import app; "
+        "import sys; from looktwice.service.cli.commands import app; "
         "print([name for name in ('torch', 'fastapi', 'numpy') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -156,7 +156,7 @@ def ran_bare(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """A command where only `looktwice[serve]` is installed: neither the simulator nor other extras."""
     extras = ("accelerate", "cv2", "gltf", "hdrh", "metadrive", "panda3d", "psutil", "ray", "shapely")
     missing = f"import sys; sys.modules.update(dict.fromkeys({extras!r}))"
-    code = f"{missing}; from service.cli import main; main()"
+    code = f"{missing}; from looktwice.service.cli import main; main()"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(

@@ -8,8 +8,8 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from service.cli.commands import app
-from service.settings import Settings
+from looktwice.service.cli.commands import app
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve
 

@@ -16,8 +16,8 @@ import pytest
 from carla_driver_interface.protocol import EgodriverServiceStub, Empty
 from typer.testing import CliRunner
 
-from service.cli.commands import app
-from service.settings import Settings
+from looktwice.service.cli.commands import app
+from looktwice.service.settings import Settings
 from tests.clients.alpasim.driving import READY_US, close, drive, observe, start
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve
@@ -29,7 +29,7 @@ RUNNER = CliRunner()
 @contextmanager
 def running(*arguments: str, **environment: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """The command's process and the address it listens on."""
-    command = [sys.executable, "-m", "service.cli", "egodriver", *arguments]
+    command = [sys.executable, "-m", "looktwice.service.cli", "egodriver", *arguments]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, **environment})
     try:
         assert process.stderr is not None

@@ -6,9 +6,9 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from service.cli.commands import app
-from service.cli.engines import make_engine
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.service.cli.commands import app
+from looktwice.service.cli.engines import make_engine
 
 RUNNER = CliRunner()
 
@@ -65,9 +65,9 @@ def test_who_serves_chooses_between_equal_bytes_and_speed(
         made.append(engine._settings.reproducible)
         raise ValueError("that is enough")
 
-    monkeypatch.setattr("service.app.create_app", note)
+    monkeypatch.setattr("looktwice.service.app.create_app", note)
     # They are of the whole process, which is the tests' own here.
-    monkeypatch.setattr("model.network.allocator.return_large_buffers", lambda: None)
+    monkeypatch.setattr("looktwice.model.network.allocator.return_large_buffers", lambda: None)
     monkeypatch.setattr("sys.setswitchinterval", lambda _: None)
     result = RUNNER.invoke(app, ["serve", "--checkpoint", str(untrained_checkpoint), "--port", "0", *told])
     assert "that is enough" in result.stderr

@@ -12,11 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from model.bundled import SCENES
-from model.driving.scene_store import read_scenes, write_scenes
-from model.engines.engine import Event, PlanRequest
-from model.engines.torch.engine import TorchEngine
-from service.cli.commands import app
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.scene_store import read_scenes, write_scenes
+from looktwice.model.engines.engine import Event, PlanRequest
+from looktwice.model.engines.torch.engine import TorchEngine
+from looktwice.service.cli.commands import app
 
 
 def ladder(checkpoint: Path, folder: Path, *more: str) -> dict[str, Any]:

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from model.bundled import SCENES
-from service.cli.commands import app
-from service.cli.evaluate_failures import stages_named
+from looktwice.model.bundled import SCENES
+from looktwice.service.cli.commands import app
+from looktwice.service.cli.evaluate_failures import stages_named
 
 
 def evaluated(*more: str) -> Result:

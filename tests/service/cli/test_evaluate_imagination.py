@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from model.driving.images import encode_png
-from model.driving.scene import FRONT_WIDE, LabelledScene, NextFrame
-from model.driving.scene_store import write_scenes
-from model.network.checkpoint import load, save
-from model.network.settings import VlaSettings
-from model.network.visual_codes import VisualCodes
-from service.cli.commands import app
+from looktwice.model.driving.images import encode_png
+from looktwice.model.driving.scene import FRONT_WIDE, LabelledScene, NextFrame
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.network.checkpoint import load, save
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.visual_codes import VisualCodes
+from looktwice.service.cli.commands import app
 from tests.checkpoints import write_untrained
 from tests.model.driving.drives import labelled_scene
 

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from clients.metadrive.result_store import outcome_store
-from model.bundled import SCENES
-from service.cli import outcomes
-from service.cli.commands import app
+from looktwice.clients.metadrive.result_store import outcome_store
+from looktwice.model.bundled import SCENES
+from looktwice.service.cli import outcomes
+from looktwice.service.cli.commands import app
 
 DRAWS = 2
 

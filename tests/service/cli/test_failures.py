@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from model.driving.feedback_store import read_feedback
-from model.driving.pdm.feedback import Feedback, parse_feedback
-from service.cli.commands import app
-from service.settings import Settings
+from looktwice.model.driving.feedback_store import read_feedback
+from looktwice.model.driving.pdm.feedback import Feedback, parse_feedback
+from looktwice.service.cli.commands import app
+from looktwice.service.settings import Settings
 from tests.clients.labelling.builds import scenes
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from model.bundled import SCENES
-from service.cli import ladder, serving
-from service.cli.commands import app
+from looktwice.model.bundled import SCENES
+from looktwice.service.cli import ladder, serving
+from looktwice.service.cli.commands import app
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 
     monkeypatch.setattr(ladder, "_run", run)
     monkeypatch.setattr(serving, "_wait_for", lambda *_: None)
-    monkeypatch.setattr("service.cli.serving.subprocess.Popen", _NoProcess)
+    monkeypatch.setattr("looktwice.service.cli.serving.subprocess.Popen", _NoProcess)
     return ran
 
 

@@ -11,10 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from loadtests.loads import Phase, poisson_arrivals
-from service.admission import Admission
-from service.cli.loadtest import loadtest as command
-from service.settings import Settings
+from looktwice.loadtests.loads import Phase, poisson_arrivals
+from looktwice.service.admission import Admission
+from looktwice.service.cli.loadtest import loadtest as command
+from looktwice.service.settings import Settings
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import serve
 
@@ -23,7 +23,7 @@ def loadtest(url: str, *options: str) -> subprocess.CompletedProcess[str]:
     command = [
         sys.executable,
         "-m",
-        "service.cli",
+        "looktwice.service.cli",
         "loadtest",
         "--service",
         url,
@@ -113,7 +113,15 @@ def test_what_cannot_be_run_is_refused_before_it_begins() -> None:
 def test_a_service_of_its_own_stands_what_is_dear_and_stops_in_the_midst_of_it() -> None:
     done = subprocess.run(
         [
-            *(sys.executable, "-m", "service.cli", "loadtest", "--scenario", "costly", "--own-service"),
+            *(
+                sys.executable,
+                "-m",
+                "looktwice.service.cli",
+                "loadtest",
+                "--scenario",
+                "costly",
+                "--own-service",
+            ),
             *("--rate", "1", "--seconds", "6", "--warm-up", "1", "--mix", "direct", "--n", "1"),
             *("--lag-limit-ms", "5000", "--timeout-s", "120", "--json"),
         ],

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
-from model.bundled import SCENES
-from service.cli.commands import app
-from service.examples import example_score
+from looktwice.model.bundled import SCENES
+from looktwice.service.cli.commands import app
+from looktwice.service.examples import example_score
 
 RUNNER = CliRunner()
 

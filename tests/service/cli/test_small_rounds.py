@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from clients.metadrive import simulator
-from model.bundled import CHECKPOINT
-from model.driving.scene_store import read_scenes, write_scenes
-from model.network.small_planner import WEIGHTS_FILE, load_small
-from model.training.small import SmallSettings
-from service.cli.small_rounds import FIRST_ROUND_SEED, train_small_in_rounds
+from looktwice.clients.metadrive import simulator
+from looktwice.model.bundled import CHECKPOINT
+from looktwice.model.driving.scene_store import read_scenes, write_scenes
+from looktwice.model.network.small_planner import WEIGHTS_FILE, load_small
+from looktwice.model.training.small import SmallSettings
+from looktwice.service.cli.small_rounds import FIRST_ROUND_SEED, train_small_in_rounds
 from tests.model.training.scenes import training_scene
 
 

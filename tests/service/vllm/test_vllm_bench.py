@@ -11,9 +11,9 @@ import pytest
 
 pytest.importorskip("vllm", reason="runs in vLLM's own environment (make test-vllm)", exc_type=ImportError)
 
-from model.bundled import CHECKPOINT
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from service.settings import Settings
+from looktwice.model.bundled import CHECKPOINT
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.service.settings import Settings
 from tests.service.serving import serve
 
 PROMPTS = 4

@@ -15,11 +15,11 @@ from hypothesis import given
 from starlette.responses import StreamingResponse
 from starlette.types import ASGIApp
 
-from clients.labelling.checks import FailedCheck, check_reflection
-from clients.labelling.retries import with_retries
-from clients.labelling.teachers.facts import phrases_of
-from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
-from clients.labelling.teachers.teacher import (
+from looktwice.clients.labelling.checks import FailedCheck, check_reflection
+from looktwice.clients.labelling.retries import with_retries
+from looktwice.clients.labelling.teachers.facts import phrases_of
+from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from looktwice.clients.labelling.teachers.teacher import (
     Answer,
     Question,
     TeacherBusy,
@@ -27,7 +27,7 @@ from clients.labelling.teachers.teacher import (
     TeacherError,
     ask,
 )
-from model.driving.phrases import HEADS, Facts, head_of
+from looktwice.model.driving.phrases import HEADS, Facts, head_of
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer, completion
 from tests.model.driving.strategies import facts
 from tests.service.scenes import scene

@@ -8,16 +8,16 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from clients.labelling.checks import check_reflection
-from clients.labelling.teachers.rules import RuleTeacher
-from clients.labelling.teachers.teacher import Question, TeacherError
-from model.bundled import SCENES
-from model.driving.labeller import expert_plan
-from model.driving.phrases import NOTHING, agrees, corrected, read_facts
-from model.driving.plan import WORDS, Plan, track_from_words
-from model.driving.scene import LabelledScene
-from model.driving.scene_store import read_scenes
-from model.driving.view import Surroundings
+from looktwice.clients.labelling.checks import check_reflection
+from looktwice.clients.labelling.teachers.rules import RuleTeacher
+from looktwice.clients.labelling.teachers.teacher import Question, TeacherError
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.phrases import NOTHING, agrees, corrected, read_facts
+from looktwice.model.driving.plan import WORDS, Plan, track_from_words
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.view import Surroundings
 
 BUNDLED = list(read_scenes(SCENES, dense=False))
 STRAIGHT = next(labelled for labelled in BUNDLED if "turn" not in labelled.tags)

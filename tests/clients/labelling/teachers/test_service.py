@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from clients.labelling.checks import FailedCheck
-from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
-from clients.labelling.teachers.rules import RuleTeacher
-from clients.labelling.teachers.service import ServiceTeacher
-from clients.labelling.teachers.teacher import (
+from looktwice.clients.labelling.checks import FailedCheck
+from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from looktwice.clients.labelling.teachers.rules import RuleTeacher
+from looktwice.clients.labelling.teachers.service import ServiceTeacher
+from looktwice.clients.labelling.teachers.teacher import (
     Answer,
     Question,
     Teacher,
@@ -21,9 +21,9 @@ from clients.labelling.teachers.teacher import (
     TeacherClosed,
     TeacherError,
 )
-from model.driving.outcome import Outcome
-from model.driving.view import Surroundings
-from service.settings import Settings
+from looktwice.model.driving.outcome import Outcome
+from looktwice.model.driving.view import Surroundings
+from looktwice.service.settings import Settings
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN, ScriptedEngine

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import pytest
 
-from clients.labelling.checks import FailedCheck
-from clients.labelling.teachers.rules import RuleTeacher
-from clients.labelling.teachers.teacher import (
+from looktwice.clients.labelling.checks import FailedCheck
+from looktwice.clients.labelling.teachers.rules import RuleTeacher
+from looktwice.clients.labelling.teachers.teacher import (
     ATTEMPTS,
     Answer,
     Question,
@@ -15,10 +15,10 @@ from clients.labelling.teachers.teacher import (
     TeacherBusy,
     ask,
 )
-from model.bundled import SCENES
-from model.driving.labeller import expert_plan
-from model.driving.scene_store import read_scenes
-from model.driving.view import Surroundings
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.view import Surroundings
 
 SCENE, OTHER = list(read_scenes(SCENES, dense=False))[:2]
 QUESTION = Question(

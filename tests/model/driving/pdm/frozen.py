@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from model.driving.pdm.scoring import (
+from looktwice.model.driving.pdm.scoring import (
     COLLISIONS,
     COMFORT,
     DIRECTION,

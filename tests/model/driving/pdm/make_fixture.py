@@ -1,4 +1,5 @@
-"""Freeze what NAVSIM's own scorer says of random worlds; `model.bench.navsim_scorer` tells what it needs.
+"""Freeze what NAVSIM's own scorer says of random worlds; `looktwice.model.bench.navsim_scorer` tells what it
+needs.
 
 From the repository's root, once for each version, in as many parts as there are processors:
 
@@ -15,9 +16,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from model.bench.navsim_scorer import NavsimScorer
-from model.driving.pdm.scoring import score_states
-from model.driving.pdm.world import STATE_SIZE, STEPS, Array, BoolArray, World
+from looktwice.model.bench.navsim_scorer import NavsimScorer
+from looktwice.model.driving.pdm.scoring import score_states
+from looktwice.model.driving.pdm.world import STATE_SIZE, STEPS, Array, BoolArray, World
 from tests.model.driving.pdm.frozen import FULL_STATES, NAMES, STATE_STEPS
 from tests.model.driving.pdm.worlds import PLANS, case
 

@@ -8,14 +8,14 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.course import course_of
-from model.driving.pdm.failures import Fact, facts_of
-from model.driving.pdm.feedback import Feedback, parse_feedback
-from model.driving.pdm.judged import Number, foreign_numbers, numbers
-from model.driving.pdm.judging import Said, judged_plans
-from model.driving.pdm.rule_teacher import SHORT, critique
-from model.driving.pdm.scoring import (
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.course import course_of
+from looktwice.model.driving.pdm.failures import Fact, facts_of
+from looktwice.model.driving.pdm.feedback import Feedback, parse_feedback
+from looktwice.model.driving.pdm.judged import Number, foreign_numbers, numbers
+from looktwice.model.driving.pdm.judging import Said, judged_plans
+from looktwice.model.driving.pdm.rule_teacher import SHORT, critique
+from looktwice.model.driving.pdm.scoring import (
     COLLISIONS,
     COMFORT,
     DIRECTION,
@@ -29,7 +29,7 @@ from model.driving.pdm.scoring import (
     ego_boxes,
     score,
 )
-from model.driving.pdm.world import PACIFICA, Array, RedLight, ScoreError, World
+from looktwice.model.driving.pdm.world import PACIFICA, Array, RedLight, ScoreError, World
 from tests.model.driving.pdm.test_scoring import box, road, standing, straight
 from tests.model.driving.pdm.worlds import case
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.driving.pdm.feedback import (
+from looktwice.model.driving.pdm.feedback import (
     BEGIN,
     END,
     MOST_CHARACTERS,

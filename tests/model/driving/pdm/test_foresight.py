@@ -11,20 +11,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from transformers import AutoTokenizer
 
-from clients.wire import MAX_FEEDBACK_CHARACTERS
-from model.bundled import CHECKPOINT
-from model.driving.agents import AGENT_KINDS
-from model.driving.pdm.foresight import world_ahead
-from model.driving.pdm.judging import judged_plans
-from model.driving.pdm.rule_teacher import critique
-from model.driving.pdm.scoring import COLLISIONS, Others, score
-from model.driving.pdm.world import Array, World
-from model.driving.tracks import Track
-from model.driving.trajectory import FloatArray
-from model.families.elf_vla.inputs import WITH_ATTEMPT
-from model.families.family import Attempt, Situation
-from model.formats.cursor import CompiledFormat
-from model.network.vocabulary import Vocabulary
+from looktwice.clients.wire import MAX_FEEDBACK_CHARACTERS
+from looktwice.model.bundled import CHECKPOINT
+from looktwice.model.driving.agents import AGENT_KINDS
+from looktwice.model.driving.pdm.foresight import world_ahead
+from looktwice.model.driving.pdm.judging import judged_plans
+from looktwice.model.driving.pdm.rule_teacher import critique
+from looktwice.model.driving.pdm.scoring import COLLISIONS, Others, score
+from looktwice.model.driving.pdm.world import Array, World
+from looktwice.model.driving.tracks import Track
+from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.families.elf_vla.inputs import WITH_ATTEMPT
+from looktwice.model.families.family import Attempt, Situation
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.network.vocabulary import Vocabulary
 
 CAR = Track(20.0, 3.0, 0.0, 5.0, 4.5, 1.9, "vehicle")
 

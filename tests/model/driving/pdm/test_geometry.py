@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
-from model.driving.pdm.geometry import (
+from looktwice.model.driving.pdm.geometry import (
     Boxes,
     Points,
     area_meets,
@@ -19,7 +19,7 @@ from model.driving.pdm.geometry import (
     segments_meet,
     to_edges,
 )
-from model.driving.pdm.world import Area, Array
+from looktwice.model.driving.pdm.world import Area, Array
 
 SEEDS = range(8)
 

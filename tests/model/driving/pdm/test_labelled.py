@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.bundled import SCENES
-from model.driving.lane_map import LaneArea, LaneMap
-from model.driving.pdm.comfort import _filter
-from model.driving.pdm.failures import failures_of
-from model.driving.pdm.labelled import EGO, plans_of, world_of
-from model.driving.pdm.scoring import (
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.lane_map import LaneArea, LaneMap
+from looktwice.model.driving.pdm.comfort import _filter
+from looktwice.model.driving.pdm.failures import failures_of
+from looktwice.model.driving.pdm.labelled import EGO, plans_of, world_of
+from looktwice.model.driving.pdm.scoring import (
     COLLISIONS,
     COMFORT,
     DIRECTION,
@@ -26,8 +26,8 @@ from model.driving.pdm.scoring import (
     Scores,
     score,
 )
-from model.driving.pdm.world import ACCELERATION, HEADING, SPEED, STEERING, YAW_RATE
-from model.driving.scene_store import read_scenes
+from looktwice.model.driving.pdm.world import ACCELERATION, HEADING, SPEED, STEERING, YAW_RATE
+from looktwice.model.driving.scene_store import read_scenes
 from tests.model.driving.drives import MIDDLES_S, labelled_scene, rectangle
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.scoring import (
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.scoring import (
     COMFORT,
     EXTENDED_COMFORT,
     PROGRESS,
@@ -19,7 +19,7 @@ from model.driving.pdm.scoring import (
     Scores,
     score,
 )
-from model.driving.pdm.simulator import reference_poses, simulate
+from looktwice.model.driving.pdm.simulator import reference_poses, simulate
 from tests.model.driving.pdm.frozen import FULL_STATES, NAMES, SCORE, STATE_STEPS, WORLDS
 from tests.model.driving.pdm.worlds import Case, case
 

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.driving.pdm.profiles import (
+from looktwice.model.driving.pdm.profiles import (
     CURVATURE_RATE_PENALTY,
     INITIAL_CURVATURE_PENALTY,
     SolveError,
     curvature_fit,
     profiles,
 )
-from model.driving.pdm.world import STEP_S, Array
+from looktwice.model.driving.pdm.world import STEP_S, Array
 
 # A car that creeps, stands and creeps on while its heading wavers: millimetres per second, radians a step.
 CREEPING_MMPS: Final = (

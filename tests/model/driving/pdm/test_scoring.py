@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model.driving.pdm.comfort import Version
-from model.driving.pdm.scoring import (
+from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.scoring import (
     COLLISIONS,
     COMFORT,
     DIRECTION,
@@ -22,7 +22,16 @@ from model.driving.pdm.scoring import (
     Others,
     score,
 )
-from model.driving.pdm.world import Area, Array, Lane, RedLight, ScoreError, TrackedBox, Vehicle, World
+from looktwice.model.driving.pdm.world import (
+    Area,
+    Array,
+    Lane,
+    RedLight,
+    ScoreError,
+    TrackedBox,
+    Vehicle,
+    World,
+)
 from tests.model.driving.pdm.worlds import case
 
 

@@ -12,7 +12,7 @@ from random import Random
 
 import numpy as np
 
-from model.driving.pdm.world import (
+from looktwice.model.driving.pdm.world import (
     ACCELERATION,
     HEADING,
     LONG_STEPS,

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from model.bundled import CHECKPOINT, SCENES
-from model.driving.images import ImageError
-from model.driving.phrases import read_facts
-from model.driving.plan import parse_plan
-from model.driving.scene import Clip, Scene
-from model.driving.scene_store import read_scenes
-from model.driving.tracks import Track
-from model.engines.engine import (
+from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.driving.images import ImageError
+from looktwice.model.driving.phrases import read_facts
+from looktwice.model.driving.plan import parse_plan
+from looktwice.model.driving.scene import Clip, Scene
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.tracks import Track
+from looktwice.model.engines.engine import (
     Controls,
     Decision,
     Draw,
@@ -34,18 +34,18 @@ from model.engines.engine import (
     Started,
     TextWritten,
 )
-from model.engines.torch.engine import TorchEngine, TorchSettings
-from model.engines.vllm.engine import VllmEngine, VllmSettings
-from model.families.cf_vla import CF_VLA
-from model.families.registry import families_of
-from model.formats.cursor import CompiledFormat
-from model.formats.replay import decisions
-from model.formats.text import parse
-from model.network.checkpoint import load, read_parts
-from model.network.settings import NANO_SETTINGS
-from model.training.batches import collate
-from model.training.learner import ResponseLearner
-from model.training.rollouts import rollout
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.engines.vllm.engine import VllmEngine, VllmSettings
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.registry import families_of
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.replay import decisions
+from looktwice.model.formats.text import parse
+from looktwice.model.network.checkpoint import load, read_parts
+from looktwice.model.network.settings import NANO_SETTINGS
+from looktwice.model.training.batches import collate
+from looktwice.model.training.learner import ResponseLearner
+from looktwice.model.training.rollouts import rollout
 from tests.checkpoints import write_untrained
 from tests.model.engines.contract import CONTRACT, Check
 

@@ -25,9 +25,9 @@ from transformers import (
     Qwen2VLVideoProcessor,
 )
 
-from clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
-from clients.labelling.teachers.service import ServiceTeacher
-from clients.labelling.teachers.teacher import (
+from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from looktwice.clients.labelling.teachers.service import ServiceTeacher
+from looktwice.clients.labelling.teachers.teacher import (
     Answer,
     Question,
     Reflection,
@@ -36,9 +36,9 @@ from clients.labelling.teachers.teacher import (
     TeacherError,
     ask,
 )
-from model.network.corpus import nano_corpus
-from model.network.vocabulary import build_nano_tokenizer
-from service.settings import Settings
+from looktwice.model.network.corpus import nano_corpus
+from looktwice.model.network.vocabulary import build_nano_tokenizer
+from looktwice.service.settings import Settings
 from tests.clients.labelling.builds import GOOD
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN, ScriptedEngine

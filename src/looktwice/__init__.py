@@ -1,0 +1,1 @@
+"""LookTwice: a server for driving models that look twice before they act."""
