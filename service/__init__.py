@@ -1,0 +1,2 @@
+if __name__ != "looktwice.service":
+    raise ImportError(f"{__name__} is looktwice.service; import it by that name")

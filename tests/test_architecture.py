@@ -64,6 +64,7 @@ def imports(path: Path) -> Iterator[str]:
 
 
 def place(imported: str) -> str:
+    """As `ALLOWED` tells it."""
     return imported.removeprefix("looktwice.").replace(".", "/")
 
 
@@ -74,8 +75,28 @@ def within(name: str, places: tuple[str, ...]) -> bool:
 @pytest.mark.parametrize(("name", "path"), list(modules()))
 def test_arrows_point_one_way(name: str, path: Path) -> None:
     room = max((room for room in ALLOWED if within(name, (room,))), key=len)
-    ours = [place(imported) for imported in imports(path) if within(place(imported), PACKAGES)]
+    ours = [place(imported) for imported in imports(path) if imported.startswith("looktwice.")]
     assert [imported for imported in ours if not within(imported, ALLOWED[room])] == []
+
+
+def test_nobody_imports_a_room_by_another_name() -> None:
+    everywhere = [path for folder in (*PACKAGES, "docs", "tests") for path in (ROOT / folder).rglob("*.py")]
+    assert len(everywhere) > len(list(modules()))
+    assert [
+        path
+        for path in everywhere
+        if any(within(place(each), PACKAGES) and not each.startswith("looktwice.") for each in imports(path))
+    ] == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_room_in_reach_says_by_which_name_to_import_it(package: str) -> None:
+    """In a clone's root they are in reach; two names would be two modules of everything."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"import {package}"], capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.returncode == 1
+    assert done.stderr.endswith(f"ImportError: {package} is looktwice.{package}; import it by that name\n")
 
 
 @pytest.mark.parametrize(("name", "path"), list(modules()))

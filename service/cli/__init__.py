@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from typing import Final
 
-_OURS: Final = frozenset({"clients", "deploy", "loadtests", "model", "service"})
 _MORE: Final = (
     "This command needs more: the simulator (`make sim`), or an extra such as "
     "pip install 'looktwice[load]' for load tests, [train], [video], [ray] or [alpasim]"
@@ -21,6 +20,6 @@ def main() -> None:
     try:
         app()
     except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition(".")[0] in _OURS:
+        if error.name is None or error.name.partition(".")[0] == "looktwice":
             raise
         sys.exit(f"looktwice: {error}. {_MORE}")
