@@ -103,7 +103,7 @@ def test_the_constraints_for_gpus_admit_what_the_package_asks_for() -> None:
 
 
 def test_a_build_is_sent_what_it_installs_and_nothing_else(context: set[str]) -> None:
-    packages = ("clients/", "loadtests/", "model/", "service/")
+    packages = ("clients/", "loadtests/", "model/", "service/", "src/")
     assert {file for file in tracked() if file.startswith(packages)} <= context
     assert {"deploy/ray/app.py", "pyproject.toml", "constraints.txt", "README.md", "NOTICE"} <= context
     assert not {file for file in context if file.startswith(("tests/", "docs/", "deploy/helm/", ".git"))}

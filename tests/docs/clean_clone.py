@@ -276,15 +276,20 @@ def follow_without_network(folder: Path, port: int) -> None:
         Faulty: a command does not do what the page says.
     """
     newcomer = Newcomer(folder / "looktwice", port, left_out(), network=False)
+    copy_clone(newcomer.folder)
+    _installed(newcomer.folder)
+    follow_readme(newcomer)
+    follow_own_cameras(newcomer)
+
+
+def copy_clone(folder: Path) -> None:
+    """What git carries here, changes that are not committed included, in another folder."""
     listed_files = ("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard")
     names = subprocess.run(listed_files, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in filter(None, names.split("\0")):
         if (ROOT / name).is_file() or (ROOT / name).is_symlink():
-            (newcomer.folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / name, newcomer.folder / name, follow_symlinks=False)
-    _installed(newcomer.folder)
-    follow_readme(newcomer)
-    follow_own_cameras(newcomer)
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, folder / name, follow_symlinks=False)
 
 
 def left_out() -> dict[str, str]:
@@ -298,7 +303,7 @@ def _installed(clone: Path) -> None:
     venv = clone / ".venv"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", venv], check=True)
     (packages,) = venv.glob("lib/python*/site-packages")
-    (packages / "clone.pth").write_text(f"{clone}\n{sysconfig.get_path('purelib')}\n")
+    (packages / "clone.pth").write_text(f"{clone / 'src'}\n{sysconfig.get_path('purelib')}\n")
     command = venv / "bin" / "looktwice"
     command.write_text(f"#!{venv}/bin/python\nfrom looktwice.service.cli import main\nmain()\n")
     command.chmod(0o755)
