@@ -99,7 +99,7 @@ def test_modules_of_ones_own_with_the_same_names_do_no_harm(installed: Path, tmp
     names = ", ".join(PACKAGES)
     script.write_text(
         f"import {names}\n"
-        "from looktwice.clients.planner import PlannerClient\n"
+        "from looktwice.clients import PlannerClient\n"
         "from looktwice.model.bundled import CHECKPOINT, SCENES\n"
         "from looktwice.service.app import create_app\n"
         f"assert all(each.MINE for each in ({names}))\n"

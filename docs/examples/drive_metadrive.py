@@ -6,11 +6,11 @@ Needs the simulator (`make sim`). `looktwice drive` does the same for many episo
 import argparse
 from pathlib import Path
 
+from looktwice.clients import PlannerClient
 from looktwice.clients.metadrive.drive import DriveConfig, drive
 from looktwice.clients.metadrive.film import Film
 from looktwice.clients.metadrive.pilots import ServicePilot
 from looktwice.clients.metadrive.rig import Rig
-from looktwice.clients.planner import PlannerClient
 from looktwice.clients.wire import Controls
 
 parser = argparse.ArgumentParser()

@@ -2,7 +2,7 @@
 
 import sys
 
-from looktwice.clients.planner import PlannerClient
+from looktwice.clients import PlannerClient
 from looktwice.clients.wire import Controls
 from looktwice.model.bundled import SCENES
 from looktwice.model.driving.scene_store import read_scenes

@@ -5,7 +5,7 @@ Here the other planner is careless: it accelerates straight on, whatever is ahea
 
 import sys
 
-from looktwice.clients.planner import PlannerClient
+from looktwice.clients import PlannerClient
 from looktwice.clients.wire import ReflectControls
 from looktwice.model.bundled import SCENES
 from looktwice.model.driving.plan import parse_plan
