@@ -71,6 +71,8 @@ def generate(
     with reported_errors():
         from looktwice.clients.metadrive.generate import GenerateConfig, generate
 
+        if careless and small is None:
+            raise ValueError("--careless is for --small, which plans from tracks")
         driver, pilot = _driver(service, small, tracks=tracks, pictures=pictures)
         config = GenerateConfig(
             stride_s=stride,

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
 from looktwice.clients.metadrive.drive import TAKE_OVER, DriveConfig
 from looktwice.clients.metadrive.generate import GenerateConfig, GenerationError, generate
@@ -20,6 +21,7 @@ from looktwice.model.driving.metrics import collides, leaves_road
 from looktwice.model.driving.scene import Scene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.tracks import Track
+from looktwice.service.cli.commands import app
 from looktwice.service.cli.scenes import served_pilot
 from looktwice.service.settings import Settings
 from tests.clients.metadrive.conftest import SEED
@@ -137,6 +139,14 @@ def test_a_careless_pilot_overlooks_everybody_for_a_while(tmp_path: Path) -> Non
         assert told == (not pilot.shown[scene.scene_id].tracks)
     with pytest.raises(GenerationError, match="the expert has lapses"):
         GenerateConfig(dense=False, careless=True)
+
+
+def test_carelessness_is_refused_where_nobody_plans_from_tracks(tmp_path: Path) -> None:
+    command = ["scenes", "generate", str(tmp_path / "new"), "--first-seed", "4", "--episodes", "1"]
+    told = CliRunner().invoke(app, [*command, "--no-dense", "--service", "http://127.0.0.1:9", "--careless"])
+    assert told.exit_code != 0
+    assert "--careless is for --small" in told.output
+    assert not (tmp_path / "new").exists()
 
 
 def test_what_only_the_expert_s_drives_have_is_refused() -> None:
