@@ -129,7 +129,8 @@ class ResponseDataset(Dataset[Sample]):
         weights: of sections.
         pictures: whether prompts have them.
         vision: what the tower sees in all examples, where it does not learn; else their patches are given.
-        reflections: to be asked for by items.
+        reflections: to be asked for by items. Where some of those that are judged look twice and others do
+            not, the expert's own responses teach nothing of the branch.
         attempts: to be asked for by items, which are refined in the format ``attempting``.
         own_plans: behind which trajectories are learned too, where nothing is reflected.
         visual_codes: of the checkpoint, where items are to teach pictures.
@@ -170,6 +171,9 @@ class ResponseDataset(Dataset[Sample]):
         self.formats = {
             name: CompiledFormat(family.format, vocabulary) for name, family in self._families.items()
         }
+        # Both ways on from plans of the model's own: then these alone say when to look twice.
+        judged = {bool(reflection.thinking) for reflection in reflections if reflection.judged}
+        self._expert_branches = judged != {True, False}
         self.reflecting = next((name for name, family in self._families.items() if family.looks_twice), None)
         for reflection in reflections:
             if self.reflecting is None:
@@ -257,7 +261,13 @@ class ResponseDataset(Dataset[Sample]):
         return self._next[key]
 
     def _target(self, task: str, lesson: Lesson) -> Target:
-        return make_target(self._families[task], self.formats[task], lesson, self._weights)
+        return make_target(
+            self._families[task],
+            self.formats[task],
+            lesson,
+            self._weights,
+            expert_branches=self._expert_branches,
+        )
 
     def _prompt(self, item: Item, situation: Situation) -> list[int]:
         if self._pictures and item.pictures:

@@ -30,6 +30,8 @@ def make_target(
     compiled: CompiledFormat,
     lesson: Lesson,
     weights: SectionWeights,
+    *,
+    expert_branches: bool = True,
 ) -> Target:
     """Render and weigh the response that a lesson teaches, in ``compiled``, the family's format.
 
@@ -41,6 +43,8 @@ def make_target(
 
     Args:
         weights: by section.
+        expert_branches: whether the expert's own response teaches the branch. Where reflections say which of
+            the model's plans fail, it would only say that nothing fails in hard scenes either.
 
     Raises:
         ValueError: the family does not say what to teach; a `FormatError` where its format cannot say it.
@@ -53,10 +57,11 @@ def make_target(
     plans = {section: each for section in values for each in values.all(section) if isinstance(each, Plan)}
     tokens = compiled.render(values, given=plans)
     untaught, reflection = set[str | None](), lesson.reflection
+    judged = expert_branches if reflection is None else reflection.judged
+    if not judged and family.branch is not None:
+        untaught.add(family.branch.name)
     if reflection is not None:
         untaught.add(family.first_plan)
-        if not reflection.judged and family.branch is not None:
-            untaught.add(family.branch.name)
         if reflection.revised_plan is not None and wanted_changes(reflection.revised_plan, lesson.plan):
             untaught.add(family.trajectory)
     taught = {section: 0.0 if section in untaught else weight for section, weight in weights.items()}

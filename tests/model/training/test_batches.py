@@ -50,6 +50,21 @@ def test_a_reflection_that_cannot_be_written_is_refused_before_training(loaded: 
         dataset(loaded, "The car ahead stands.", "\u524d\u306e\u8eca")
 
 
+@pytest.mark.parametrize(
+    ("texts", "branches"),
+    [((), True), (("The car ahead stands.",), True), (("",), True), (("The car ahead stands.", ""), False)],
+)
+def test_the_expert_branches_unless_plans_of_both_kinds_were_judged(
+    loaded: Loaded, texts: tuple[str, ...], branches: bool
+) -> None:
+    alone, beside = (
+        dataset(loaded, *each)[Item(0, "cf_vla", route=True)].responses[0] for each in ((), texts)
+    )
+    assert beside.ids == alone.ids
+    untaught = [one for one, other in zip(alone.weights, beside.weights, strict=True) if other != one]
+    assert untaught == ([] if branches else [10.0])  # one token decides
+
+
 def test_an_epoch_gives_every_example_at_most_once_with_its_share_of_tasks() -> None:
     has_route = np.arange(4000) % 4 > 0
     sampler = TaskSampler(has_route, 16, {"traj_only": 0.25, "cf_vla": 0.75}, 0.5, seed=0)

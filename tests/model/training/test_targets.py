@@ -93,6 +93,28 @@ def test_a_plan_that_nobody_judged_teaches_no_branch() -> None:
     } == {0.0}
 
 
+def test_the_expert_may_teach_no_branch() -> None:
+    compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
+    whole, rest = (
+        make_target(CF_VLA, compiled, lesson(PLAN), PAPER_WEIGHTS, expert_branches=branches)
+        for branches in (True, False)
+    )
+    assert whole.ids == rest.ids
+    given = {"plan": PLAN}
+    tokens = compiled.render(parse(compiled, VOCABULARY.decode(whole.ids), given), given)
+    differ = [
+        (token.section, other)
+        for token, one, other in zip(tokens, whole.weights, rest.weights, strict=True)
+        if one != other
+    ]
+    assert {section for section, _ in differ} == {"branch"}
+    assert {weight for _, weight in differ} == {0.0}
+    looked = lesson(PLAN, Reflection(WRONG, "The car ahead stands still."))
+    assert make_target(CF_VLA, compiled, looked, PAPER_WEIGHTS, expert_branches=False) == make_target(
+        CF_VLA, compiled, looked, PAPER_WEIGHTS
+    )
+
+
 def test_a_right_plan_of_its_own_is_acted_on_and_not_taught() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
     target = make_target(CF_VLA, compiled, lesson(PLAN, Reflection(WRONG, "")), PAPER_WEIGHTS)
