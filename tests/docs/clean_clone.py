@@ -2,7 +2,7 @@
 
 It clones the commit that is checked out and runs every block of commands in order, against the real service.
 The README's Python runs in an environment that holds nothing but what the README names. Of every command that
-the README lists it asks for the help, and those that take seconds it runs (`TRIED`). This takes a network and
+README and docs/commands.md list it asks for the help, and those that take seconds it runs (`TRIED`). This takes a network and
 minutes. Nothing but Python is needed, since the environments are made on the way.
 
 `make test` follows them too, without a network: see `follow_without_network`.
@@ -30,6 +30,7 @@ from urllib.error import URLError
 from urllib.request import urlopen
 
 ROOT: Final = Path(__file__).parents[2]
+COMMANDS: Final = "docs/commands.md"
 PORT: Final = 8000
 ELSEWHERE: Final = {"make test": "continuous integration runs it in a clean clone anyway; half an hour"}
 """Commands that are not run, and why."""
@@ -53,7 +54,7 @@ TRIED: Final = {
     "keys new": "looktwice keys new somebody",
     "evaluate": "looktwice evaluate --limit 2 --n 1",
 }
-"""How commands that the README lists are run beside its service, in this order."""
+"""How listed commands are run beside the README's service, in this order."""
 HELP_ONLY: Final = {
     "plan": "the README's `make plan` runs it",
     "scenes generate": "it needs the simulator",
@@ -68,7 +69,7 @@ HELP_ONLY: Final = {
     "bench egodriver": "minutes",
     "bench http": "minutes",
 }
-"""Commands that the README lists and of which only the help is asked for, and why."""
+"""Listed commands of which only the help is asked for, and why."""
 ACTIVATE: Final = "source .venv/bin/activate"
 SERVE: Final = "looktwice serve"
 _READY_S: Final = 120.0
@@ -213,11 +214,12 @@ def follow_readme(newcomer: Newcomer) -> None:
     assert rest, "nothing behind the service"
     if newcomer.network:
         check_pins(newcomer)
-    for command, options in listed(page):
+    lists = page + (newcomer.folder / COMMANDS).read_text()
+    for command, options in listed(lists):
         told = newcomer.run(f"looktwice {command} --help")
         if missing := [option for option in options if option not in told]:
             raise Faulty(f"looktwice {command} has no {', '.join(missing)}")
-    for target in sorted(set(re.findall(r"`make ([a-z-]+)`", page))):
+    for target in sorted(set(re.findall(r"`make ([a-z-]+)`", lists))):
         newcomer.run(f"make --dry-run {target}")
     with newcomer.service():
         run_block(newcomer, "\n".join(TRIED.values()))

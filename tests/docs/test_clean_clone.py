@@ -13,6 +13,7 @@ from looktwice.clients.importers.recording import RecordingError
 from tests.comma2k19 import SEGMENT
 from tests.docs.clean_clone import (
     ACTIVATE,
+    COMMANDS,
     HELP_ONLY,
     MINUTE,
     SERVE,
@@ -42,8 +43,9 @@ def test_what_is_left_out_stands_in_the_pages() -> None:
     assert left_out().keys() <= set(commands)
 
 
-def test_every_command_that_the_readme_lists_is_run_or_it_is_said_why_not() -> None:
-    names = {name for name, _ in listed((ROOT / "README.md").read_text())}
+def test_every_command_that_is_listed_is_run_or_it_is_said_why_not() -> None:
+    pages = ("README.md", COMMANDS)
+    names = {name for page in pages for name, _ in listed((ROOT / page).read_text())}
     assert not TRIED.keys() & HELP_ONLY.keys()
     assert names == TRIED.keys() | HELP_ONLY.keys()
     for name, command in TRIED.items():
