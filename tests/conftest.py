@@ -9,6 +9,8 @@ from hypothesis import settings
 
 # Small tensors: a second thread gains nothing, and where another process has the core it costs tenfold.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# A process that a test starts need not compile our modules again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # How long an example takes says how busy the machine is, not whether the code is right.
 settings.register_profile("no time limit", deadline=None)

@@ -5,7 +5,7 @@ The README's Python runs in an environment that holds nothing but what the READM
 the README lists it asks for the help, and those that take seconds it runs (`TRIED`). This takes a network and
 minutes. Nothing but Python is needed, since the environments are made on the way.
 
-`make test` follows them too, without a network: see `follow_without_network`.
+`make test` follows the pages' own commands too, without a network: see `follow_without_network`.
 """
 
 from __future__ import annotations
@@ -213,14 +213,15 @@ def follow_readme(newcomer: Newcomer) -> None:
     assert rest, "nothing behind the service"
     if newcomer.network:
         check_pins(newcomer)
-    for command, options in listed(page):
-        told = newcomer.run(f"looktwice {command} --help")
-        if missing := [option for option in options if option not in told]:
-            raise Faulty(f"looktwice {command} has no {', '.join(missing)}")
+        for command, options in listed(page):
+            told = newcomer.run(f"looktwice {command} --help")
+            if missing := [option for option in options if option not in told]:
+                raise Faulty(f"looktwice {command} has no {', '.join(missing)}")
     for target in sorted(set(re.findall(r"`make ([a-z-]+)`", page))):
         newcomer.run(f"make --dry-run {target}")
     with newcomer.service():
-        run_block(newcomer, "\n".join(TRIED.values()))
+        if newcomer.network:
+            run_block(newcomer, "\n".join(TRIED.values()))
         for language, block in rest:
             if language == "bash":
                 run_block(newcomer, block)
@@ -269,8 +270,9 @@ def follow_own_cameras(newcomer: Newcomer) -> None:
 def follow_without_network(folder: Path, port: int) -> None:
     """Both pages in a copy of what git carries here, with the packages that run this.
 
-    Not tried: the commands that are `left_out`; that `make plan` installs; that the client needs no more
-    than it names, and that constraints.txt pins all.
+    Not tried: the commands that are `left_out`, and those that the README only lists, which have tests of
+    their own; that `make plan` installs; that the client needs no more than it names, and that
+    constraints.txt pins all.
 
     Raises:
         Faulty: a command does not do what the page says.

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from looktwice.clients.importers.comma2k19 import Film
 from looktwice.clients.importers.recording import RecordingError
+from looktwice.service.cli.commands import app
 from tests.comma2k19 import SEGMENT
 from tests.docs.clean_clone import (
     ACTIVATE,
@@ -40,6 +42,15 @@ def test_what_is_left_out_stands_in_the_pages() -> None:
         line for page in PAGES for _, block in blocks((ROOT / page).read_text()) for line in lines(block)
     ]
     assert left_out().keys() <= set(commands)
+
+
+@pytest.mark.parametrize(("command", "options"), listed((ROOT / "README.md").read_text()))
+def test_a_command_that_the_readme_lists_has_the_options_that_it_shows(
+    command: str, options: list[str]
+) -> None:
+    told = CliRunner(env={"COLUMNS": "200"}).invoke(app, [*command.split(), "--help"])
+    assert told.exit_code == 0, told.output
+    assert [option for option in options if option not in told.output] == []
 
 
 def test_every_command_that_the_readme_lists_is_run_or_it_is_said_why_not() -> None:
