@@ -26,6 +26,20 @@ def untrained_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def brief_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As `resampling_checkpoint`, but narrow, for tests of many responses.
+
+    Its reflections are phrases: with the free text of `untrained_checkpoint` a response takes eight times as
+    long.
+    """
+    from looktwice.model.network.settings import NANO_SETTINGS
+    from tests.checkpoints import write_untrained
+
+    folder = tmp_path_factory.mktemp("checkpoint") / "brief"
+    return write_untrained(folder, narrow=True, settings=NANO_SETTINGS)
+
+
+@pytest.fixture(scope="session")
 def resampling_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As `untrained_checkpoint`, but with a resampler and tracks, as the shipped model's recipe makes it."""
     from looktwice.model.network.settings import NANO_SETTINGS
