@@ -89,12 +89,10 @@ def test_labelled_and_exported_in_every_form(rolled: Path, tmp_path: Path) -> No
 
 def test_a_model_of_phrases_learns_from_its_own_plans(resampling_checkpoint: Path, tmp_path: Path) -> None:
     build, file = tmp_path / "build", tmp_path / "reflections.parquet"
-    some = tmp_path / "some.parquet"
-    write_scenes(some, islice(read_scenes(SCENES), 4))
     with serve(TorchEngine(resampling_checkpoint, TorchSettings(rows=12)), Settings()) as served:
-        told("rollout", build, some, "--service", served.url, "--n", 2, "--json")
+        told("rollout", build, SCENES, "--service", served.url, "--n", 2, "--json")
     told("filter", build, "--everything", "--json")
-    assert told("label", build, some, "--json")["done"] > 0
+    assert told("label", build, SCENES, "--json")["done"] > 0
     ran("export", build, "--to", file)
     written = list(read_reflections(file))
     for each in written:
