@@ -18,14 +18,18 @@ FAST_TESTS := tests/model/formats tests/model/driving tests/service
 NOT_FAST := $(addprefix tests/service/,cli vllm test_connection.py test_fuzz.py test_server.py test_trust.py test_inspector_scenes.py) \
 	tests/model/driving/pdm/test_oracle.py tests/model/formats/test_grammar_export.py
 
+# One more than there are cores: tests wait for clocks, browsers and other processes. A process may take 3 GB.
+TEST_PROCESSES := $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
+
 .PHONY: plan test test-fast test-readme lint docs lint-api pictures deploy-check sim vllm test-vllm system-packages clean
 
 plan: $(VENV)/.serve
 	$(BIN)/looktwice plan
 
-# A file's tests stay together: they share servers and checkpoints. A process may take 3 GB.
+# A file's tests stay together: they share servers and checkpoints. Files are dealt out by their paths: those that
+# take long come first, and many short ones last, so that no core waits for the last file.
 test: $(VENV)/.dev $(BIN)/promtool system-packages lint
-	$(BIN)/python -m pytest -n logical --maxprocesses 8 --dist loadfile
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 test-fast: $(VENV)/.dev
 	$(BIN)/python -m pytest -q $(FAST_TESTS) $(addprefix --ignore=,$(NOT_FAST))

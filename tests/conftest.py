@@ -9,6 +9,8 @@ from hypothesis import settings
 
 # Small tensors: a second thread gains nothing, and where another process has the core it costs tenfold.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# A process that a test starts need not compile our modules again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # How long an example takes says how busy the machine is, not whether the code is right.
 settings.register_profile("no time limit", deadline=None)
@@ -21,6 +23,20 @@ def untrained_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tests.checkpoints import write_untrained
 
     return write_untrained(tmp_path_factory.mktemp("checkpoint") / "untrained")
+
+
+@pytest.fixture(scope="session")
+def brief_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As `resampling_checkpoint`, but narrow, for tests of many responses.
+
+    Its reflections are phrases: with the free text of `untrained_checkpoint` a response takes eight times as
+    long.
+    """
+    from looktwice.model.network.settings import NANO_SETTINGS
+    from tests.checkpoints import write_untrained
+
+    folder = tmp_path_factory.mktemp("checkpoint") / "brief"
+    return write_untrained(folder, narrow=True, settings=NANO_SETTINGS)
 
 
 @pytest.fixture(scope="session")

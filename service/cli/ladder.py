@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -14,7 +15,6 @@ import typer
 from looktwice.model.evaluation.ladder import COUNTERFACTUAL, META_ACT, MULTI_ROUND, ROUND_2, WHOLE_DATASET
 from looktwice.service.cli.serving import served
 
-_LOOKTWICE: Final = (sys.executable, "-m", "looktwice.service.cli")
 _CHECKPOINT_FILE: Final = "looktwice.json"
 
 
@@ -80,6 +80,21 @@ _THINK_THRESHOLD: Final = "0.25"
 """Chosen on validation scenes (docs/results.md)."""
 
 
+@dataclass(frozen=True)
+class Step:
+    """A command of the ladder.
+
+    Attributes:
+        words: that `looktwice` is called with.
+        processes: that run it together; 0: it is called without `torch.distributed.run`.
+        served: the checkpoint that a service plans with meanwhile; its URL is the command's ``--service``.
+    """
+
+    words: tuple[str, ...]
+    processes: int = 0
+    served: Path | None = None
+
+
 def climb(
     folder: Path,
     scenes: Path,
@@ -108,43 +123,75 @@ def climb(
     folder.mkdir(parents=True, exist_ok=True)
     if meta_act is not None and not (folder / META_ACT).exists():
         (folder / META_ACT).symlink_to(meta_act.resolve(), target_is_directory=True)
+    for step in steps_left(folder, scenes, test, training, every=every, processes=processes):
+        follow(step)
+
+
+def steps_left(
+    folder: Path, scenes: Path, test: Path, training: Sequence[str], *, every: int, processes: int
+) -> list[Step]:
+    """What is still to be done, in order; arguments as of `climb`."""
+    steps: list[Step] = []
     if not _is_there(folder / META_ACT):
         if not _is_there(folder / _UNTRAINED):
-            _run(
-                _LOOKTWICE,
-                ["train", "create", "--to", str(folder / _UNTRAINED), "--scenes", str(scenes), *training],
-            )
+            to = ("--to", str(folder / _UNTRAINED))
+            steps.append(Step(("train", "create", *to, "--scenes", str(scenes), *training)))
         own = _without(training, _OF_RECIPES)
         for entry in _GROUNDWORK:
             vision = ["--vision-from", str(folder / entry.vision)] if entry.vision else []
-            _train(entry, folder, scenes, [*vision, *own], processes)
+            steps += _trained(entry, folder, scenes, [*vision, *own], processes)
+    built = set[str]()
     for entry in _LADDER:
         reflections = folder / f"{entry.build}.parquet"
-        if not reflections.exists() and not _is_there(folder / entry.name):
-            _make(_BUILDS[entry.build], folder, scenes, every, reflections)
-        _train(entry, folder, scenes, ["--reflections", str(reflections), *training], processes)
-    _run(
-        _LOOKTWICE,
-        ["evaluate", "--preset", "ladder", "--checkpoint", str(folder / COUNTERFACTUAL)],
-        ["--ladder", str(folder), "--scenes", str(test), "--plots", str(folder / "plots")],
-        ["--think-threshold", _THINK_THRESHOLD, "--keep", str(folder / "draws.sqlite")],
-    )
+        wanted = not reflections.exists() and not _is_there(folder / entry.name)
+        if wanted and entry.build not in built:
+            built.add(entry.build)
+            steps += _built(_BUILDS[entry.build], folder, scenes, every, reflections)
+        steps += _trained(entry, folder, scenes, ["--reflections", str(reflections), *training], processes)
+    table = ("evaluate", "--preset", "ladder", "--checkpoint", str(folder / COUNTERFACTUAL))
+    kept = ("--plots", str(folder / "plots"), "--keep", str(folder / "draws.sqlite"))
+    of = ("--ladder", str(folder), "--scenes", str(test), "--think-threshold", _THINK_THRESHOLD)
+    return [*steps, Step((*table, *of, *kept))]
+
+
+def follow(step: Step, call: Callable[[Sequence[str]], int] = subprocess.call) -> None:
+    """Run a step's command; raises RuntimeError when it fails.
+
+    Args:
+        step: of `steps_left`.
+        call: runs a command and says with which code it ended.
+    """
+    with ExitStack() as meanwhile:
+        words = step.words
+        if step.served is not None:
+            # Nobody waits for an answer here: the more at once the better.
+            options = ["--checkpoint", str(step.served), "--rows", str(_ROWS)]
+            _, url = meanwhile.enter_context(served(options, {"LOOKTWICE_MAX_DRAWS": str(_ROWS)}))
+            words = (*words, "--service", url)
+        together = (
+            ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(step.processes))
+            if step.processes
+            else ()
+        )
+        command = (sys.executable, *together, "-m", "looktwice.service.cli", *words)
+        typer.echo(f"$ {' '.join(command)}", err=True)
+        if code := call(command):
+            raise RuntimeError(f"{' '.join(command)} ended with code {code}")
 
 
 def _is_there(checkpoint: Path) -> bool:
     return (checkpoint / _CHECKPOINT_FILE).exists()
 
 
-def _train(entry: LadderEntry, folder: Path, scenes: Path, options: Sequence[str], processes: int) -> None:
-    """Train one entry, unless it is there."""
+def _trained(
+    entry: LadderEntry, folder: Path, scenes: Path, options: Sequence[str], processes: int
+) -> list[Step]:
+    """The step that trains an entry; none where it is there."""
     if _is_there(folder / entry.name):
-        return
-    _run(
-        [sys.executable, "-m", "torch.distributed.run", "--standalone"],
-        ["--nproc-per-node", str(processes), "-m", "looktwice.service.cli", "train", entry.recipe],
-        ["--from", str(folder / entry.source), "--to", str(folder / entry.name)],
-        ["--scenes", str(scenes), *options],
-    )
+        return []
+    between = ("--from", str(folder / entry.source), "--to", str(folder / entry.name))
+    words = ("train", entry.recipe, *between, "--scenes", str(scenes), *options)
+    return [Step(words, processes)]
 
 
 def _without(options: Sequence[str], names: frozenset[str]) -> list[str]:
@@ -153,25 +200,12 @@ def _without(options: Sequence[str], names: frozenset[str]) -> list[str]:
     return [option for at, option in enumerate(options) if not {at, at - 1} & set(places)]
 
 
-def _make(build: Build, folder: Path, scenes: Path, every: int, reflections: Path) -> None:
+def _built(build: Build, folder: Path, scenes: Path, every: int, reflections: Path) -> list[Step]:
     """Everything from a checkpoint to a file of reflections on its plans."""
     place = str(folder / f"build-{build.name}")
-    # Nobody waits for an answer here: the more at once the better.
-    options = ["--checkpoint", str(folder / build.entry), "--rows", str(_ROWS)]
-    with served(options, {"LOOKTWICE_MAX_DRAWS": str(_ROWS)}) as (_, url):
-        _run(
-            _LOOKTWICE,
-            ["build", "rollout", place, str(scenes), "--service", url, "--every", str(every)],
-        )
-    _run(_LOOKTWICE, ["build", "filter", place, *build.keep])
-    _run(_LOOKTWICE, ["build", "label", place, str(scenes), "--plans-per-scene", str(_PLANS_PER_SCENE)])
-    _run(_LOOKTWICE, ["build", "export", place, "--to", str(reflections), *build.right])
-
-
-def _run(*parts: Sequence[str]) -> None:
-    """Run a command; raises RuntimeError when it fails."""
-    command = [word for part in parts for word in part]
-    typer.echo(f"$ {' '.join(command)}", err=True)
-    ended = subprocess.run(command, check=False)
-    if ended.returncode:
-        raise RuntimeError(f"{' '.join(command)} ended with code {ended.returncode}")
+    return [
+        Step(("build", "rollout", place, str(scenes), "--every", str(every)), served=folder / build.entry),
+        Step(("build", "filter", place, *build.keep)),
+        Step(("build", "label", place, str(scenes), "--plans-per-scene", str(_PLANS_PER_SCENE))),
+        Step(("build", "export", place, "--to", str(reflections), *build.right)),
+    ]

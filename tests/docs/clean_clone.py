@@ -2,10 +2,10 @@
 
 It clones the commit that is checked out and runs every block of commands in order, against the real service.
 The README's Python runs in an environment that holds nothing but what the README names. Of every command that
-README and docs/commands.md list it asks for the help, and those that take seconds it runs (`TRIED`). This takes a network and
-minutes. Nothing but Python is needed, since the environments are made on the way.
+README and docs/commands.md list it asks for the help, and those that take seconds it runs (`TRIED`). This
+takes a network and minutes. Nothing but Python is needed, since the environments are made on the way.
 
-`make test` follows them too, without a network: see `follow_without_network`.
+`make test` follows the pages' own commands too, without a network: see `follow_without_network`.
 """
 
 from __future__ import annotations
@@ -212,17 +212,18 @@ def follow_readme(newcomer: Newcomer) -> None:
     while not newcomer.activated:
         run_block(newcomer, rest.pop(0)[1])
     assert rest, "nothing behind the service"
+    lists = page + (newcomer.folder / COMMANDS).read_text()
     if newcomer.network:
         check_pins(newcomer)
-    lists = page + (newcomer.folder / COMMANDS).read_text()
-    for command, options in listed(lists):
-        told = newcomer.run(f"looktwice {command} --help")
-        if missing := [option for option in options if option not in told]:
-            raise Faulty(f"looktwice {command} has no {', '.join(missing)}")
+        for command, options in listed(lists):
+            told = newcomer.run(f"looktwice {command} --help")
+            if missing := [option for option in options if option not in told]:
+                raise Faulty(f"looktwice {command} has no {', '.join(missing)}")
     for target in sorted(set(re.findall(r"`make ([a-z-]+)`", lists))):
         newcomer.run(f"make --dry-run {target}")
     with newcomer.service():
-        run_block(newcomer, "\n".join(TRIED.values()))
+        if newcomer.network:
+            run_block(newcomer, "\n".join(TRIED.values()))
         for language, block in rest:
             if language == "bash":
                 run_block(newcomer, block)
@@ -271,8 +272,9 @@ def follow_own_cameras(newcomer: Newcomer) -> None:
 def follow_without_network(folder: Path, port: int) -> None:
     """Both pages in a copy of what git carries here, with the packages that run this.
 
-    Not tried: the commands that are `left_out`; that `make plan` installs; that the client needs no more
-    than it names, and that constraints.txt pins all.
+    Not tried: the commands that are `left_out`, and those that the README only lists, which have tests of
+    their own; that `make plan` installs; that the client needs no more than it names, and that
+    constraints.txt pins all.
 
     Raises:
         Faulty: a command does not do what the page says.

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from looktwice.clients.importers.comma2k19 import Film
 from looktwice.clients.importers.recording import RecordingError
+from looktwice.service.cli.commands import app
 from tests.comma2k19 import SEGMENT
 from tests.docs.clean_clone import (
     ACTIVATE,
@@ -30,6 +32,7 @@ from tests.sockets import free_port
 
 ROOT = Path(__file__).parents[2]
 PAGES = ("README.md", "docs/own-cameras.md")
+LISTED = [each for page in ("README.md", COMMANDS) for each in listed((ROOT / page).read_text())]
 
 
 def test_every_command_and_snippet_does_what_the_pages_say(tmp_path: Path) -> None:
@@ -43,9 +46,15 @@ def test_what_is_left_out_stands_in_the_pages() -> None:
     assert left_out().keys() <= set(commands)
 
 
+@pytest.mark.parametrize(("command", "options"), LISTED)
+def test_a_listed_command_has_the_options_that_are_shown(command: str, options: list[str]) -> None:
+    told = CliRunner(env={"COLUMNS": "200"}).invoke(app, [*command.split(), "--help"])
+    assert told.exit_code == 0, told.output
+    assert [option for option in options if option not in told.output] == []
+
+
 def test_every_command_that_is_listed_is_run_or_it_is_said_why_not() -> None:
-    pages = ("README.md", COMMANDS)
-    names = {name for page in pages for name, _ in listed((ROOT / page).read_text())}
+    names = {name for name, _ in LISTED}
     assert not TRIED.keys() & HELP_ONLY.keys()
     assert names == TRIED.keys() | HELP_ONLY.keys()
     for name, command in TRIED.items():

@@ -6,8 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
 BUILD = (sys.executable, "-m", "mkdocs", "build")
 
@@ -25,12 +23,13 @@ def test_every_page_is_in_the_site_and_every_link_leads_somewhere(tmp_path: Path
         assert (tmp_path / "site" / name).is_file()
 
 
-@pytest.mark.parametrize("link", ["nowhere.md", "index.md#nowhere", "/nowhere"])
-def test_a_link_that_leads_nowhere_fails_the_site(link: str, tmp_path: Path) -> None:
+def test_links_that_lead_nowhere_fail_the_site(tmp_path: Path) -> None:
+    links = ("nobody.md", "index.md#nowhere", "/no-place")
     settings = (ROOT / "mkdocs.yml").read_text()
     (tmp_path / "mkdocs.yml").write_text(settings[: settings.index("nav:\n  - ")])
     (tmp_path / "docs").mkdir()
-    (tmp_path / "docs" / "index.md").write_text(f"# Home\n\n[a link]({link})\n")
+    page = "\n".join(f"[a link]({link})" for link in links)
+    (tmp_path / "docs" / "index.md").write_text(f"# Home\n\n{page}\n")
     done = build(tmp_path, tmp_path / "site")
     assert done.returncode != 0
-    assert "nowhere" in done.stderr
+    assert [link for link in links if f"'{link}'" not in done.stderr] == []

@@ -95,10 +95,9 @@ def test_it_plans_better_than_keeping_on(planner: PlannerClient) -> None:
     assert np.mean(errors) < 0.8 * min(kept_on)
 
 
-def test_a_thousand_hot_draws_all_parse() -> None:
+def test_hundreds_of_hot_draws_all_parse() -> None:
     """Read back strictly, from text alone, at a temperature that makes a model of this size babble."""
-    hot = [Controls(n=40, temperature=1.5, seed=seed) for seed in (1, 2)]
-    hot.append(Controls(n=4, temperature=1.5, thinking="always"))
+    hot = [Controls(n=40, temperature=1.5, seed=1), Controls(n=4, temperature=1.5, thinking="always")]
     requests = [
         PlanRequest(f"{labelled.scene.scene_id} {index}", labelled.scene, "cf_vla", controls=controls)
         for labelled in BUNDLED
@@ -115,7 +114,7 @@ def test_a_thousand_hot_draws_all_parse() -> None:
         return [event.draw for event in events if isinstance(event, DrawFinished)]
 
     draws = asyncio.run(write())
-    assert len(draws) == 12 * 84
+    assert len(draws) == 12 * 44
     compiled = CompiledFormat(CF_VLA.format, read_parts(CHECKPOINT).vocabulary)
     for draw in draws:
         values = parse(compiled, draw.text)

@@ -71,18 +71,22 @@ def test_the_expert_drives_as_in_its_own_episode(expert: Drive) -> None:
     np.testing.assert_array_equal(again.log().ego, log.ego)
 
 
-def test_who_plans_what_the_expert_did_gets_as_far(rig: Rig, expert: Drive) -> None:
+@pytest.fixture(scope="module")
+def oracle_drive(rig: Rig) -> tuple[Oracle, Drive]:
     oracle = Oracle(run_episode(SEED, CONFIG.duration_s + 7.0))
-    drove = drive(SEED, oracle, rig, CONFIG)
+    return oracle, drive(SEED, oracle, rig, CONFIG)
+
+
+def test_who_plans_what_the_expert_did_gets_as_far(oracle_drive: tuple[Oracle, Drive], expert: Drive) -> None:
+    oracle, drove = oracle_drive
     assert drove.driven_m == pytest.approx(expert.driven_m, rel=0.1)
     assert drove.ended == "time"
     assert not drove.off_road
     assert drove.plans == len(oracle.scenes) == (round(CONFIG.duration_s * 10) - TAKE_OVER + 4) // 5
 
 
-def test_a_scene_holds_what_the_car_sees_and_nothing_else(rig: Rig) -> None:
-    oracle = Oracle(run_episode(SEED, CONFIG.duration_s + 7.0))
-    drive(SEED, oracle, rig, CONFIG)
+def test_a_scene_holds_what_the_car_sees_and_nothing_else(oracle_drive: tuple[Oracle, Drive]) -> None:
+    oracle, _ = oracle_drive
     first, second = oracle.scenes[:2]
     assert [len(clip.images) for clip in first.clips] == [4, 4]
     assert first.route is not None

@@ -106,17 +106,27 @@ def test_the_chat_template_writes_our_prompts(tmp_path: Path, scene_tokens: int)
         assert written == "".join(prompt_text(task, settings, route=route, tracks=tracks))
 
 
-def test_a_new_checkpoint_has_a_card_that_tells_what_it_is(tmp_path: Path) -> None:
-    folder = write_untrained(tmp_path / "new", narrow=True)
-    card = (folder / "README.md").read_text()
-    assert read_card(folder)["revision"] in card
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint as it is written; not to be changed."""
+    return write_untrained(tmp_path_factory.mktemp("written") / "new", narrow=True)
+
+
+@pytest.fixture
+def folder(written: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(written, tmp_path / "new"))
+
+
+def test_a_new_checkpoint_has_a_card_that_tells_what_it_is(written: Path) -> None:
+    card = (written / "README.md").read_text()
+    assert read_card(written)["revision"] in card
     assert "Not for road use" in card
     assert "No training is recorded" in card
     assert "None are recorded" in card
 
 
-def test_describe_keeps_weights_and_records_figures(tmp_path: Path) -> None:
-    folder = write_untrained(tmp_path / "new", narrow=True)
+def test_describe_keeps_weights_and_records_figures(folder: Path) -> None:
     weights = (folder / "model.safetensors").read_bytes()
     told = ["describe", str(folder), "--figure", "minADE of 6 = 2.35 m", "--figure", "a=b=3"]
     result = CliRunner().invoke(app, told)
@@ -129,8 +139,7 @@ def test_describe_keeps_weights_and_records_figures(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("figure", ["none", "a=", "=3", "a|b=3"])
-def test_describe_refuses_what_is_no_figure(tmp_path: Path, figure: str) -> None:
-    folder = write_untrained(tmp_path / "new", narrow=True)
+def test_describe_refuses_what_is_no_figure(folder: Path, figure: str) -> None:
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
     result = CliRunner().invoke(app, ["describe", str(folder), "--figure", figure])
     assert result.exit_code == 2
@@ -201,8 +210,9 @@ def hub_of(name: str, folder: Path, asked: list[str]) -> Starlette:
     )
 
 
-def test_a_checkpoint_is_downloaded_from_the_hub_without_what_it_does_not_need(tmp_path: Path) -> None:
-    folder = write_untrained(tmp_path / "new", narrow=True)
+def test_a_checkpoint_is_downloaded_from_the_hub_without_what_it_does_not_need(
+    folder: Path, tmp_path: Path
+) -> None:
     write_repository(folder)
     for unneeded in ("pytorch_model.bin", "weights.pkl", "log.jsonl", "extra/setup.py"):
         (folder / unneeded).parent.mkdir(exist_ok=True)

@@ -15,7 +15,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from looktwice.model.bundled import CHECKPOINT
+from looktwice.model.bundled import CHECKPOINT, SCENES
 from looktwice.model.engines.torch.engine import TorchEngine
 from looktwice.service.cli.commands import app
 from looktwice.service.settings import Settings, TeacherSettings
@@ -164,8 +164,17 @@ def ran_bare(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("command", [("scenes", "stats"), ("scenes", "show", "--limit", "1")])
-def test_scenes_are_counted_and_shown_without_the_simulator(command: tuple[str, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("scenes", "stats"),
+        ("scenes", "show", "--limit", "1"),
+        ("scenes", "pick", str(SCENES), "picked.parquet", "--count", "2"),
+    ],
+)
+def test_scenes_are_counted_shown_and_picked_without_the_simulator(
+    command: tuple[str, ...], tmp_path: Path
+) -> None:
     done = ran_bare(*command, folder=tmp_path)
     assert done.returncode == 0, done.stderr
 

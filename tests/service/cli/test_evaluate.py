@@ -31,15 +31,15 @@ def ladder(checkpoint: Path, folder: Path, *more: str) -> dict[str, Any]:
 
 
 def test_a_ladder_is_climbed_once_and_told_again(
-    untrained_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    brief_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entries = tmp_path / "entries"
     entries.mkdir()
     for name in ("meta-act", "multi-round"):
-        (entries / name).symlink_to(untrained_checkpoint, target_is_directory=True)
+        (entries / name).symlink_to(brief_checkpoint, target_is_directory=True)
     plots = tmp_path / "plots"
     files = ["--plots", str(plots), "--per-scene", str(tmp_path / "scenes.parquet")]
-    told = ladder(untrained_checkpoint, tmp_path, "--ladder", str(entries), *files)
+    told = ladder(brief_checkpoint, tmp_path, "--ladder", str(entries), *files)
     scenes = pq.read_table(tmp_path / "scenes.parquet").to_pylist()
     for row in (each for each in told["rows"] if each["subgroup"] is None):
         measured = [scene["min_ade_m"] for scene in scenes if scene["row"] == row["name"]]
@@ -61,7 +61,7 @@ def test_a_ladder_is_climbed_once_and_told_again(
         return submit(engine, request)
 
     monkeypatch.setattr(TorchEngine, "submit", planning)
-    assert ladder(untrained_checkpoint, tmp_path, "--ladder", str(entries)) == told
+    assert ladder(brief_checkpoint, tmp_path, "--ladder", str(entries)) == told
     assert not planned & {each.scene.scene_id for each in read_scenes(SCENES)}, "all draws are kept"
 
 

@@ -1,69 +1,24 @@
-"""From scenes to the table in one command."""
+"""From scenes to the table: which commands are left to be run, and a round of them run."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
-import pytest
+import typer
 from typer.testing import CliRunner
 
 from looktwice.model.bundled import SCENES
-from looktwice.service.cli import ladder, serving
+from looktwice.model.driving.reflection_store import read_reflections
+from looktwice.model.driving.scene_store import read_scenes, write_scenes
+from looktwice.model.evaluation.ladder import COUNTERFACTUAL, META_ACT, MULTI_ROUND, ROUND_2, WHOLE_DATASET
+from looktwice.model.network.checkpoint import load
 from looktwice.service.cli.commands import app
+from looktwice.service.cli.ladder import Step, follow, steps_left
 
-
-@pytest.fixture
-def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """The commands that it would run; each leaves behind what it would make."""
-    ran: list[list[str]] = []
-
-    def run(*parts: list[str]) -> None:
-        command = [word for part in parts for word in part]
-        ran.append(command)
-        if "--to" in command:
-            made = Path(command[command.index("--to") + 1])
-            if made.suffix == ".parquet":
-                made.touch()
-            else:
-                made.mkdir()
-                (made / "looktwice.json").touch()
-
-    monkeypatch.setattr(ladder, "_run", run)
-    monkeypatch.setattr(serving, "_wait_for", lambda *_: None)
-    monkeypatch.setattr("looktwice.service.cli.serving.subprocess.Popen", _NoProcess)
-    return ran
-
-
-class _NoProcess:
-    def __init__(self, *_: object, **__: object) -> None:
-        pass
-
-    def terminate(self) -> None:
-        pass
-
-    def wait(self) -> None:
-        pass
-
-
-def climbed(folder: Path, *more: str) -> None:
-    asked = ["train", "ladder", "--scenes", str(SCENES), "--test", str(SCENES), "--to", str(folder)]
-    result = CliRunner().invoke(app, [*asked, "--learning-rate", "0.001", "--steps", "2", *more])
-    assert result.exit_code == 0, result.output
-
-
-def trained(commands: list[list[str]]) -> list[tuple[str, str, str]]:
-    """Recipe, source and target of each training."""
-    return [
-        (
-            command[command.index("train") + 1],
-            Path(command[command.index("--from") + 1]).name,
-            Path(command[command.index("--to") + 1]).name,
-        )
-        for command in commands
-        if "train" in command and "--from" in command
-    ]
-
-
+TRAINING = ("--learning-rate", "0.001", "--steps", "2")
 LADDER = [
     ("counterfactual", "meta-act", "counterfactual"),
     ("multi-round", "meta-act", "multi-round"),
@@ -72,9 +27,39 @@ LADDER = [
 ]
 
 
-def test_it_begins_with_nothing_but_scenes(commands: list[list[str]], tmp_path: Path) -> None:
-    climbed(tmp_path / "ladder")
-    assert trained(commands) == [
+def left(folder: Path) -> list[Step]:
+    """What is left in a ladder's folder; every command is one that `looktwice` has, with these options."""
+    steps = steps_left(folder, SCENES, SCENES, TRAINING, every=6, processes=1)
+    for step in steps:
+        words = [*step.words, *(("--service", "http://localhost") if step.served else ())]
+        command: Any = typer.main.get_command(app)
+        while hasattr(command, "commands"):
+            command = command.commands[words.pop(0)]
+        command.make_context("looktwice", words)
+    return steps
+
+
+def value(step: Step, option: str) -> str:
+    return step.words[step.words.index(option) + 1]
+
+
+def trained(steps: Sequence[Step]) -> list[tuple[str, str, str]]:
+    """Recipe, source and target of each training."""
+    return [
+        (step.words[1], Path(value(step, "--from")).name, Path(value(step, "--to")).name)
+        for step in steps
+        if step.words[0] == "train" and step.words[1] != "create"
+    ]
+
+
+def linked(folder: Path, checkpoint: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).symlink_to(checkpoint, target_is_directory=True)
+
+
+def test_it_begins_with_nothing_but_scenes(tmp_path: Path) -> None:
+    steps = left(tmp_path)
+    assert trained(steps) == [
         ("read-tracks", "untrained", "tracks"),
         ("language", "tracks", "language"),
         ("ground", "untrained", "ground"),
@@ -82,37 +67,73 @@ def test_it_begins_with_nothing_but_scenes(commands: list[list[str]], tmp_path: 
         ("meta-act", "scene", "meta-act"),
         *LADDER,
     ]
-    of_rung = {command[command.index("train") + 1]: command for command in commands if "train" in command}
-    assert of_rung["read-scene"][of_rung["read-scene"].index("--vision-from") + 1].endswith("ladder/ground")
-    assert "--learning-rate" not in of_rung["meta-act"]
-    assert of_rung["counterfactual"][of_rung["counterfactual"].index("--learning-rate") + 1] == "0.001"
-    assert all(command[command.index("--steps") + 1] == "2" for command in of_rung.values())
-    assert commands[-1][3] == "evaluate"
+    recipes = {step.words[1]: step for step in steps if step.words[0] == "train"}
+    assert steps[0] is recipes["create"]
+    assert value(recipes["read-scene"], "--vision-from") == str(tmp_path / "ground")
+    assert "--learning-rate" not in recipes["meta-act"].words
+    assert value(recipes["counterfactual"], "--learning-rate") == "0.001"
+    assert all(value(step, "--steps") == "2" for step in recipes.values())
+    # What is learned from is made right before it is learned, of plans of the entry that it is named for.
+    made: list[str] = []
+    for step in steps:
+        if step.words[1] == "export":
+            made.append(value(step, "--to"))
+        elif "--reflections" in step.words:
+            assert value(step, "--reflections") in made
+    assert [Path(file).stem for file in made] == ["round-1", "whole", "round-2"]
+    served = [step.served.name for step in steps if step.served is not None]
+    assert served == [META_ACT, META_ACT, COUNTERFACTUAL]
+    assert steps[-1].words[0] == "evaluate"
 
 
-def test_it_begins_with_a_checkpoint_and_goes_on_where_it_was(
-    commands: list[list[str]], untrained_checkpoint: Path, tmp_path: Path
-) -> None:
-    folder = tmp_path / "ladder"
-    climbed(folder, "--from", str(untrained_checkpoint))
-    assert trained(commands) == LADDER
-    commands.clear()
-    climbed(folder, "--from", str(untrained_checkpoint))
-    assert [command[3] for command in commands] == ["evaluate"], "only the table is told again"
-
-
-def test_the_papers_recipes_need_a_model_to_begin_with(commands: list[list[str]], tmp_path: Path) -> None:
-    asked = [
-        "train",
-        "ladder",
-        "--scenes",
-        str(SCENES),
-        "--test",
-        str(SCENES),
-        "--to",
-        str(tmp_path / "ladder"),
+def test_it_goes_on_where_it_was(untrained_checkpoint: Path, tmp_path: Path) -> None:
+    linked(tmp_path, untrained_checkpoint, META_ACT)
+    assert trained(left(tmp_path)) == LADDER
+    (tmp_path / "round-1.parquet").touch()
+    steps = left(tmp_path)
+    assert trained(steps) == LADDER
+    assert [Path(value(step, "--to")).stem for step in steps if step.words[1] == "export"] == [
+        "whole",
+        "round-2",
     ]
-    result = CliRunner().invoke(app, [*asked, "--paper"])
+    linked(tmp_path, untrained_checkpoint, COUNTERFACTUAL, MULTI_ROUND, WHOLE_DATASET, ROUND_2)
+    assert [step.words[0] for step in left(tmp_path)] == ["evaluate"], "only the table is told again"
+
+
+def test_a_data_set_is_made_and_learned(brief_checkpoint: Path, tmp_path: Path) -> None:
+    """Behind a real service. The table, which comes last, is a test of `evaluate --preset ladder`."""
+    linked(tmp_path, brief_checkpoint, META_ACT, COUNTERFACTUAL, MULTI_ROUND, ROUND_2)
+    scenes = tmp_path / "scenes.parquet"
+    write_scenes(scenes, islice(read_scenes(SCENES), 3))
+
+    def here(command: Sequence[str]) -> int:
+        """In this process, which has imported everything."""
+        words = command[command.index("looktwice.service.cli") + 1 :]
+        return CliRunner().invoke(app, words, catch_exceptions=False).exit_code
+
+    training = ("--steps", "2", "--batch-size", "2", "--cache", str(tmp_path / "cache"))
+    *steps, table = steps_left(tmp_path, scenes, scenes, training, every=1, processes=1)
+    assert table.words[0] == "evaluate"
+    for step in steps:
+        follow(step, here)
+    learned = load(tmp_path / WHOLE_DATASET).card.details["stages"][-1]
+    assert learned["name"] == "counterfactual"
+    assert learned["reflections_count"] == len(list(read_reflections(tmp_path / "whole.parquet"))) > 0
+
+
+def test_a_step_that_fails_ends_it_and_is_named(tmp_path: Path) -> None:
+    nowhere, folder = str(tmp_path / "nowhere"), str(tmp_path / "ladder")
+    asked = ["train", "ladder", "--scenes", nowhere, "--test", nowhere, "--to", folder, "--steps", "2"]
+    result = CliRunner().invoke(app, asked)
+    assert result.exit_code == 2
+    command = f"train create --to {folder}/untrained --scenes {nowhere} --steps 2"
+    assert f"{command}\n" in result.output, "it is told before it is run"
+    assert f"{command} ended with code 2" in result.output
+
+
+def test_the_papers_recipes_need_a_model_to_begin_with(tmp_path: Path) -> None:
+    asked = ["train", "ladder", "--scenes", str(SCENES), "--test", str(SCENES), "--paper"]
+    result = CliRunner().invoke(app, [*asked, "--to", str(tmp_path / "ladder")])
     assert result.exit_code == 2
     assert "--from" in result.output
-    assert commands == []
+    assert not (tmp_path / "ladder").exists()
