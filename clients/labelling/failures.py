@@ -33,12 +33,11 @@ from looktwice.clients.planner import AsyncPlannerClient
 from looktwice.model.driving.feedback_store import FeedbackRow
 from looktwice.model.driving.hashing import hash_of, judged_hash
 from looktwice.model.driving.pdm.comfort import Version
-from looktwice.model.driving.pdm.feedback import RuleFeedback
 from looktwice.model.driving.pdm.judged import THRESHOLD, JudgedPlan
 from looktwice.model.driving.pdm.judging import Said, judged_in_scene
 from looktwice.model.driving.pdm.labelled import plans_of
 from looktwice.model.driving.pdm.profiles import SolveError
-from looktwice.model.driving.pdm.rule_teacher import NAME, REVISION, critique
+from looktwice.model.driving.pdm.rule_teacher import NAME, REVISION, feedback_on
 from looktwice.model.driving.pdm.world import Array, ScoreError
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import read_scenes
@@ -208,10 +207,8 @@ def writer(
         draw = chosen.entry.record["draws"][chosen.draw]
         (judged,) = await asyncio.to_thread(judge, chosen.labelled, [draw], version, threshold)
         attempts = 0
-        if judged.correct:
-            text = str(RuleFeedback(judged.score, correct=True))
-        elif teacher is None:
-            text = str(critique(judged))
+        if teacher is None or judged.correct:
+            text = str(feedback_on(judged))
         else:
             text, attempts = await _asked(ledger, run, job.key, teacher, judged)
         return {

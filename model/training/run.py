@@ -173,7 +173,7 @@ def run(
     validate: Validate | None = None
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
-    taught = taught_by(recipe, examples)
+    taught = _taught_by(recipe, examples)
     on_examples = None if reflections is None else reflections_on(examples, read_reflections(reflections))
     tried = None
     if failures is not None and recipe.attempting is not None:
@@ -259,7 +259,7 @@ def _check_pictures(recipe: Recipe, examples: Examples, loaded: Loaded) -> None:
         )
 
 
-def taught_by(recipe: Recipe, examples: Examples) -> npt.NDArray[np.bool_]:
+def _taught_by(recipe: Recipe, examples: Examples) -> npt.NDArray[np.bool_]:
     """Which examples tell all that a recipe's responses say, bool [N]; raises ValueError where none does."""
     taught = np.ones(len(examples), np.bool_)
     for task in recipe.tasks:
