@@ -15,7 +15,8 @@ VLLM_UNUSED := torchaudio torchcodec triton
 
 # No browser, no simulator, no Ray, no processes of the service, no long oracle: under two minutes on one core.
 FAST_TESTS := tests/model/formats tests/model/driving tests/service
-NOT_FAST := $(addprefix tests/service/,cli vllm test_connection.py test_fuzz.py test_server.py test_trust.py test_inspector_scenes.py) \
+NOT_FAST := $(addprefix tests/service/,cli vllm test_fuzz.py routes/test_scenes.py) \
+	$(addprefix tests/service/http/,test_connection.py test_server.py test_trust.py) \
 	tests/model/driving/pdm/test_oracle.py tests/model/formats/test_grammar_export.py
 
 .PHONY: plan test test-fast test-readme lint docs lint-api pictures deploy-check sim vllm test-vllm system-packages clean

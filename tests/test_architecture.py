@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,6 +14,15 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("model", "service", "clients", "loadtests", "deploy")
 EVERYTHING = PACKAGES
+WIRE = (
+    *("clients/wire", "clients/wire_feedback", "clients/wire_imagine", "clients/wire_refine"),
+    *("clients/wire_scores", "clients/wire_values"),
+)
+ENGINES = (
+    *("model/engines/engine", "model/network/model_card", "model/families", "model/formats"),
+    "model/driving",
+)
+"""What an engine is asked and answers, whichever it is."""
 ALLOWED = {
     "model": ("model",),
     "model/driving": ("model/driving",),
@@ -30,19 +40,55 @@ ALLOWED = {
     "clients": ("clients", "model/driving"),
     "clients/importers": ("clients/importers", "clients/navsim", "model/driving"),
     "loadtests": ("loadtests", "clients", "model/driving"),
-    "service": (
-        *("service", "clients/wire", "clients/wire_feedback", "clients/wire_imagine", "clients/wire_refine"),
-        *("clients/wire_scores", "clients/wire_values", "clients/labelling/teachers"),
-        *("clients/labelling/retries", "model"),
+    "service": (),
+    "service/problems": ("clients/wire",),
+    "service/admission": ("service/admission", "service/problems"),
+    "service/operations": (
+        *("service/operations", "service/admission", "service/problems", "clients/wire"),
+        *("clients/labelling/teachers", "model/bundled", *ENGINES),
+    ),
+    "service/http": (
+        *("service/http", "service/operations", "service/problems", "clients/wire", "clients/wire_values"),
+    ),
+    "service/inspector": ("service/inspector", "service/http", "service/problems"),
+    "service/scenes": (
+        *("service/scenes", "service/problems", "clients/wire", "clients/wire_values", "model/driving"),
+    ),
+    "service/scoring": (
+        *("service/scoring", "service/scenes", "service/problems", *WIRE),
+        *("clients/labelling/teachers", "model/driving"),
+    ),
+    "service/planning": (
+        *("service/planning", "service/scoring", "service/operations", "service/admission"),
+        *("service/problems", *WIRE, *ENGINES),
+    ),
+    "service/openai": (
+        *("service/openai", "service/planning", "service/problems", "clients/wire", *ENGINES),
+    ),
+    "service/teaching": (
+        *("service/teaching", "service/planning", "service/scoring", "service/operations"),
+        *("service/problems", *WIRE, "clients/labelling/teachers", "clients/labelling/retries"),
+        "model/driving",
+    ),
+    "service/routes": (
+        *("service/routes", "service/teaching", "service/openai", "service/planning", "service/scoring"),
+        *("service/scenes", "service/http", "service/operations", "service/admission", "service/problems"),
+        *(*WIRE, "clients/labelling/teachers", "model/driving", "model/engines/engine"),
+    ),
+    "service/app": (
+        *("service/routes", "service/inspector", "service/planning", "service/scoring", "service/http"),
+        *("service/operations", "service/admission", "clients/wire", "clients/labelling/teachers"),
+        "model/engines/engine",
     ),
     "service/cli": EVERYTHING,
     "deploy": ("deploy", "service", "model/bundled"),
 }
-TORCH_FREE = ("model/driving", "model/formats", "model/families", "clients", "loadtests")
-LIGHT = (
-    *("clients/wire", "clients/wire_feedback", "clients/wire_imagine", "clients/wire_refine"),
-    *("clients/wire_scores", "clients/planner"),
-)
+SERVICE = tuple(room for room in ALLOWED if room.startswith("service/") and room != "service/cli")
+"""From the lowest to the highest."""
+TORCH_FREE = ("model/driving", "model/formats", "model/families", "clients", "loadtests", *SERVICE)
+AT_THE_DOOR = ("service/app", "service/http", "service/inspector", "service/routes")
+"""Where requests and answers are HTTP's."""
+LIGHT = (*WIRE, "clients/planner")
 LIGHT_IMPORTS = ("numpy", "PIL", "httpx", "httpx_sse", "msgpack", "pydantic", "model", "clients")
 
 
@@ -54,13 +100,16 @@ def modules() -> Iterator[tuple[str, Path]]:
             yield (place.parent if place.name == "__init__" else place).as_posix(), path
 
 
-def imports(path: Path) -> Iterator[str]:
+@functools.cache
+def imports(path: Path) -> tuple[str, ...]:
+    found = list[str]()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: imports are absolute here"
-            yield node.module or ""
+            found.append(node.module or "")
+    return tuple(found)
 
 
 def place(imported: str) -> str:
@@ -77,6 +126,24 @@ def test_arrows_point_one_way(name: str, path: Path) -> None:
     room = max((room for room in ALLOWED if within(name, (room,))), key=len)
     ours = [place(imported) for imported in imports(path) if imported.startswith("looktwice.")]
     assert [imported for imported in ours if not within(imported, ALLOWED[room])] == []
+
+
+@pytest.mark.parametrize("room", SERVICE)
+def test_a_room_of_the_service_stands_on_lower_ones(room: str) -> None:
+    below = SERVICE[: SERVICE.index(room) + 1]
+    assert [each for each in ALLOWED[room] if each.startswith("service/") and each not in below] == []
+
+
+def test_every_folder_of_the_service_is_a_room() -> None:
+    folders = {f"service/{path.parent.name}" for path in (ROOT / "service").glob("*/__init__.py")}
+    assert folders <= {*SERVICE, "service/cli"}
+
+
+@pytest.mark.parametrize(("name", "path"), list(modules()))
+def test_http_stays_at_the_door(name: str, path: Path) -> None:
+    if within(name, SERVICE) and not within(name, AT_THE_DOOR):
+        door = [each for each in imports(path) if within(place(each), ("fastapi", "starlette", "uvicorn"))]
+        assert door == []
 
 
 def test_nobody_imports_a_room_by_another_name() -> None:

@@ -22,7 +22,7 @@ from looktwice.clients.metadrive.tracking import FreeVehicle, world_trajectory
 from looktwice.clients.planner import PlannerClient
 from looktwice.model.driving.scene import Scene
 from looktwice.model.driving.trajectory import to_ego_frame
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.metadrive.conftest import SEED
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import serve

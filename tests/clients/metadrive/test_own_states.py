@@ -23,7 +23,7 @@ from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.tracks import Track
 from looktwice.service.cli.commands import app
 from looktwice.service.cli.scenes import served_pilot
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.metadrive.conftest import SEED
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve
