@@ -11,9 +11,15 @@ from pathlib import Path
 
 import pytest
 
+
+def within(name: str, places: tuple[str, ...]) -> bool:
+    return any(name == each or name.startswith(each + "/") for each in places)
+
+
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("model", "service", "clients", "loadtests", "deploy")
 EVERYTHING = PACKAGES
+SIMULATOR = "clients/metadrive/simulator"
 WIRE = (
     *("clients/wire", "clients/wire_feedback", "clients/wire_imagine", "clients/wire_refine"),
     *("clients/wire_scores", "clients/wire_values"),
@@ -38,6 +44,31 @@ ALLOWED = {
         *("model/formats", "model/driving"),
     ),
     "clients": ("clients", "model/driving"),
+    "clients/summaries": ("clients/summaries", "model/driving"),
+    "clients/metadrive": (),
+    "clients/metadrive/simulator": (),
+    "clients/metadrive/result_store": (),
+    "clients/metadrive/world": ("clients/metadrive/world", SIMULATOR, "model/driving"),
+    "clients/metadrive/drawing": (
+        *("clients/metadrive/drawing", "clients/metadrive/world", SIMULATOR, "model/driving"),
+    ),
+    "clients/metadrive/scenes": (
+        *("clients/metadrive/scenes", "clients/metadrive/drawing", "clients/metadrive/world"),
+        "model/driving",
+    ),
+    "clients/metadrive/closed_loop": (
+        *("clients/metadrive/closed_loop", "clients/metadrive/scenes", "clients/metadrive/drawing"),
+        *("clients/metadrive/world", "clients/metadrive/result_store"),
+        *("clients/summaries", "clients/planner", "clients/wire", "clients/wire_imagine", "model/driving"),
+    ),
+    "clients/metadrive/generation": (
+        *("clients/metadrive/generation", "clients/metadrive/closed_loop", "clients/metadrive/scenes"),
+        *("clients/metadrive/drawing", "clients/metadrive/world", SIMULATOR, "model/driving"),
+    ),
+    "clients/metadrive/outcomes": (
+        *("clients/metadrive/outcomes", "clients/metadrive/generation", "clients/metadrive/scenes"),
+        *("clients/metadrive/world", "clients/metadrive/result_store", SIMULATOR, "model/driving"),
+    ),
     "clients/importers": ("clients/importers", "clients/navsim", "model/driving"),
     "loadtests": ("loadtests", "clients", "model/driving"),
     "service": (),
@@ -85,6 +116,8 @@ ALLOWED = {
 }
 SERVICE = tuple(room for room in ALLOWED if room.startswith("service/") and room != "service/cli")
 """From the lowest to the highest."""
+METADRIVE = tuple(room for room in ALLOWED if within(room, ("clients/metadrive",)))
+DOORS = (*("clients/metadrive/closed_loop", "clients/metadrive/generation", "clients/metadrive/outcomes"),)
 TORCH_FREE = ("model/driving", "model/formats", "model/families", "clients", "loadtests", *SERVICE)
 AT_THE_DOOR = ("service/app", "service/http", "service/inspector", "service/routes")
 """Where requests and answers are HTTP's."""
@@ -108,17 +141,21 @@ def imports(path: Path) -> tuple[str, ...]:
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: imports are absolute here"
-            found.append(node.module or "")
+            found += [_imported(node.module or "", alias.name) for alias in node.names]
     return tuple(found)
+
+
+def _imported(module: str, name: str) -> str:
+    """What ``from module import name`` brings in: a module of ours where the name is one."""
+    whole = f"{module}.{name}"
+    path = ROOT / place(whole)
+    ours = module.startswith("looktwice.") and (path.is_dir() or path.with_suffix(".py").exists())
+    return whole if ours else module
 
 
 def place(imported: str) -> str:
     """As `ALLOWED` tells it."""
     return imported.removeprefix("looktwice.").replace(".", "/")
-
-
-def within(name: str, places: tuple[str, ...]) -> bool:
-    return any(name == each or name.startswith(each + "/") for each in places)
 
 
 @pytest.mark.parametrize(("name", "path"), list(modules()))
@@ -128,15 +165,46 @@ def test_arrows_point_one_way(name: str, path: Path) -> None:
     assert [imported for imported in ours if not within(imported, ALLOWED[room])] == []
 
 
-@pytest.mark.parametrize("room", SERVICE)
-def test_a_room_of_the_service_stands_on_lower_ones(room: str) -> None:
-    below = SERVICE[: SERVICE.index(room) + 1]
-    assert [each for each in ALLOWED[room] if each.startswith("service/") and each not in below] == []
+@pytest.mark.parametrize("house", [SERVICE, METADRIVE])
+def test_rooms_stand_on_lower_ones(house: tuple[str, ...]) -> None:
+    higher = [
+        (room, each)
+        for number, room in enumerate(house)
+        for each in ALLOWED[room]
+        if each in house and each not in house[: number + 1]
+    ]
+    assert higher == []
 
 
-def test_every_folder_of_the_service_is_a_room() -> None:
-    folders = {f"service/{path.parent.name}" for path in (ROOT / "service").glob("*/__init__.py")}
-    assert folders <= {*SERVICE, "service/cli"}
+@pytest.mark.parametrize("house", ["service", "clients/metadrive"])
+def test_every_folder_is_a_room(house: str) -> None:
+    folders = {path.parent.relative_to(ROOT).as_posix() for path in (ROOT / house).glob("*/__init__.py")}
+    assert folders <= ALLOWED.keys()
+
+
+def outsiders() -> Iterator[Path]:
+    """Whoever uses scenes and drives of the simulator without being a part of it; examples too."""
+    yield from (path for name, path in modules() if not within(name, ("clients/metadrive",)))
+    yield from (ROOT / "docs").rglob("*.py")
+
+
+def test_others_come_to_the_simulator_by_its_doors() -> None:
+    entered = {
+        place(imported)
+        for path in outsiders()
+        for imported in imports(path)
+        if within(place(imported), ("clients/metadrive",))
+    }
+    assert entered == {*DOORS}
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_a_door_needs_no_simulator(door: str) -> None:
+    blocked = (
+        "import sys; sys.modules.update(dict.fromkeys(('metadrive', 'panda3d', 'direct', 'gltf'))); "
+        f"import looktwice.{door.replace('/', '.')}"
+    )
+    subprocess.run([sys.executable, "-c", blocked], check=True, cwd=ROOT)
 
 
 @pytest.mark.parametrize(("name", "path"), list(modules()))
