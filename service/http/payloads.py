@@ -16,12 +16,7 @@ from starlette.datastructures import Headers, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from looktwice.clients.wire import (
-    MSGPACK_MEDIA_TYPE,
-    MULTIPART_MEDIA_TYPE,
-    PART_SCHEME,
-    REQUEST_PART,
-)
+from looktwice.clients.wire import MSGPACK_MEDIA_TYPE, MULTIPART_MEDIA_TYPE, PART_SCHEME, REQUEST_PART
 from looktwice.clients.wire_values import with_pictures
 from looktwice.service.http.body_limit import LARGE_BYTES
 from looktwice.service.http.documents import read_json, read_msgpack

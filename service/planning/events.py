@@ -10,10 +10,7 @@ import numpy.typing as npt
 
 import looktwice.clients.wire as wire
 from looktwice.model.driving.agreement import Agreement
-from looktwice.model.engines.engine import (
-    Draw,
-    Event,
-)
+from looktwice.model.engines.engine import Draw, Event
 from looktwice.model.network.model_card import ModelCard
 
 Paint = Callable[[Sequence[int]], npt.NDArray[np.uint8]]

@@ -1,4 +1,4 @@
-"""Feedback on trajectories: by rule where scores are worked out, by other teachers after that."""
+"""Feedback on trajectories by the built-in teacher, where scores are worked out; also what callers bring."""
 
 from __future__ import annotations
 
@@ -6,14 +6,8 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Final, Literal
 
-import structlog
-
 import looktwice.clients.wire_feedback as wire_feedback
-from looktwice.clients.labelling.teachers.feedback import (
-    FeedbackQuestion,
-    check_feedback,
-    question_of,
-)
+from looktwice.clients.labelling.teachers.feedback import FeedbackQuestion, check_feedback, question_of
 from looktwice.clients.wire import TeacherName
 from looktwice.model.driving.hashing import hash_of
 from looktwice.model.driving.pdm.course import Course
@@ -23,16 +17,9 @@ from looktwice.model.driving.pdm.judged import JudgedPlan, Number
 from looktwice.model.driving.pdm.judging import Said, judged_plans
 from looktwice.model.driving.pdm.rule_teacher import NAME, REVISION, feedback_on
 from looktwice.model.driving.pdm.world import ScoreError
-from looktwice.service.problems import (
-    INVALID_FEEDBACK,
-    INVALID_LABELS,
-    OTHER_PLAN,
-    at,
-)
+from looktwice.service.problems import INVALID_FEEDBACK, INVALID_LABELS, OTHER_PLAN, at
 from looktwice.service.scenes.bundled import BundledScenes
 from looktwice.service.scoring.scores import rounded, scores_of, trajectory_of
-
-log = structlog.stdlib.get_logger()
 
 GROUND_TRUTH: Final = "ground_truth"
 CALLER: Final = "caller"
