@@ -17,25 +17,25 @@ from looktwice.clients.labelling.teachers.rules import RuleTeacher
 from looktwice.clients.labelling.teachers.teacher import Teacher
 from looktwice.clients.wire import IDEMPOTENCY_KEY_HEADER, REQUEST_ID_HEADER
 from looktwice.model.engines.engine import Engine
-from looktwice.service.admission import Admission
-from looktwice.service.auth import Guard
-from looktwice.service.body_limit import BodyLimit
-from looktwice.service.dependencies import Dependencies
-from looktwice.service.errors import install_error_handlers
-from looktwice.service.idempotency import Idempotency
+from looktwice.service.admission.places import Admission
+from looktwice.service.admission.rates import Rates
+from looktwice.service.http.auth import Guard
+from looktwice.service.http.body_limit import BodyLimit
+from looktwice.service.http.errors import install_error_handlers
+from looktwice.service.http.idempotency import Idempotency
+from looktwice.service.http.middleware import Around
+from looktwice.service.http.openapi import describe
 from looktwice.service.inspector.page import add_inspector
-from looktwice.service.lifecycle import Lifecycle
-from looktwice.service.logs import configure_logging
-from looktwice.service.metrics import Metrics
-from looktwice.service.middleware import Around
-from looktwice.service.openapi import describe
-from looktwice.service.planning import Limits, Planning
-from looktwice.service.pulse import Pulse
-from looktwice.service.rates import Rates
-from looktwice.service.routes import make_router
-from looktwice.service.scorer import Scorer
-from looktwice.service.settings import Settings
-from looktwice.service.traces import Traces, traces_from_environment
+from looktwice.service.operations.lifecycle import Lifecycle
+from looktwice.service.operations.logs import configure_logging
+from looktwice.service.operations.metrics import Metrics
+from looktwice.service.operations.pulse import Pulse
+from looktwice.service.operations.settings import Settings
+from looktwice.service.operations.traces import Traces, traces_from_environment
+from looktwice.service.planning.submitting import Limits, Planning
+from looktwice.service.routes.dependencies import Dependencies
+from looktwice.service.routes.router import make_router
+from looktwice.service.scoring.process import Scorer
 
 DESCRIPTION = """Planning for driving models that look twice before they act.
 

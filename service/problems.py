@@ -94,6 +94,8 @@ REJECTIONS: Final = frozenset(
     )
 )
 """Requests that may have been right and were not served."""
+NOT_NOW: Final = (NOT_READY, DRAINING, ENGINE_FAILED)
+"""While no engine can answer."""
 
 
 class ProblemError(Exception):

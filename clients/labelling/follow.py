@@ -1,7 +1,6 @@
-"""Follow: the free draws of a rollout in the simulator, scene by scene
-(`looktwice.clients.metadrive.outcomes`).
+"""Follow: the free draws of a rollout in the simulator, scene by scene.
 
-Worker processes do it (`looktwice.clients.metadrive.workers`). The ledger stays with whoever gave the
+Worker processes do it (`looktwice.clients.metadrive.outcomes`). The ledger stays with whoever gave the
 command; what is entered there is not done again.
 """
 
@@ -17,9 +16,15 @@ from typing import Any
 from looktwice.clients.labelling.ledger import Entry, Ledger, Run
 from looktwice.clients.labelling.pipeline import Limits, StageStopped, Tally
 from looktwice.clients.labelling.rollout import key_of, unpacked
-from looktwice.clients.metadrive.outcomes import MomentOutcomes
-from looktwice.clients.metadrive.replay import EpisodeSetting, Moment, setting_of
-from looktwice.clients.metadrive.workers import FollowTask, WorkerDied, follow_episodes
+from looktwice.clients.metadrive.outcomes import (
+    EpisodeSetting,
+    FollowTask,
+    Moment,
+    MomentOutcomes,
+    WorkerDied,
+    follow_episodes,
+    setting_of,
+)
 from looktwice.model.driving.hashing import hash_of
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.trajectory import FloatArray

@@ -4,16 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Generic, TypeVar
-
-from looktwice.clients.metadrive.drive import Drive
-from looktwice.clients.metadrive.outcomes import MomentOutcomes
-from looktwice.clients.metadrive.replay import EpisodeSetting
-from looktwice.clients.metadrive.workers import FollowTask
-from looktwice.model.driving.hashing import hash_of
-from looktwice.model.driving.outcome import OUTCOMES_VERSION, Outcome
 
 _Result = TypeVar("_Result")
 
@@ -52,29 +44,3 @@ class ResultStore(Generic[_Result]):
         if self._file is not None:
             with self._file.open("a") as file:
                 file.write(json.dumps({"key": key, self._field: self._to_json(result)}) + "\n")
-
-
-def drive_store(file: Path) -> ResultStore[Drive]:
-    """Drives of whole episodes."""
-    return ResultStore(file, "drive", asdict, lambda told: Drive(**told))
-
-
-def outcome_store(file: Path | None) -> ResultStore[MomentOutcomes]:
-    """Outcomes of trajectories, by `outcome_key`."""
-
-    def to_json(found: MomentOutcomes) -> list[dict[str, Any]]:
-        return [outcome.to_json() for outcome in (found.expert, *found.plans)]
-
-    def from_json(told: list[dict[str, Any]]) -> MomentOutcomes:
-        expert, *plans = (Outcome.from_json(each) for each in told)
-        return MomentOutcomes(expert, tuple(plans))
-
-    return ResultStore(file, "outcomes", to_json, from_json)
-
-
-def outcome_key(task: FollowTask, setting: EpisodeSetting) -> str:
-    """What the outcomes of some trajectories at a moment are found by."""
-    moment, trajectories = task
-    told = [moment.scene_id, OUTCOMES_VERSION, asdict(setting)]
-    arrays = (moment.history, moment.future, *trajectories)
-    return hash_of(told, *(array.astype("<f4").tobytes() for array in arrays))

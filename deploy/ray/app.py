@@ -20,8 +20,8 @@ from ray.serve import Application
 from looktwice.model.bundled import CHECKPOINT
 from looktwice.service.app import create_app
 from looktwice.service.cli.engines import make_engine
-from looktwice.service.server import check_who_may_ask
-from looktwice.service.settings import Settings, TeacherSettings
+from looktwice.service.http.server import check_who_may_ask
+from looktwice.service.operations.settings import Settings, TeacherSettings
 
 _GLANCE_S: Final = 0.2
 

@@ -7,10 +7,7 @@ import argparse
 from pathlib import Path
 
 from looktwice.clients import PlannerClient
-from looktwice.clients.metadrive.drive import DriveConfig, drive
-from looktwice.clients.metadrive.film import Film
-from looktwice.clients.metadrive.pilots import ServicePilot
-from looktwice.clients.metadrive.rig import Rig
+from looktwice.clients.metadrive.closed_loop import DriveConfig, Film, Rig, ServicePilot, drive
 from looktwice.clients.wire import Controls
 
 parser = argparse.ArgumentParser()

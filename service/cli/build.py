@@ -393,7 +393,7 @@ def _batch(
     """The questions for the endpoint that the settings name."""
     from looktwice.clients.labelling.label import config_of, jobs, questions
     from looktwice.clients.labelling.teachers.openai import OpenAiTeacher
-    from looktwice.service.settings import TeacherSettings
+    from looktwice.service.operations.settings import TeacherSettings
 
     settings = TeacherSettings().openai()
     rollout = ledger.the_run("rollout", run)
@@ -408,6 +408,6 @@ def _check_ray(on_ray: str | None, limit: int | None, dry_run: int, every: int =
 
 
 async def _teacher_of_settings() -> Teacher:
-    from looktwice.service.settings import TeacherSettings
+    from looktwice.service.operations.settings import TeacherSettings
 
     return TeacherSettings().teacher()

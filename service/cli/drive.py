@@ -54,14 +54,23 @@ def drive(
     from rich.progress import Progress
 
     from looktwice.clients import wire
-    from looktwice.clients.metadrive.drive import EXPERT, Drive, DriveConfig
-    from looktwice.clients.metadrive.drive import drive as drive_episode
-    from looktwice.clients.metadrive.drive_table import driver_rows, format_table, to_json
-    from looktwice.clients.metadrive.film import IMAGINED, Film
-    from looktwice.clients.metadrive.maps import MapError
-    from looktwice.clients.metadrive.pilots import ConstantVelocity, Pilot, ServicePilot
-    from looktwice.clients.metadrive.result_store import drive_store
-    from looktwice.clients.metadrive.rig import Rig
+    from looktwice.clients.metadrive.closed_loop import (
+        EXPERT,
+        IMAGINED,
+        ConstantVelocity,
+        Drive,
+        DriveConfig,
+        Film,
+        MapError,
+        Pilot,
+        Rig,
+        ServicePilot,
+        drive_store,
+        driver_rows,
+        drives_to_json,
+        format_driver_rows,
+    )
+    from looktwice.clients.metadrive.closed_loop import drive as drive_episode
     from looktwice.clients.planner import Access, PlannerClient, RetryPolicy
     from looktwice.model.driving.cameras import FRONT_CAMERAS
     from looktwice.model.driving.hashing import hash_of
@@ -147,7 +156,7 @@ def drive(
                     progress.update(task, advance=1, description=f"{name}: {drove.ended}")
         if gif is not None:
             film.save(gif)
-        typer.echo(json.dumps(to_json(found)) if as_json else format_table(driver_rows(found)))
+        typer.echo(json.dumps(drives_to_json(found)) if as_json else format_driver_rows(driver_rows(found)))
 
 
 @contextmanager

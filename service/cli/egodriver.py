@@ -75,8 +75,8 @@ def egodriver(
             raise RuntimeError("the egodriver needs more: pip install 'looktwice[alpasim]'")
         from looktwice.clients.alpasim.driver import DriverConfig
         from looktwice.clients.alpasim.session import CAMERAS
-        from looktwice.service.logs import configure_logging
-        from looktwice.service.settings import Settings
+        from looktwice.service.operations.logs import configure_logging
+        from looktwice.service.operations.settings import Settings
 
         config = DriverConfig(
             cameras={**CAMERAS, **_cameras(cameras or [])},
@@ -126,7 +126,7 @@ async def _planner(service: str | None, engine: Engine | None) -> AsyncIterator[
             yield planner
         return
     from looktwice.service.app import create_app
-    from looktwice.service.settings import Settings
+    from looktwice.service.operations.settings import Settings
 
     # Nobody else reaches it: sessions are what is limited here.
     app = create_app(engine, Settings(api_keys_file=None, rate_limit=None, max_draws=4096, max_scenes=1024))

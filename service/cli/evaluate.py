@@ -207,7 +207,7 @@ def _outcomes(
     quiet: bool,
 ) -> tuple[dict[str, Any], str]:
     """What comes of first plans and of second looks, as JSON and as text."""
-    from looktwice.clients.metadrive.replay import Moment, setting_of
+    from looktwice.clients.metadrive.outcomes import Moment, setting_of
     from looktwice.model.evaluation.report import evaluate_variants
     from looktwice.service.cli.outcomes import follow_pairs, outcome_pairs
 

@@ -128,7 +128,7 @@ async def _write(
 ) -> tuple[Run, Tally]:
     from looktwice.clients.labelling.failures import feedback_config, feedback_jobs, sampled, writer
     from looktwice.clients.labelling.teachers.feedback import FeedbackTeacher
-    from looktwice.service.settings import TeacherSettings
+    from looktwice.service.operations.settings import TeacherSettings
 
     set_teacher = TeacherSettings().teacher()
     teacher = set_teacher if isinstance(set_teacher, FeedbackTeacher) else None

@@ -21,10 +21,10 @@ def feedback(
 ) -> None:
     """Say why a request's trajectories fail, as the built-in teacher does; docs/feedback.md tells how."""
     from looktwice.clients.wire_feedback import FeedbackRequest
-    from looktwice.service.errors import validated
-    from looktwice.service.feedback import feedback_given
-    from looktwice.service.inspector_scenes import BundledScenes
+    from looktwice.service.http.errors import validated
     from looktwice.service.problems import ProblemError
+    from looktwice.service.scenes.bundled import BundledScenes
+    from looktwice.service.scoring.rule_feedback import feedback_given
 
     with reported_errors():
         text = sys.stdin.read() if str(request) == "-" else request.read_text()

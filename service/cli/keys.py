@@ -12,7 +12,7 @@ app = typer.Typer(no_args_is_help=True, help="Make keys for callers of the servi
 @app.command()
 def new(name: Annotated[str, typer.Argument(help="Whose key it is: letters, digits, dots, dashes.")]) -> None:
     """Print a new key, and the line for the service's keys file; the key itself is kept nowhere."""
-    from looktwice.service.keys import new_line
+    from looktwice.service.operations.keys import new_line
 
     try:
         key, line = new_line(name)

@@ -98,7 +98,7 @@ def loadtest(
         from looktwice.loadtests.sending import Target
         from looktwice.model.driving.scene_store import read_scenes
         from looktwice.service.cli.serving import served
-        from looktwice.service.settings import Settings
+        from looktwice.service.operations.settings import Settings
 
         def soaked() -> Result:
             if knee is None or server_pid is None:

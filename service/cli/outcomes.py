@@ -11,10 +11,17 @@ from typing import Final
 from rich.console import Console
 from rich.progress import Progress
 
-from looktwice.clients.metadrive.outcomes import MomentOutcomes
-from looktwice.clients.metadrive.replay import EpisodeSetting, Moment, ReplayError
-from looktwice.clients.metadrive.result_store import ResultStore, outcome_key, outcome_store
-from looktwice.clients.metadrive.workers import FollowTask, follow_episodes
+from looktwice.clients.metadrive.outcomes import (
+    EpisodeSetting,
+    FollowTask,
+    Moment,
+    MomentOutcomes,
+    ReplayError,
+    ResultStore,
+    follow_episodes,
+    outcome_key,
+    outcome_store,
+)
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.engines.engine import Controls, Draw, EngineError

@@ -97,7 +97,7 @@ def _read(file: Path) -> Iterator[LabelledScene | wire.PlanRequest]:
         yield from read_scenes(file, dense=False)
         return
     import looktwice.clients.wire as wire
-    from looktwice.service.errors import validated
+    from looktwice.service.http.errors import validated
     from looktwice.service.problems import ProblemError
 
     try:
@@ -116,8 +116,8 @@ def _requested(
     """The engine's request for a scene, or for a request as the service would make it."""
     from looktwice.model.driving.scene import LabelledScene
     from looktwice.model.engines.engine import Controls, PlanRequest
+    from looktwice.service.planning.validation import engine_request
     from looktwice.service.problems import ProblemError
-    from looktwice.service.validation import engine_request
 
     if isinstance(found, LabelledScene):
         scene = found.given(**given)

@@ -16,7 +16,7 @@ from looktwice.service.cli.options import DEFAULT_SCENES, Json, reported_errors
 if TYPE_CHECKING:
     from looktwice.clients.importers.recording import Recording
     from looktwice.clients.importers.resampling import Source
-    from looktwice.clients.metadrive.pilots import Pilot
+    from looktwice.clients.metadrive.closed_loop import Pilot
     from looktwice.model.driving.cameras import CameraSpec
     from looktwice.model.driving.scene import LabelledScene
 
@@ -69,7 +69,7 @@ def generate(
 ) -> None:
     """Drive episodes in MetaDrive and store their scenes; run again after a kill, it resumes."""
     with reported_errors():
-        from looktwice.clients.metadrive.generate import GenerateConfig, generate
+        from looktwice.clients.metadrive.generation import GenerateConfig, generate
 
         if careless and small is None:
             raise ValueError("--careless is for --small, which plans from tracks")
@@ -115,7 +115,7 @@ def _driver(
 def served_pilot(service: str, *, tracks: bool) -> Pilot:
     """A service's model, without second looks: those are taught by what comes of first plans."""
     from looktwice.clients import wire
-    from looktwice.clients.metadrive.pilots import ServicePilot
+    from looktwice.clients.metadrive.closed_loop import ServicePilot
     from looktwice.clients.planner import Access, PlannerClient, RetryPolicy
 
     planner = PlannerClient(service, RetryPolicy(timeout_s=120.0), access=Access.from_environment())
@@ -215,7 +215,7 @@ def _played(told: list[str], specs: list[CameraSpec]) -> dict[CameraSpec, Source
 def stats(path: _Scenes = DEFAULT_SCENES, as_json: Json = False) -> None:
     """Count scenes per tag and per meta-action, and check the expert."""
     with reported_errors():
-        from looktwice.clients.metadrive.stats import scene_stats
+        from looktwice.clients.summaries.stats import scene_stats
 
         figures = scene_stats(path)
         if as_json:
@@ -239,7 +239,7 @@ def show(
 ) -> None:
     """Write a contact sheet: cameras and bird's-eye view of scenes."""
     with reported_errors():
-        from looktwice.clients.metadrive.sheet import contact_sheet
+        from looktwice.clients.summaries.sheet import contact_sheet
         from looktwice.model.driving.scene_store import read_scenes
 
         out.parent.mkdir(parents=True, exist_ok=True)

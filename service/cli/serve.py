@@ -52,8 +52,8 @@ def serve(
     """Serve a checkpoint over HTTP; the inspector page is at /."""
     from looktwice.model.network.allocator import return_large_buffers
     from looktwice.service.app import create_app
-    from looktwice.service.server import make_server
-    from looktwice.service.settings import Settings, TeacherSettings
+    from looktwice.service.http.server import make_server
+    from looktwice.service.operations.settings import Settings, TeacherSettings
 
     if list_settings:
         for kind in (Settings, TeacherSettings):
@@ -75,7 +75,7 @@ def serve(
         )
         teacher = TeacherSettings().teacher()
         if no_model:
-            from looktwice.service.no_model import NoModel
+            from looktwice.service.operations.no_model import NoModel
 
             app = create_app(NoModel(), settings, teacher=teacher)
         else:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from looktwice.clients.metadrive.pilots import Planned
+from looktwice.clients.metadrive.closed_loop import Planned
 from looktwice.model.driving.scene import Scene
 from looktwice.model.network.small_planner import load_small, small_revision
 

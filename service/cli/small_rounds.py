@@ -14,7 +14,7 @@ from typing import Final
 import typer
 from rich.progress import Progress, TextColumn
 
-from looktwice.clients.metadrive.generate import GenerateConfig, generate
+from looktwice.clients.metadrive.generation import GenerateConfig, generate
 from looktwice.model.driving.scene import split_of_seed
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.small_planner import WEIGHTS_FILE, SmallKind

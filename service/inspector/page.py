@@ -8,7 +8,7 @@ from typing import Final
 from fastapi import FastAPI
 from starlette.responses import FileResponse
 
-from looktwice.service.openapi import problems
+from looktwice.service.http.openapi import problems
 from looktwice.service.problems import NOT_FOUND, ProblemError
 
 _FOLDER: Final = Path(__file__).parent

@@ -30,7 +30,7 @@ from looktwice.model.driving.scene import LabelledScene, Scene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.engines.torch.engine import TorchEngine
 from looktwice.model.network.card import read_card
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.browser.conftest import ARGUMENTS, CHROMIUM
 from tests.service.serving import serve
 

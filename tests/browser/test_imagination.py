@@ -13,7 +13,7 @@ from playwright.sync_api import Page, expect
 from looktwice.model.driving.images import encode_png
 from looktwice.model.driving.scene import NextFrame
 from looktwice.model.driving.scene_store import write_scenes
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import Served, serve

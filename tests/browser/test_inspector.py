@@ -17,8 +17,8 @@ from playwright.sync_api import Browser, Page, expect
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.driving.trajectory import TEN_HZ_S
 from looktwice.model.engines.engine import EngineError
-from looktwice.service.keys import new_line
-from looktwice.service.settings import Settings
+from looktwice.service.operations.keys import new_line
+from looktwice.service.operations.settings import Settings
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body, serve

@@ -29,8 +29,8 @@ from looktwice.clients.planner import (
 )
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.engines.engine import EngineError
-from looktwice.service.keys import new_line
-from looktwice.service.settings import Settings
+from looktwice.service.operations.keys import new_line
+from looktwice.service.operations.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import serve

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 from packaging.requirements import Requirement
 
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.deploy.tools import DEPLOY, ROOT, run
 
 DOCKERFILES = sorted((DEPLOY / "docker").glob("*.Dockerfile"))

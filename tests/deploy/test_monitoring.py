@@ -14,7 +14,7 @@ from grafana_foundation_sdk.cog.encoder import JSONEncoder
 from grafana_foundation_sdk.models.dashboard import Dashboard
 from prometheus_client.parser import text_string_to_metric_families
 
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.deploy.tools import DASHBOARD, ROOT, RULES, expressions, run
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import body, serve

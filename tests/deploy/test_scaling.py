@@ -10,11 +10,11 @@ import pytest
 import yaml
 
 import looktwice.clients.wire as wire
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.deploy.tools import CHART, DEPLOY, render, run
+from tests.service.admission.test_limits import waiting
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import body, serve
-from tests.service.test_limits import waiting
 
 DRAWS = wire.Controls().n
 """Of a scene whose caller does not say how many."""

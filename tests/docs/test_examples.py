@@ -19,7 +19,7 @@ from looktwice.clients.metadrive import simulator
 from looktwice.model.bundled import SCENES
 from looktwice.model.driving.images import decode_image
 from looktwice.model.driving.scene_store import read_scenes
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, serve
 

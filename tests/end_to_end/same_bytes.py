@@ -19,7 +19,7 @@ from looktwice.model.bundled import CHECKPOINT
 from looktwice.model.driving.scene import Scene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.engines.torch.engine import TorchEngine
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.serving import body, serve
 
 DRAWS, FEW = 6, 3

@@ -27,7 +27,7 @@ from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.text import parse
 from looktwice.model.network.checkpoint import read_parts
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.serving import Served, serve
 
 BUNDLED = list(read_scenes(SCENES))

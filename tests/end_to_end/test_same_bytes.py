@@ -7,7 +7,7 @@ import base64
 from looktwice.model.bundled import CHECKPOINT, SCENES
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.engines.torch.engine import TorchEngine
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.end_to_end.same_bytes import WAYS, compare, draws_of, told_last
 from tests.service.scripted_engine import KEEP_ON
 from tests.service.serving import body, serve

@@ -45,7 +45,7 @@ from looktwice.model.network.settings import VlaSettings
 from looktwice.model.training.batches import Item, ResponseDataset
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.targets import make_target
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.model.driving.drives import MIDDLES_S, drive, labelled_scene
 from tests.model.driving.roads import mirrored_scene

@@ -15,7 +15,7 @@ from looktwice.model.driving.phrases import ReflectionLanguage
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.families.registry import OURS, family_named
 from looktwice.model.network.settings import VlaSettings
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.service.serving import Served, serve
 

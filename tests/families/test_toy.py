@@ -31,11 +31,11 @@ from looktwice.model.network.settings import VlaSettings
 from looktwice.model.training.batches import Item, ResponseDataset
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.targets import make_target
-from looktwice.service.metrics import Metrics
-from looktwice.service.planning import Judged, SceneEvent
-from looktwice.service.settings import Settings
-from looktwice.service.streaming import told_events
-from looktwice.service.telling import PlanTeller
+from looktwice.service.operations.metrics import Metrics
+from looktwice.service.operations.settings import Settings
+from looktwice.service.planning.events import Judged, SceneEvent
+from looktwice.service.planning.telling import PlanTeller
+from looktwice.service.routes.streaming import told_events
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.families.toy import TOY, drive
 from tests.model.driving.drives import MIDDLES_S, labelled_scene

@@ -44,7 +44,7 @@ from looktwice.model.network.visual_codes import VisualCodes, frame_of
 from looktwice.model.network.vocabulary import END_OF_TEXT, Vocabulary
 from looktwice.model.training.batches import Item, ResponseDataset
 from looktwice.model.training.examples import Examples
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.model.driving.drives import MIDDLES_S, agent, drive, labelled_scene
 from tests.model.driving.roads import mirrored_scene

@@ -7,7 +7,7 @@ from looktwice.loadtests.overhead import NoAnswer, measure
 from looktwice.model.bundled import SCENES
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.engines.engine import EngineError
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from looktwice.model.driving.scene_store import write_scenes
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, serve

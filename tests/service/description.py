@@ -7,8 +7,8 @@ import tempfile
 from pathlib import Path
 
 from looktwice.service.app import create_app
-from looktwice.service.keys import new_line
-from looktwice.service.settings import Settings
+from looktwice.service.operations.keys import new_line
+from looktwice.service.operations.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 
 

@@ -15,8 +15,8 @@ import looktwice.clients.wire as wire
 from looktwice.clients.wire_feedback import FeedbackRequest
 from looktwice.clients.wire_refine import RefineRequest
 from looktwice.clients.wire_scores import ScoreRequest
-from looktwice.service.examples import example_feedback, example_refinement, example_score
-from looktwice.service.openai_chat import ChatRequest
+from looktwice.service.openai.requests import ChatRequest
+from looktwice.service.routes.examples import example_feedback, example_refinement, example_score
 from tests.service.serving import body
 
 REAL = body()["scene"]

@@ -21,8 +21,8 @@ from looktwice.clients.labelling.teachers.teacher import Teacher
 from looktwice.model.driving.scene import Scene
 from looktwice.model.engines.engine import Engine
 from looktwice.service.app import create_app
-from looktwice.service.server import make_server
-from looktwice.service.settings import Settings
+from looktwice.service.http.server import make_server
+from looktwice.service.operations.settings import Settings
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
 from tests.sockets import PATIENCE_S, listening

@@ -5,10 +5,10 @@ import json
 import pytest
 
 from looktwice.model.engines.engine import EngineError
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
+from tests.service.http.test_errors import problem
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
-from tests.service.test_errors import problem
 
 
 def test_models(served: Served) -> None:

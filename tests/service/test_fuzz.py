@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from looktwice.model.driving.scene import FRONT_WIDE
-from looktwice.service.keys import new_line
-from looktwice.service.settings import Settings
+from looktwice.service.operations.keys import new_line
+from looktwice.service.operations.settings import Settings
 from tests.service.fuzz_hooks import IMAGINES, REFINES
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve

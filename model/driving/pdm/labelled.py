@@ -35,7 +35,7 @@ _WHEELBASE_M: Final = 1.4166 + 1.0523
 EGO: Final = Vehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2, EGO_LENGTH_M / 2, _WHEELBASE_M)
 """The ego of our scenes, measured from its middle: that is the point that never slips.
 
-Experts on their rails, and cars that follow plans (`looktwice.clients.metadrive.tracking`), head where their
+Experts on their rails, and cars that follow plans (`looktwice.clients.metadrive`), head where their
 middle goes. NAVSIM calls the point of which this is true the rear axle. Were it put where MetaDrive's axle
 is, an expert in a tight turn would slip by 8 degrees there, and NAVSIM's tracker, which cannot slip, be a
 metre off.

@@ -35,7 +35,7 @@ from looktwice.clients.alpasim.messages import DebugFormat
 from looktwice.clients.alpasim.server import start_server
 from looktwice.clients.alpasim.session import CAMERAS
 from looktwice.clients.planner import AsyncPlannerClient
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.scenes import picture
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve

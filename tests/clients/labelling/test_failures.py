@@ -35,7 +35,7 @@ from looktwice.model.driving.feedback_store import FeedbackFileError, read_feedb
 from looktwice.model.driving.pdm.feedback import Feedback
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import write_scenes
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.labelling.builds import MODEL, completion, named
 from tests.clients.labelling.killed import AT_ONCE, fail_all
 from tests.service.scenes import labelled

@@ -16,7 +16,7 @@ import pytest
 
 from looktwice.clients.labelling.ledger import Ledger
 from looktwice.model.driving.scene_store import write_scenes
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.labelling.builds import named, without_future
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import ScriptedEngine

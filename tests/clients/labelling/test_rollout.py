@@ -29,7 +29,7 @@ from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.metrics import displacement_errors
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.engines.engine import RequestError
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.labelling.builds import MODEL, scenes, without_future
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import CARD, ScriptedEngine

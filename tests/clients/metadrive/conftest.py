@@ -13,10 +13,10 @@ from looktwice.clients.metadrive import simulator
 if not simulator.is_installed():
     pytest.skip("MetaDrive is not installed (make sim)", allow_module_level=True)
 
-from looktwice.clients.metadrive.episode import run_episode
-from looktwice.clients.metadrive.episode_log import EpisodeLog
-from looktwice.clients.metadrive.rig import Rig
-from looktwice.clients.metadrive.windows import labelled_scenes
+from looktwice.clients.metadrive.drawing.rig import Rig
+from looktwice.clients.metadrive.scenes.windows import labelled_scenes
+from looktwice.clients.metadrive.world.episode import run_episode
+from looktwice.clients.metadrive.world.episode_log import EpisodeLog
 from looktwice.model.driving.scene import LabelledScene
 
 SEED = 2

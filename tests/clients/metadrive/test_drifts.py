@@ -3,11 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from looktwice.clients.metadrive.actors import Drift
-from looktwice.clients.metadrive.episode import run_episode
-from looktwice.clients.metadrive.episode_log import EpisodeLog
-from looktwice.clients.metadrive.rig import Rig
-from looktwice.clients.metadrive.windows import labelled_scenes
+from looktwice.clients.metadrive.drawing.rig import Rig
+from looktwice.clients.metadrive.scenes.windows import labelled_scenes
+from looktwice.clients.metadrive.world.actors import Drift
+from looktwice.clients.metadrive.world.episode import run_episode
+from looktwice.clients.metadrive.world.episode_log import EpisodeLog
 from looktwice.model.driving.labeller import expert_plan
 
 SEED, DURATION_S = 904, 30.0

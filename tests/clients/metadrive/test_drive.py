@@ -10,19 +10,26 @@ import pytest
 from PIL import Image
 
 from looktwice.clients import wire
-from looktwice.clients.metadrive.drive import EXPERT, TAKE_OVER, Drive, DriveConfig, Shot, drive
-from looktwice.clients.metadrive.drive_table import driver_rows, format_table, to_json
-from looktwice.clients.metadrive.episode import make_world, run_episode
-from looktwice.clients.metadrive.episode_log import EpisodeLog
-from looktwice.clients.metadrive.film import IMAGINED, Film
-from looktwice.clients.metadrive.pilots import ConstantVelocity, Planned, ServicePilot
-from looktwice.clients.metadrive.result_store import drive_store
-from looktwice.clients.metadrive.rig import Rig
-from looktwice.clients.metadrive.tracking import FreeVehicle, world_trajectory
+from looktwice.clients.metadrive.closed_loop.drives import (
+    EXPERT,
+    TAKE_OVER,
+    Drive,
+    DriveConfig,
+    Shot,
+    drive,
+    drive_store,
+)
+from looktwice.clients.metadrive.closed_loop.film import IMAGINED, Film
+from looktwice.clients.metadrive.closed_loop.pilots import ConstantVelocity, Planned, ServicePilot
+from looktwice.clients.metadrive.closed_loop.table import driver_rows, drives_to_json, format_driver_rows
+from looktwice.clients.metadrive.drawing.rig import Rig
+from looktwice.clients.metadrive.world.episode import make_world, run_episode
+from looktwice.clients.metadrive.world.episode_log import EpisodeLog
+from looktwice.clients.metadrive.world.tracking import FreeVehicle, world_trajectory
 from looktwice.clients.planner import PlannerClient
 from looktwice.model.driving.scene import Scene
 from looktwice.model.driving.trajectory import to_ego_frame
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.metadrive.conftest import SEED
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import serve
@@ -211,8 +218,8 @@ def test_drivers_are_compared_over_the_same_episodes() -> None:
     expert, mine = driver_rows({EXPERT: [whole, whole], "adaptive": [half, whole]})
     assert (expert.route_completion, mine.route_completion) == pytest.approx((1.0, 0.75))
     assert (mine.collisions, mine.off_road, mine.deadline_misses, mine.think_rate) == (1, 1, 1, 0.2)
-    assert "adaptive" in format_table([expert, mine])
-    told = to_json({EXPERT: [whole], "adaptive": [half]})["drivers"]
+    assert "adaptive" in format_driver_rows([expert, mine])
+    told = drives_to_json({EXPERT: [whole], "adaptive": [half]})["drivers"]
     assert {"name", "episodes", "route_completion", "collisions", "off_road", "think_rate"} <= set(told[1])
     assert told[1]["drives"][0]["ended"] == "collision"
     assert driver_rows({"adaptive": [half]})[0].route_completion is None

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from looktwice.clients.metadrive.actors import Vehicle
-from looktwice.clients.metadrive.episode import World, make_world
-from looktwice.clients.metadrive.fork import ForkError, fork_along, fork_expert, on_rails
-from looktwice.clients.metadrive.tracking import FreeVehicle
+from looktwice.clients.metadrive.world.actors import Vehicle
+from looktwice.clients.metadrive.world.episode import World, make_world
+from looktwice.clients.metadrive.world.fork import ForkError, fork_along, fork_expert, on_rails
+from looktwice.clients.metadrive.world.tracking import FreeVehicle
 from looktwice.model.driving.trajectory import FUTURE_STEPS, constant_velocity, to_ego_frame
 from tests.clients.metadrive.conftest import SEED
 

@@ -15,15 +15,15 @@ import pytest
 from PIL import Image
 
 from looktwice.clients.metadrive import simulator
-from looktwice.clients.metadrive.generate import (
+from looktwice.clients.metadrive.generation.blocks import (
     GenerateConfig,
     GenerationError,
     block_file,
     generate,
     write_block,
 )
-from looktwice.clients.metadrive.sheet import contact_sheet
-from looktwice.clients.metadrive.stats import scene_stats
+from looktwice.clients.summaries.sheet import contact_sheet
+from looktwice.clients.summaries.stats import scene_stats
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.scene import TAGS, LabelledScene, SceneError
 from looktwice.model.driving.scene_store import MANIFEST, SceneFileError, read_scenes, write_scenes

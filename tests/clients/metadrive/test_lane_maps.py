@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 
-from looktwice.clients.metadrive.lane_maps import (
+from looktwice.clients.metadrive.scenes.lane_maps import (
     AHEAD_M,
     LINE_AHEAD_M,
     REACH_M,
@@ -16,7 +16,7 @@ from looktwice.clients.metadrive.lane_maps import (
     _intersections,
     _parts,
 )
-from looktwice.clients.metadrive.roads import Lane, Road, RoadMap, Turn
+from looktwice.clients.metadrive.world.roads import Lane, Road, RoadMap, Turn
 from looktwice.model.driving.lane_map import LaneMap
 from looktwice.model.driving.pdm.geometry import crosses_itself
 from looktwice.model.driving.pdm.labelled import plans_of, world_of

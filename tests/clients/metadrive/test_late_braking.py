@@ -5,10 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from looktwice.clients.metadrive.episode import run_episode
-from looktwice.clients.metadrive.episode_log import EpisodeLog
-from looktwice.clients.metadrive.rig import Rig
-from looktwice.clients.metadrive.windows import labelled_scenes
+from looktwice.clients.metadrive.drawing.rig import Rig
+from looktwice.clients.metadrive.scenes.windows import labelled_scenes
+from looktwice.clients.metadrive.world.episode import run_episode
+from looktwice.clients.metadrive.world.episode_log import EpisodeLog
 
 SEED, DURATION_S = 6011, 48.0
 

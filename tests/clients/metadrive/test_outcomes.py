@@ -10,11 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from looktwice.clients.metadrive.episode import World
-from looktwice.clients.metadrive.fork import Forked, fork_expert
-from looktwice.clients.metadrive.generate import GENERATOR_VERSION, GenerateConfig
-from looktwice.clients.metadrive.outcomes import judged, outcomes_at
-from looktwice.clients.metadrive.replay import (
+from looktwice.clients.metadrive.generation.blocks import GENERATOR_VERSION, GenerateConfig
+from looktwice.clients.metadrive.outcomes.replay import (
     EpisodeSetting,
     Moment,
     ReplayError,
@@ -22,7 +19,10 @@ from looktwice.clients.metadrive.replay import (
     replayed,
     setting_of,
 )
+from looktwice.clients.metadrive.outcomes.verdicts import judged, outcomes_at
 from looktwice.clients.metadrive.simulator import described
+from looktwice.clients.metadrive.world.episode import World
+from looktwice.clients.metadrive.world.fork import Forked, fork_expert
 from looktwice.model.driving.outcome import FailureName, Outcome
 from looktwice.model.driving.scene_store import MANIFEST
 from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray, constant_velocity

@@ -12,18 +12,18 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from looktwice.clients.metadrive.drive import TAKE_OVER, DriveConfig
-from looktwice.clients.metadrive.generate import GenerateConfig, GenerationError, generate
-from looktwice.clients.metadrive.own_states import own_states
-from looktwice.clients.metadrive.pilots import Careless, ConstantVelocity, Planned
-from looktwice.clients.metadrive.replay import ReplayError, setting_of
+from looktwice.clients.metadrive.closed_loop.drives import TAKE_OVER, DriveConfig
+from looktwice.clients.metadrive.closed_loop.pilots import Careless, ConstantVelocity, Planned
+from looktwice.clients.metadrive.generation.blocks import GenerateConfig, GenerationError, generate
+from looktwice.clients.metadrive.generation.own_states import own_states
+from looktwice.clients.metadrive.outcomes.replay import ReplayError, setting_of
 from looktwice.model.driving.metrics import collides, leaves_road
 from looktwice.model.driving.scene import Scene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.tracks import Track
 from looktwice.service.cli.commands import app
 from looktwice.service.cli.scenes import served_pilot
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.metadrive.conftest import SEED
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve

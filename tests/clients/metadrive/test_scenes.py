@@ -11,11 +11,11 @@ import pytest
 import shapely
 from PIL import Image
 
-from looktwice.clients.metadrive.episode import run_episode
-from looktwice.clients.metadrive.maps import make_map
-from looktwice.clients.metadrive.rig import Rig
-from looktwice.clients.metadrive.windows import labelled_scenes
-from looktwice.clients.metadrive.y_flip import points_from_metadrive
+from looktwice.clients.metadrive.drawing.rig import Rig
+from looktwice.clients.metadrive.scenes.windows import labelled_scenes
+from looktwice.clients.metadrive.world.episode import run_episode
+from looktwice.clients.metadrive.world.maps import make_map
+from looktwice.clients.metadrive.world.y_flip import points_from_metadrive
 from looktwice.model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS, CameraSpec
 from looktwice.model.driving.metrics import collides, leaves_road
 from looktwice.model.driving.scene import CAMERAS, EGO_LENGTH_M, SEMANTIC_CLASSES, LabelledScene

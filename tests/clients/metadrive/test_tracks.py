@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from looktwice.clients.metadrive.episode import run_episode
-from looktwice.clients.metadrive.tracks import tracks_at
-from looktwice.clients.metadrive.windows import _Moment
+from looktwice.clients.metadrive.scenes.tracks import tracks_at
+from looktwice.clients.metadrive.scenes.windows import _Moment
+from looktwice.clients.metadrive.world.episode import run_episode
 from looktwice.model.driving.tracks import tracks_of
 from tests.clients.metadrive.conftest import SEED
 

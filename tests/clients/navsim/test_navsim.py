@@ -18,7 +18,7 @@ from looktwice.clients.planner import PlannerClient
 from looktwice.model.driving.cameras import FRONT_CAMERAS
 from looktwice.model.driving.images import check_image
 from looktwice.model.driving.trajectory import agreed
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from looktwice.clients.metadrive import simulator
-from looktwice.clients.metadrive.generate import GenerateConfig, write_block, write_manifest
+from looktwice.clients.metadrive.generation.blocks import GenerateConfig, write_block, write_manifest
 
 
 @pytest.fixture(scope="session")

@@ -26,7 +26,7 @@ from looktwice.model.network.checkpoint import read_config
 from looktwice.model.network.settings import VlaSettings
 from looktwice.service.cli.commands import app
 from looktwice.service.cli.stages import progress_bar
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer
 from tests.service.cli.builds import ran, told
 from tests.service.serving import serve

@@ -19,7 +19,7 @@ from looktwice.model.bundled import CHECKPOINT, SCENES
 from looktwice.model.driving.reflection_store import read_reflections
 from looktwice.model.driving.scene_store import MANIFEST
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.cli.builds import ran, told
 from tests.service.serving import serve
 

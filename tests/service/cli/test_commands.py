@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from looktwice.model.bundled import CHECKPOINT, SCENES
 from looktwice.model.engines.torch.engine import TorchEngine
 from looktwice.service.cli.commands import app
-from looktwice.service.settings import Settings, TeacherSettings
+from looktwice.service.operations.settings import Settings, TeacherSettings
 from tests.service.serving import body, serve
 
 ROOT: Final = Path(__file__).parents[3]

@@ -9,7 +9,7 @@ from typing import Any
 from typer.testing import CliRunner
 
 from looktwice.service.cli.commands import app
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve
 

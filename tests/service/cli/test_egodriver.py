@@ -17,7 +17,7 @@ from carla_driver_interface.protocol import EgodriverServiceStub, Empty
 from typer.testing import CliRunner
 
 from looktwice.service.cli.commands import app
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.alpasim.driving import READY_US, close, drive, observe, start
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve

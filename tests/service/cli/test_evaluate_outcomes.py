@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from looktwice.clients.metadrive.result_store import outcome_store
+from looktwice.clients.metadrive.outcomes import outcome_store
 from looktwice.model.bundled import SCENES
 from looktwice.service.cli import outcomes
 from looktwice.service.cli.commands import app

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from looktwice.model.driving.feedback_store import read_feedback
 from looktwice.model.driving.pdm.feedback import Feedback, parse_feedback
 from looktwice.service.cli.commands import app
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.labelling.builds import scenes
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import serve

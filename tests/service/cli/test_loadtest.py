@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from looktwice.loadtests.loads import Phase, poisson_arrivals
-from looktwice.service.admission import Admission
+from looktwice.service.admission.places import Admission
 from looktwice.service.cli.loadtest import loadtest as command
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import serve
 

@@ -13,7 +13,7 @@ pytest.importorskip("vllm", reason="runs in vLLM's own environment (make test-vl
 
 from looktwice.model.bundled import CHECKPOINT
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.service.serving import serve
 
 PROMPTS = 4

@@ -23,7 +23,7 @@ from looktwice.clients.labelling.teachers.teacher import (
 )
 from looktwice.model.driving.outcome import Outcome
 from looktwice.model.driving.view import Surroundings
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN, ScriptedEngine

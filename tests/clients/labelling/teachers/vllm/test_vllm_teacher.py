@@ -38,7 +38,7 @@ from looktwice.clients.labelling.teachers.teacher import (
 )
 from looktwice.model.network.corpus import nano_corpus
 from looktwice.model.network.vocabulary import build_nano_tokenizer
-from looktwice.service.settings import Settings
+from looktwice.service.operations.settings import Settings
 from tests.clients.labelling.builds import GOOD
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN, ScriptedEngine

@@ -1,0 +1,122 @@
+"""How drivers compare over the same episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from looktwice.clients.metadrive.closed_loop.drives import EXPERT, Drive
+from looktwice.model.driving.columns import Columns, aligned, cells, titles
+from looktwice.model.driving.intervals import ratio_interval
+
+_COLUMNS: Final[Columns] = {
+    "episodes": ("episodes", "{:d}"),
+    "km": ("km", "{:.1f}"),
+    "route_completion": ("route completion", "{:.1%}"),
+    "collisions": ("collisions", "{:d}"),
+    "collisions_per_km": ("collisions per km", "{:.2f}"),
+    "off_road": ("off road", "{:d}"),
+    "off_road_per_km": ("off road per km", "{:.2f}"),
+    "jerk_ms3": ("jerk ms3", "{:.1f}"),
+    "lateral_ms2": ("lateral ms2", "{:.1f}"),
+    "think_rate": ("think rate", "{:.1%}"),
+    "plans": ("plans", "{:d}"),
+    "deadline_misses": ("deadline misses", "{:d}"),
+    "plan_ms": ("plan ms", "{:.0f}"),
+}
+
+
+@dataclass(frozen=True)
+class DriverRow:
+    """A driver over all episodes.
+
+    Attributes:
+        name: who.
+        episodes: how many.
+        km: driven along the route, all episodes together.
+        route_completion: metres driven along the route, all episodes together, as a share of what the expert
+            drove in the same time; None where the expert did not drive.
+        collisions, off_road: episodes in which it happened.
+        collisions_per_km, off_road_per_km: by the kilometres driven; None where nobody drove any.
+        intervals: 95 % intervals of ``route_completion``, ``collisions_per_km`` and ``off_road_per_km``, over
+            episodes drawn with replacement.
+        jerk_ms3, lateral_ms2: means over episodes of their 95th percentiles.
+        think_rate: share of draws that thought; None where nobody thinks.
+        plans: that were made.
+        deadline_misses: plans that came behind their deadline.
+        plan_ms: median over episodes of their median; None where nobody was asked.
+    """
+
+    name: str
+    episodes: int
+    km: float
+    route_completion: float | None
+    collisions: int
+    collisions_per_km: float | None
+    off_road: int
+    off_road_per_km: float | None
+    jerk_ms3: float
+    lateral_ms2: float
+    think_rate: float | None
+    plans: int
+    deadline_misses: int
+    plan_ms: float | None
+    intervals: dict[str, tuple[float, float]]
+
+
+def driver_rows(drives: Mapping[str, Sequence[Drive]]) -> list[DriverRow]:
+    """A row for each driver, in the order given."""
+    experts = {drive.seed: drive.driven_m for drive in drives.get(EXPERT, ())}
+    return [_row(name, of, experts) for name, of in drives.items()]
+
+
+def _row(name: str, drives: Sequence[Drive], experts_m: Mapping[int, float]) -> DriverRow:
+    rates = [drive.thought for drive in drives if drive.thought is not None]
+    times = [drive.milliseconds for drive in drives if drive.milliseconds is not None]
+    km = np.array([drive.driven_m / 1000 for drive in drives])
+    collided = np.array([drive.ended == "collision" for drive in drives], np.float64)
+    left = np.array([drive.off_road for drive in drives], np.float64)
+    whole_km = np.array([experts_m.get(drive.seed, 0.0) / 1000 for drive in drives])
+    ratios = {
+        "route_completion": (km, whole_km),
+        "collisions_per_km": (collided, km),
+        "off_road_per_km": (left, km),
+    }
+    told = {name: float(of.sum() / by.sum()) for name, (of, by) in ratios.items() if by.any()}
+    return DriverRow(
+        name=name,
+        episodes=len(drives),
+        km=float(km.sum()),
+        route_completion=told.get("route_completion"),
+        collisions=int(collided.sum()),
+        collisions_per_km=told.get("collisions_per_km"),
+        off_road=int(left.sum()),
+        off_road_per_km=told.get("off_road_per_km"),
+        jerk_ms3=float(np.mean([drive.jerk_ms3 for drive in drives])),
+        lateral_ms2=float(np.mean([drive.lateral_ms2 for drive in drives])),
+        think_rate=float(np.mean(rates)) if rates else None,
+        plans=sum(drive.plans for drive in drives),
+        deadline_misses=sum(drive.late for drive in drives),
+        plan_ms=float(np.median(times)) if times else None,
+        intervals={name: ratio_interval(*ratios[name]) for name in told},
+    )
+
+
+def drives_to_json(drives: Mapping[str, Sequence[Drive]]) -> dict[str, Any]:
+    """``drivers[]`` with every episode of each."""
+    return {
+        "drivers": [
+            asdict(row) | {"drives": [asdict(drive) for drive in drives[row.name]]}
+            for row in driver_rows(drives)
+        ]
+    }
+
+
+def format_driver_rows(rows: Sequence[DriverRow]) -> str:
+    """The rows as plain text."""
+    lines = [["", *titles(_COLUMNS)]]
+    lines += [[row.name, *cells(_COLUMNS, asdict(row))] for row in rows]
+    return "\n".join(aligned(lines))

@@ -1,0 +1,25 @@
+"""What comes of plans, in the worlds of generated scenes. A door: others import from here."""
+
+from looktwice.clients.metadrive.outcomes.replay import EpisodeSetting, Moment, ReplayError, setting_of
+from looktwice.clients.metadrive.outcomes.store import outcome_key, outcome_store
+from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes
+from looktwice.clients.metadrive.outcomes.workers import FollowTask, WorkerDied, follow_episodes
+from looktwice.clients.metadrive.result_store import ResultStore
+from looktwice.clients.metadrive.world.fork import Forked, fork_along, fork_expert
+
+__all__ = [
+    "EpisodeSetting",
+    "FollowTask",
+    "Forked",
+    "Moment",
+    "MomentOutcomes",
+    "ReplayError",
+    "ResultStore",
+    "WorkerDied",
+    "follow_episodes",
+    "fork_along",
+    "fork_expert",
+    "outcome_key",
+    "outcome_store",
+    "setting_of",
+]

@@ -1,0 +1,136 @@
+"""What comes of a plan: followed in a fork of the world, it holds or fails, and at what.
+
+A plan is followed by a car with a driver's limits while everybody else reacts
+(`looktwice.clients.metadrive.world.fork`), and is compared with the expert's own way on from the same moment,
+followed by the same car. Bounds of comfort are those of NAVSIM (`looktwice.model.driving.pdm.comfort`). All
+other thresholds are the constants here: chosen on training scenes, where the expert's own trajectories pass
+them (docs/labelling.md has the figures).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from looktwice.clients.metadrive.world.episode import World
+from looktwice.clients.metadrive.world.fork import Forked, fork_along, fork_expert
+from looktwice.clients.metadrive.world.tracking import WHEELBASE_M
+from looktwice.model.driving.outcome import FailureName, Outcome, metres_behind
+from looktwice.model.driving.pdm import world as pdm
+from looktwice.model.driving.pdm.comfort import comfort
+from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
+from looktwice.model.driving.trajectory import STEP_S, FloatArray
+
+BEHIND_RATIO: Final = 0.8
+"""Whoever drives less than this share of the expert's way falls behind ..."""
+AHEAD_RATIO: Final = 1.25
+"""... and whoever drives more than this share of it goes too far ..."""
+LEAST_GAP_M: Final = 5.0
+"""... if at least so many metres are between them, as in NAVSIM's progress."""
+
+_BODY: Final = pdm.Vehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2, EGO_LENGTH_M / 2, WHEELBASE_M)
+"""Measured from its centre, as all our poses are."""
+
+
+@dataclass(frozen=True)
+class MomentOutcomes:
+    """How the expert and some plans fared from one moment on.
+
+    Attributes:
+        expert: of the expert's own way on, followed by the same car as the plans are.
+        plans: of each plan, in their order.
+    """
+
+    expert: Outcome
+    plans: tuple[Outcome, ...]
+
+
+def outcomes_at(
+    world: World, trajectories: Sequence[FloatArray], driven: Forked | None = None
+) -> MomentOutcomes:
+    """Follow each of some trajectories [64, 4] of the ego frame of now, each in a fork of its own.
+
+    Args:
+        world: at the moment; nothing happens in it.
+        trajectories: of the plans.
+        driven: the expert's fork from this moment, where it is there already.
+
+    Raises:
+        ForkError: the episode has ended.
+    """
+    driven = fork_expert(world) if driven is None else driven
+    expert = judged(fork_along(world, driven.trajectory), driven.driven_m)
+    strict = expert.uncomfortable is None
+    plans = (fork_along(world, trajectory) for trajectory in trajectories)
+    return MomentOutcomes(
+        expert, tuple(judged(plan, driven.driven_m, needs_comfort=strict) for plan in plans)
+    )
+
+
+def judged(followed: Forked, expert_m: float, *, needs_comfort: bool = False) -> Outcome:
+    """The outcome of a followed plan where the expert drives ``expert_m`` along the route.
+
+    Args:
+        followed: what came of the plan.
+        expert_m: as far as the expert comes from the same moment.
+        needs_comfort: whether a broken bound of comfort is a failure. It is none where the expert breaks one
+            itself: a person who runs into the road leaves no comfortable way.
+    """
+    uncomfortable_s, uncomfortable = _discomfort(followed)
+    behind_m = metres_behind(followed.driven_m, expert_m)
+    collided = followed.collided_s is not None
+    found: dict[FailureName, bool] = {
+        "collision": collided,
+        "off_road": followed.off_road_s is not None,
+        "off_route": followed.off_route_s is not None,
+        "comfort": needs_comfort and uncomfortable is not None,
+        # A drive that a collision ended is shorter for that reason alone.
+        "behind": not collided and behind_m > LEAST_GAP_M and followed.driven_m < BEHIND_RATIO * expert_m,
+        "ahead": not collided and -behind_m > LEAST_GAP_M and followed.driven_m > AHEAD_RATIO * expert_m,
+    }
+    return Outcome(
+        tuple(name for name, failed in found.items() if failed),
+        _tenths(followed.collided_s),
+        followed.hit,
+        _tenths(followed.off_road_s),
+        _tenths(followed.off_route_s),
+        uncomfortable_s,
+        uncomfortable,
+        round(followed.driven_m, 2),
+        round(expert_m, 2),
+    )
+
+
+def _discomfort(followed: Forked) -> tuple[float | None, str | None]:
+    """When a ride first breaks a bound of comfort, and which; neither of one that ends in a collision."""
+    if followed.collided_s is not None:
+        return None, None
+    found = comfort(_states(followed)[None], _BODY, "v2.2")
+    if found.holds[0]:
+        return None, None
+    return _tenths((int(found.first_step[0]) + 1) * STEP_S), found.bound[0]
+
+
+def _states(followed: Forked) -> pdm.Array:
+    """A ride as NAVSIM's states [k, 11]; sideways acceleration is what a turn at that speed makes."""
+    track, speed = followed.trajectory.astype(np.float64), followed.speeds_ms.astype(np.float64)
+    states = np.zeros((len(track), pdm.STATE_SIZE))
+    states[:, pdm.X], states[:, pdm.Y], states[:, pdm.HEADING] = track[:, 0], track[:, 1], track[:, 3]
+    yaw_rate = _rate(track[:, 3])
+    states[:, pdm.SPEED], states[:, pdm.ACCELERATION] = speed, _rate(speed)
+    states[:, pdm.ACCELERATION_Y] = yaw_rate * speed
+    states[:, pdm.YAW_RATE], states[:, pdm.YAW_ACCELERATION] = yaw_rate, _rate(yaw_rate)
+    return states
+
+
+def _rate(values: pdm.Array) -> pdm.Array:
+    """Backward differences; the first is the second's."""
+    rate = np.diff(values) / STEP_S
+    return np.concatenate([rate[:1], rate])
+
+
+def _tenths(seconds: float | None) -> float | None:
+    return None if seconds is None else round(seconds, 1)

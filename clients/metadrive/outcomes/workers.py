@@ -1,0 +1,92 @@
+"""Plans of many scenes followed at once: worker processes take whole episodes, each driven once."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Final
+
+from looktwice.clients.metadrive.outcomes.replay import (
+    EpisodeSetting,
+    Moment,
+    ReplayError,
+    outcomes_of_episode,
+)
+from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes
+from looktwice.model.driving.trajectory import FloatArray
+
+FollowTask = tuple[Moment, Sequence[FloatArray]]
+"""A moment, and the trajectories [64, 4] that are to be followed from it."""
+
+_EPISODES_A_PROCESS: Final = 20
+"""Then it is replaced, so that its memory stays bounded."""
+
+
+class WorkerDied(RuntimeError):
+    """A process ended before its work: killed, or out of memory."""
+
+
+def follow_episodes(
+    episodes: Iterator[Sequence[FollowTask]], setting: EpisodeSetting, workers: int
+) -> Iterator[tuple[str, MomentOutcomes | str]]:
+    """Follow plans in so many processes; they end with this one, however it ends.
+
+    Args:
+        episodes: each what is asked of one episode; taken as they are needed.
+        setting: of all of them.
+        workers: processes.
+
+    Yields:
+        Scene ids as their episodes are done, with how their plans fared or why that cannot be said.
+
+    Raises:
+        WorkerDied: see there.
+    """
+    begun: set[Future[list[tuple[str, MomentOutcomes | str]]]] = set()
+    with ProcessPoolExecutor(
+        workers,
+        multiprocessing.get_context("spawn"),
+        initializer=_end_with_parent,
+        max_tasks_per_child=_EPISODES_A_PROCESS,
+    ) as pool:
+        try:
+            while True:
+                # One more than may run waits, so that a process has work as soon as it is free.
+                while len(begun) <= workers and (asked := next(episodes, None)) is not None:
+                    begun.add(pool.submit(_follow_episode, setting, asked))
+                if not begun:
+                    return
+                ended, begun = wait(begun, return_when=FIRST_COMPLETED)
+                for future in ended:
+                    yield from future.result()
+        except BrokenProcessPool as error:
+            raise WorkerDied("a process that followed plans died: it was killed, or lacked memory") from error
+        finally:
+            for future in begun:
+                future.cancel()
+
+
+def _follow_episode(
+    setting: EpisodeSetting, asked: Sequence[FollowTask]
+) -> list[tuple[str, MomentOutcomes | str]]:
+    """One episode in a process of its own; what cannot be followed is told as text."""
+    return [
+        (scene_id, str(found) if isinstance(found, ReplayError) else found)
+        for scene_id, found in outcomes_of_episode(asked[0][0].seed, setting, asked)
+    ]
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent does, however that ends: nobody is left who would take its work."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,1 @@
+"""What scene files contain, in numbers and in pictures."""

@@ -1,0 +1,1 @@
+"""Who is let in: places for draws, and rates for each caller."""

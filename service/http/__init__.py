@@ -1,0 +1,1 @@
+"""The server and what every request passes: connection, keys, bodies, problem documents."""

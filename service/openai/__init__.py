@@ -1,0 +1,1 @@
+"""Planning in the words of OpenAI's chat completions."""

@@ -1,0 +1,1 @@
+"""Labelled scenes: the bundled ones, and those of a file."""

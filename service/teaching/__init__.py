@@ -1,0 +1,1 @@
+"""What teachers are asked: reflections for labels, feedback on trajectories."""

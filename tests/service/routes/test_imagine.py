@@ -1,0 +1,291 @@
+"""POST /v1/imagine and the choice to imagine over a real socket, with an untrained checkpoint."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import io
+import json
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from PIL import Image
+
+import looktwice.clients.wire as wire
+from looktwice.clients.planner import (
+    AsyncPlannerClient,
+    PlannerClient,
+    RequestRefused,
+    ServiceBusy,
+    imagine_request,
+)
+from looktwice.clients.streams import ImagineEvent
+from looktwice.clients.wire_imagine import CodesWritten, ImagineControls, ImagineRequest, ImagineResponse
+from looktwice.model.driving.scene import CAMERAS
+from looktwice.model.engines.engine import EngineError
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
+from looktwice.model.engines.torch.shortcuts import Shortcuts
+from looktwice.model.network.checkpoint import load, save
+from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.visual_codes import VisualCodes, load_visual_codes
+from looktwice.service.operations.no_model import NoModel
+from looktwice.service.operations.settings import Settings
+from looktwice.service.routes.examples import example_imagining
+from tests.checkpoints import write_untrained
+from tests.service.http.test_errors import problem
+from tests.service.scenes import scene
+from tests.service.scripted_engine import CARD, ScriptedEngine
+from tests.service.serving import Served, body, serve
+from tests.sockets import PATIENCE_S
+
+PATH = "/v1/imagine"
+SEEN = ("front_wide_120", "front_tele_30")
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    settings = VlaSettings(name="world", formats=("traj_only", "vla_world"), reflection="phrases")
+    folder = tmp_path_factory.mktemp("world") / "checkpoint"
+    loaded = load(write_untrained(folder, narrow=True, settings=settings))
+    codes = VisualCodes(24)
+    save(folder, loaded.model, loaded.vocabulary, loaded.codec, visual_codes=codes)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def served(checkpoint: Path) -> Iterator[Served[TorchEngine]]:
+    with serve(
+        TorchEngine(checkpoint, TorchSettings(rows=4, products=None)), Settings(queue_timeout_s=PATIENCE_S)
+    ) as running:
+        yield running
+
+
+def asked(**changes: Any) -> dict[str, Any]:
+    return {**example_imagining(SEEN), **changes}
+
+
+def imagined(served: Served[Any], document: dict[str, Any]) -> ImagineResponse:
+    answer = served.http.post(PATH, json=document)
+    assert answer.status_code == 200, answer.text
+    return ImagineResponse.model_validate_json(answer.content)
+
+
+def pixels(image: str) -> np.ndarray[Any, Any]:
+    picture = Image.open(io.BytesIO(base64.b64decode(image)))
+    assert (picture.format, picture.size) == ("PNG", (224, 112))
+    return np.asarray(picture)
+
+
+def test_pictures_are_painted_of_the_codes_that_were_drawn(
+    served: Served[TorchEngine], checkpoint: Path
+) -> None:
+    codec = load_visual_codes(checkpoint)
+    told = imagined(served, asked(camera="back_left", controls={"n": 3, "seed": 1}))
+    assert (told.format, told.camera, told.seconds) == ("vla_world", "back_left", 0.5)
+    assert [each.index for each in told.pictures] == [0, 1, 2]
+    for each in told.pictures:
+        np.testing.assert_array_equal(pixels(each.image), codec.decode(each.codes))
+        # An untrained model finds all 1,000 codes about as likely.
+        assert each.logprob / 98 == pytest.approx(-np.log(1000), rel=0.3)
+        assert len(each.perception.objects) <= 8
+        assert each.prediction.direction in ("Left", "Forward", "Right")
+    assert len({tuple(each.codes) for each in told.pictures}) == 3
+    assert told.timing.total_ms >= told.timing.engine_ms > 0
+
+
+def test_the_same_seed_imagines_the_same_and_another_camera_something_else(
+    served: Served[TorchEngine],
+) -> None:
+    first = imagined(served, asked())
+    assert imagined(served, asked()).pictures == first.pictures
+    assert imagined(served, asked(camera="back")).pictures != first.pictures
+    assert imagined(served, asked(controls={"n": 2, "seed": 8})).pictures != first.pictures
+
+
+def test_what_the_camera_sees_now_changes_no_picture(served: Served[TorchEngine], checkpoint: Path) -> None:
+    settings = TorchSettings(rows=4, products=None, shortcuts=replace(Shortcuts(), speculate=False))
+    request = asked(camera=SEEN[0])
+    with serve(TorchEngine(checkpoint, settings), Settings()) as plain:
+        expected = imagined(plain, request)
+    assert imagined(served, request).pictures == expected.pictures
+    other = asked(camera=SEEN[0], scene=asked()["scene"] | {"route": None})
+    assert imagined(served, other).pictures != expected.pictures
+
+
+def test_clients_imagine_too_in_both_kinds(served: Served[TorchEngine]) -> None:
+    request = imagine_request(scene(), "front", ImagineControls(n=2, seed=3))
+    with PlannerClient(served.url) as planner:
+        assert [(card.imagines, card.paints) for card in planner.models()] == [(["vla_world"], True)]
+        told = planner.imagine(request)
+
+    async def asynchronously() -> ImagineResponse:
+        async with AsyncPlannerClient(served.url) as planner:
+            return await planner.imagine(request)
+
+    assert asyncio.run(asynchronously()).pictures == told.pictures
+    packed = served.http.post(
+        PATH,
+        content=msgpack.packb(request.model_dump()),
+        headers={"Content-Type": wire.MSGPACK_MEDIA_TYPE, "Accept": wire.MSGPACK_MEDIA_TYPE},
+    )
+    assert ImagineResponse.model_validate(msgpack.unpackb(packed.content)).pictures == told.pictures
+
+
+def events_of(served: Served[Any], **changes: Any) -> list[tuple[str, ImagineEvent]]:
+    request = ImagineRequest.model_validate_json(json.dumps(asked(**changes)))
+    with PlannerClient(served.url) as planner:
+        return list(planner.stream_imagine(request))
+
+
+def test_a_stream_tells_of_pictures_as_they_are_written(served: Served[TorchEngine]) -> None:
+    plain = imagined(served, asked(controls={"n": 3, "seed": 1}))
+    events = events_of(served, controls={"n": 3, "seed": 1})
+    name, done = events[-1]
+    assert (name, isinstance(done, ImagineResponse)) == ("done", True)
+    assert isinstance(done, ImagineResponse)
+    assert done.pictures == plain.pictures
+    for picture in plain.pictures:
+        own = [(name, told) for name, told in events[:-1] if getattr(told, "index", None) == picture.index]
+        progress = [told.written for _, told in own if isinstance(told, CodesWritten)]
+        assert progress == sorted(set(progress))
+        # Row by row; guesses that are right may bring more than one.
+        assert set(progress) <= set(range(14, 99, 14))
+        assert progress[-1] == 98
+        assert [name for name, _ in own] == [
+            "perception",
+            "prediction",
+            *["codes"] * len(progress),
+            "picture",
+        ]
+        parts = {name: told.model_dump() for name, told in own}
+        seen = picture.perception.model_dump(exclude={"objects": {"__all__": {"near_s"}}})
+        assert parts["perception"]["perception"] == seen
+        assert parts["prediction"]["prediction"] == picture.prediction.model_dump()
+        assert parts["picture"] == picture.model_dump(include={"index", "image", "codes"})
+
+
+def test_a_stream_is_told_before_the_answer_is_there(served: Served[TorchEngine]) -> None:
+    async def stream() -> list[str]:
+        request = imagine_request(scene(), "front_left", ImagineControls(n=1, seed=3))
+        async with AsyncPlannerClient(served.url) as planner:
+            return [name async for name, _ in planner.stream_imagine(request)]
+
+    names = asyncio.run(stream())
+    # Without guesses, as this camera is not in the scene, every row is told.
+    assert names == ["perception", "prediction", *["codes"] * 7, "picture", "done"]
+
+
+def test_what_cannot_be_streamed_gets_a_status(served: Served[TorchEngine]) -> None:
+    problem(served.http.post(PATH, json=asked(camera="rear", stream=True)), "unknown-camera")
+    history = [[0.0] * 4] * 15 + [[9.0] * 4]
+    changed = asked(stream=True)["scene"] | {"history": history}
+    problem(served.http.post(PATH, json=asked(stream=True, scene=changed)), "invalid-history")
+
+
+def test_leaving_a_stream_ends_the_work() -> None:
+    engine = ScriptedEngine()
+    engine.card_shown = replace(CARD, formats=("cf_vla", "vla_world"), paints=True)
+    with serve(engine, Settings()) as served:
+        served.in_loop(engine.may_finish.clear)
+        with served.http.stream("POST", PATH, json=asked(stream=True)) as answer:
+            assert answer.status_code == 200
+            assert served.metric("looktwice_plans_in_flight") == 1
+        served.until(lambda: len(engine.cancelled) == 1)
+        served.until(lambda: served.metric("looktwice_plans_in_flight") == 0)
+        served.in_loop(engine.may_finish.set)
+        engine.failure_later = EngineError("broke on the way")
+        with pytest.raises(ServiceBusy, match="the log has why"):
+            events_of(served)
+
+
+def test_plans_imagine_as_the_caller_decides(served: Served[TorchEngine]) -> None:
+    with PlannerClient(served.url) as planner:
+        choices: dict[wire.Imagine, float] = {"always": 1.0, "never": 0.0}
+        for imagine, share in choices.items():
+            controls = wire.Controls(n=4, imagine=imagine, seed=2)
+            draws = planner.plan(scene(), controls, format="vla_world").draws
+            assert np.mean(["visual" in draw.tokens for draw in draws]) == share
+            for draw in draws:
+                own = {"perception", "prediction", "action"} | ({"visual"} if share else set())
+                assert own <= set(draw.sections)
+                if share:
+                    codes, camera = draw.sections["visual"]
+                    assert isinstance(codes, list)
+                    assert len(codes) == 98
+                    assert str(camera).startswith("CAM_")
+        with pytest.raises(RequestRefused, match="camera has no meaning with imagine: never") as caught:
+            planner.plan(scene(), wire.Controls(imagine="never", camera="back"), format="vla_world")
+        assert caught.value.errors[0].pointer == "/controls"
+        for name, value in (("imagine", "never"), ("camera", "back")):
+            with pytest.raises(RequestRefused, match="traj_only imagines no pictures") as caught:
+                planner.plan(scene(), wire.Controls.model_validate({name: value}), format="traj_only")
+            assert caught.value.type.endswith("/cannot-imagine")
+            assert caught.value.errors[0].pointer == f"/controls/{name}"
+
+
+def test_unknown_cameras_are_refused_by_name(served: Served[TorchEngine]) -> None:
+    told = problem(served.http.post(PATH, json=asked(camera="rear")), "unknown-camera")
+    assert told.errors[0].pointer == "/camera"
+    assert all(camera in told.errors[0].detail for camera in CAMERAS)
+    told = problem(
+        served.http.post("/v1/plan", json=body() | {"controls": {"camera": "rear"}}), "unknown-camera"
+    )
+    assert told.errors[0].pointer == "/controls/camera"
+    document = asked()
+    del document["camera"]
+    assert problem(served.http.post(PATH, json=document), "invalid-request").errors[0].pointer == "/camera"
+    problem(served.http.post(PATH, json=asked(controls={"n": 65})), "invalid-controls")
+
+
+def test_models_that_cannot_imagine_or_paint_are_named() -> None:
+    engine = ScriptedEngine()
+    with serve(engine, Settings()) as served:
+        told = problem(served.http.post(PATH, json=asked()), "cannot-imagine")
+        assert "scripted writes cf_vla, traj_only" in told.detail
+        engine.card_shown = replace(CARD, formats=("vla_world",))
+        told = problem(served.http.post(PATH, json=asked()), "cannot-imagine")
+        assert "no codes of pictures to paint with" in told.detail
+        assert not engine.submitted
+        engine.card_shown = replace(CARD, formats=("cf_vla", "vla_world"), paints=True)
+        told_of = imagined(served, asked())
+        assert len(told_of.pictures) == 2
+        [request] = engine.submitted
+        assert (request.format, request.controls.camera, request.controls.imagine) == (
+            "vla_world",
+            "front_left",
+            "always",
+        )
+    with serve(NoModel(), Settings()) as served:
+        problem(served.http.post(PATH, json=asked()), "unknown-format")
+
+
+def test_a_checkpoint_without_codes_imagines_but_does_not_paint(checkpoint: Path, tmp_path: Path) -> None:
+    loaded = load(checkpoint)
+    save(tmp_path / "blind", loaded.model, loaded.vocabulary, loaded.codec)
+    with serve(TorchEngine(tmp_path / "blind", TorchSettings(rows=2, products=None)), Settings()) as served:
+        problem(served.http.post(PATH, json=asked()), "cannot-imagine")
+        planned = {"format": "vla_world", "controls": {"n": 1, "imagine": "always"}}
+        draws = served.http.post("/v1/plan", json=body() | planned).json()["draws"]
+        assert draws[0]["tokens"]["visual"] > 98
+
+
+def test_pictures_take_places_and_are_counted_as_draws_are(served: Served[TorchEngine]) -> None:
+    before = served.metric("looktwice_requests_total", endpoint=PATH, status="200")
+    with ThreadPoolExecutor(4) as pool:
+        told = list(pool.map(lambda seed: imagined(served, asked(controls={"seed": seed})), range(4)))
+    assert len({each.pictures[0].codes[0] for each in told}) > 1
+    assert served.metric("looktwice_requests_total", endpoint=PATH, status="200") == before + 4
+
+
+def test_the_described_example_is_served(served: Served[TorchEngine]) -> None:
+    described = served.http.get("/openapi.json").json()["paths"][PATH]["post"]
+    content = described["requestBody"]["content"]["application/json"]
+    for example in content["examples"].values():
+        assert ImagineRequest.model_validate_json(json.dumps(example["value"]))
+        assert events_of(served, **example["value"])[-1][0] == "done"
