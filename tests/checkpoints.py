@@ -11,7 +11,7 @@ import torch
 
 from looktwice.model.driving.images import encode_jpeg
 from looktwice.model.driving.scene import CLIP_FRAMES, FRONT_TELE, FRONT_WIDE, Clip, Scene, Track
-from looktwice.model.network.checkpoint import save, write_code_embeddings
+from looktwice.model.network.checkpoint import load, save, write_code_embeddings
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.corpus import nano_corpus, nano_phrases
 from looktwice.model.network.numbers import needed_numbers, write_number_embeddings
@@ -58,6 +58,22 @@ def write_untrained(folder: Path, *, narrow: bool = False, settings: VlaSettings
             for text in ("6.4", "\n"):
                 embeddings[vocabulary.encode(text)[0]] *= 6
     save(folder, model, vocabulary, codec)
+    return folder
+
+
+def shake(model: LookTwiceVla) -> None:
+    """Change all weights of a network a little, in place."""
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(1)
+        for weight in model.parameters():
+            weight.add_(torch.randn_like(weight) * weight.std(unbiased=False), alpha=0.1)
+
+
+def write_shaken(folder: Path, source: Path) -> Path:
+    """Write a checkpoint that is the same as another one but for its weights; returns its folder."""
+    loaded = load(source)
+    shake(loaded.model)
+    save(folder, loaded.model, loaded.vocabulary, loaded.codec, visual_codes=loaded.visual_codes)
     return folder
 
 

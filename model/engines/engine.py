@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncGenerator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
@@ -322,6 +323,20 @@ class Engine(Protocol):
 
     async def stop(self) -> None:
         """Cancel what is running and free everything."""
+        ...
+
+    async def load_weights(self, checkpoint: Path) -> None:
+        """Go on with the weights, and the card, of another folder that is the same in all but its weights.
+
+        Requests that were submitted before are answered with the old weights first. Those that are submitted
+        meanwhile wait, and are answered as by a new engine over that folder: nothing is left that was made of
+        the old weights.
+
+        Raises:
+            CheckpointError: the folder is no usable checkpoint, or differs in more than its weights; the
+                engine goes on as before.
+            EngineError: the engine is not running, or broke over it.
+        """
         ...
 
     def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:

@@ -79,6 +79,10 @@ class DrawStore:
             self._kept.close()
             self._kept = None
 
+    async def load_weights(self, checkpoint: Path) -> None:
+        """The engine's; the draws of the old weights stay, and are found when these are back."""
+        await self._engine.load_weights(checkpoint)
+
     def cancel(self, request_id: str) -> None:
         """The engine's."""
         self._engine.cancel(request_id)
@@ -94,8 +98,10 @@ class DrawStore:
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """See `Engine.submit`."""
         assert self._kept is not None, "an engine is started before it is asked"
-        key = _key(self.card, request)
-        found = self._kept.execute("SELECT draws FROM draws WHERE request = ?", (key,)).fetchone()
+        card = self.card
+        found = self._kept.execute(
+            "SELECT draws FROM draws WHERE request = ?", (_key(card, request),)
+        ).fetchone()
         if found is not None:
             yield Started()
             for draw in _unpacked(found[0]):
@@ -105,10 +111,13 @@ class DrawStore:
         async with aclosing(self._engine.submit(request)) as events:
             async for event in events:
                 if isinstance(event, DrawFinished):
+                    # It may have waited for new weights; while it is answered they stay.
+                    card = self.card
                     draws.append(event.draw)
                 yield event
         if len(draws) == request.controls.n:
-            self._kept.execute("INSERT OR REPLACE INTO draws VALUES (?, ?)", (key, _packed(draws)))
+            stored = _key(card, request), _packed(draws)
+            self._kept.execute("INSERT OR REPLACE INTO draws VALUES (?, ?)", stored)
 
 
 def _key(card: ModelCard, request: PlanRequest) -> str:

@@ -95,9 +95,14 @@ class OutcomeLearner(nn.Module):
         self._loaded, self._data, self._scenes = loaded, data, scenes
         self._task, self._settings = task, settings
         self._route_share, self._tracks_share = route_share, tracks_share
+        self._runner: Runner | None = None
 
     def forward(self, places: Tensor) -> dict[str, Tensor]:
         """The loss of one step from scenes int64 [b], and its parts without gradients."""
+        if self._runner is not None:
+            # The last step has changed the weights.
+            with torch.inference_mode():
+                self._runner.renew()
         items = [self._item(place) for place in places.tolist()]
         draws = self._drawn_by([self._request(number, item) for number, item in enumerate(items)])
         judges = [SceneJudge(self._scenes[item.index]) for item in items]
@@ -171,7 +176,9 @@ class OutcomeLearner(nn.Module):
         # The engine's memory has the weights' type, which autocast would not write into it. A prompt's draws
         # lie beside it; a few places more take those that grow long.
         with torch.inference_mode(), torch.autocast(device.type, enabled=False):
-            found = draws_of(Runner(self._loaded, rows, prompts=min(rows, 2 * len(seeded))), seeded)
+            if self._runner is None or self._runner.rows < rows:
+                self._runner = Runner(self._loaded, rows, prompts=min(rows, 2 * len(seeded)))
+            found = draws_of(self._runner, seeded)
         network.train(was_training)
         return list(found.values())
 

@@ -1,4 +1,4 @@
-// The plan of the chosen draw: tracks over time, the reasoning, tokens per section.
+// What the chosen draw says: plans as tracks over time, the reasoning, sections of its own, tokens per section.
 
 import { byId, element } from "./dom.js";
 
@@ -12,7 +12,8 @@ const LOOK = {
 const percent = (seconds) => `${100 * seconds / HORIZON_S}%`;
 
 export function showDraw(draw) {
-  const parts = [element("h3", { textContent: "First plan" }), tracks(draw.plan, null)];
+  const parts = [];
+  if (draw.plan) parts.push(element("h3", { textContent: "First plan" }), tracks(draw.plan, null));
   if (draw.thinking !== null) {
     parts.push(element("h3", { textContent: "Second look" }), element("blockquote", { textContent: draw.thinking }));
   }
@@ -20,26 +21,37 @@ export function showDraw(draw) {
     parts.push(element("h3", { textContent: "Revised plan" }), tracks(draw.revised_plan, draw.plan));
   }
   for (const section of draw.sections ?? []) {
-    const said = section.values.map((value) => typeof value === "string" ? value : JSON.stringify(value)).join(" ");
     parts.push(
       element("h3", { textContent: section.name.replaceAll("_", " ") }),
-      element("p", { textContent: said }),
+      element("p", { textContent: said(section.values) }),
     );
   }
-  const text = element("pre", { textContent: (draw.revised_plan || draw.plan || { text: "" }).text, tabIndex: 0 });
+  if (!parts.length) {
+    parts.push(element("p", { className: "empty", textContent: "This response format says nothing but its trajectory." }));
+  }
   const chips = Object.entries(draw.tokens).map(([section, count]) =>
     element("li", { textContent: `${section.replaceAll("_", " ")} ${count}` }));
   parts.push(
     element("h3", { textContent: "Tokens per section" }),
     element("ul", { className: "chips", id: "tokens" }, ...chips),
-    element("details", {}, element("summary", { textContent: "Plan as text" }), text),
   );
+  const plan = draw.revised_plan || draw.plan;
+  if (plan) {
+    const text = element("pre", { textContent: plan.text, tabIndex: 0 });
+    parts.push(element("details", {}, element("summary", { textContent: "Plan as text" }), text));
+  }
   byId("timeline").replaceChildren(...parts);
+}
+
+// A value by its kind: words and numbers as they are, several after each other, a record's with their names.
+function said(value) {
+  if (Array.isArray(value)) return value.map(said).join(" ");
+  if (value === null || typeof value !== "object") return String(value);
+  return Object.entries(value).map(([name, inner]) => `${name.replaceAll("_", " ")} ${said(inner)}`).join(", ");
 }
 
 // Segments that differ from the plan before are marked.
 function tracks(plan, before) {
-  if (!plan) return element("p", { className: "empty", textContent: "This response format has no plan." });
   const rows = GROUPS.filter((group) => plan.tracks[group]).flatMap((group) => [
     element("span", { textContent: group }),
     track(group, plan.tracks[group], before && before.tracks[group]),

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator, Sequence
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from looktwice.model.engines.engine import Event, Load, PlanRequest, RequestError
+from looktwice.model.network.card import CheckpointError
 from looktwice.model.network.model_card import ModelCard
 
 CARD: Final = ModelCard(
@@ -52,6 +54,10 @@ class NoModel:
     async def stop(self) -> None:
         """There is nothing to free."""
         self._stopped.set()
+
+    async def load_weights(self, checkpoint: Path) -> None:
+        """There is nothing that takes them."""
+        raise CheckpointError("this service runs without a model")
 
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """Refuse ``request``."""

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import AsyncGenerator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import llguidance
+import llguidance.hf
+import llguidance.numpy
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from prometheus_client import CollectorRegistry
 
 import looktwice.clients.wire as wire
@@ -25,6 +31,7 @@ from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.evaluation.open_loop import evaluate_draws
 from looktwice.model.families.family import Lesson
 from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.grammar_export import to_lark
 from looktwice.model.formats.text import parse
 from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.network.settings import VlaSettings
@@ -37,7 +44,7 @@ from looktwice.service.planning.events import Judged, SceneEvent
 from looktwice.service.planning.telling import PlanTeller
 from looktwice.service.routes.streaming import told_events
 from tests.checkpoints import noisy_scene, write_untrained
-from tests.families.toy import TOY, drive
+from tests.families.toy import TOY, drive, turned, turns_of
 from tests.model.driving.drives import MIDDLES_S, labelled_scene
 from tests.model.engines.decoding import decode
 from tests.model.engines.reference import exactly, reference_draws
@@ -45,6 +52,8 @@ from tests.model.evaluation.fakes import draw_of
 from tests.model.training.scenes import training_scene
 from tests.model.training.steps import two_losses
 from tests.service.serving import serve
+
+WEIGHTS = {"mood": 2.0, "why": 1.0, "gap": 1.0, "turns": 3.0, "speeds": 5.0}
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +82,12 @@ def planned(toy: Loaded, **controls: Any) -> list[Draw]:
 def test_it_plans_in_its_own_words(toy: Loaded) -> None:
     draws = planned(toy, n=4, numbers="drawn", seed=3)
     for draw in draws:
-        assert set(draw.tokens) in ({"mood", "speeds"}, {"mood", "why", "speeds"})
+        assert set(draw.tokens) - {"why"} == {"mood", "gap", "turns", "speeds"}
         speeds = [float(word) for word in draw.text.split(" at ")[-1].split(" m/s")[0].split(" ")]
-        np.testing.assert_array_equal(draw.trajectory, drive(tuple(speeds)))
+        turns = tuple(map(int, re.findall(r"<\|toy_turn_(\d{4})\|>", draw.text)))
+        [gap] = re.findall(r" keep <\|toy_gap_m_(\d{4})\|> m,", draw.text)
+        np.testing.assert_array_equal(draw.trajectory, drive(tuple(speeds), turns))
+        assert draw.sections == {"gap": [5.0 * int(gap)], "turns": [list(turns)]}
         assert (draw.plan, draw.codes, draw.times_s) == (None, (), (1.0, 2.0, 3.0, 4.0))
 
 
@@ -110,8 +122,9 @@ def test_it_plans_over_http_and_is_evaluated(checkpoint: Path) -> None:
         assert planned.trajectory.shape == (4, 4)
         assert planned.logprobs is not None
         assert len(planned.logprobs.token_ids) == sum(planned.tokens.values())
+        assert list(planned.sections) == ["gap", "turns"]
         draws.append(replace(draw_of(planned.trajectory), times_s=planned.times_s))
-    assert {name for name, _ in events} == {"branch", "thinking", "trajectory", "done"}
+    assert {name for name, _ in events} == {"branch", "thinking", "section", "trajectory", "done"}
     expert = labelled.future[[9, 19, 29, 39], :2]
     apart = np.linalg.norm([draw.trajectory[:, :2] - expert for draw in draws], axis=-1)
     measured = evaluate_draws(labelled, draws)
@@ -146,8 +159,7 @@ def test_it_is_streamed_in_the_words_of_the_wire(toy: Loaded) -> None:
 def test_training_reads_the_prompts_that_the_engine_reads(toy: Loaded) -> None:
     scenes = [training_scene(number) for number in range(4)]
     examples = Examples.from_scenes(scenes, toy.settings.cameras)
-    weights = {"mood": 2.0, "speeds": 5.0}
-    data = ResponseDataset(examples, toy.codec, toy.inputs, toy.vocabulary, weights, pictures=True)
+    data = ResponseDataset(examples, toy.codec, toy.inputs, toy.vocabulary, WEIGHTS, pictures=True)
     for number, labelled in enumerate(scenes):
         built = toy.inputs.build(labelled.scene, "toy")
         route = labelled.scene.route is not None
@@ -160,8 +172,7 @@ def test_training_reads_the_prompts_that_the_engine_reads(toy: Loaded) -> None:
 def test_a_step_of_training_brings_it_nearer_to_the_expert(checkpoint: Path) -> None:
     toy = load(checkpoint)
     examples = Examples.from_scenes([training_scene(1)], toy.settings.cameras)
-    weights = {"mood": 2.0, "speeds": 5.0}
-    data = ResponseDataset(examples, toy.codec, toy.inputs, toy.vocabulary, weights, pictures=False)
+    data = ResponseDataset(examples, toy.codec, toy.inputs, toy.vocabulary, WEIGHTS, pictures=False)
     sample = data[Item(0, "toy", True)]
     before, after = two_losses(toy, sample)
     assert after < before
@@ -170,9 +181,35 @@ def test_a_step_of_training_brings_it_nearer_to_the_expert(checkpoint: Path) -> 
 def test_a_labelled_scene_teaches_it(toy: Loaded) -> None:
     compiled = CompiledFormat(TOY.format, toy.vocabulary)
     labelled = labelled_scene(np.maximum(0, 12 - 4 * np.maximum(MIDDLES_S, 0)))
-    lesson = Lesson(expert_plan(labelled), (0,) * 6, labelled.future)
-    target = make_target(TOY, compiled, lesson, {"mood": 2.0, "why": 1.0, "speeds": 5.0})
+    future = labelled.future.copy()
+    future[:, 3] = np.linspace(0, -1.3, 64)
+    lesson = Lesson(expert_plan(labelled), (0,) * 6, future)
+    target = make_target(TOY, compiled, lesson, WEIGHTS)
     text = toy.vocabulary.decode(target.ids)
-    assert text == "Sure, at 10 5 0 0 m/s<|im_end|>"
+    turns = "".join(f"<|toy_turn_{code:04d}|>" for code in (0, 0, 0, 0))
+    assert text == f"Sure, keep <|toy_gap_m_0004|> m, turn {turns}, at 10 5 0 0 m/s<|im_end|>"
     assert parse(compiled, text)["speeds"] == (10.0, 5.0, 0.0, 0.0)
-    assert set(target.weights) == {2.0, 5.0}
+    assert set(target.weights) == {1.0, 2.0, 3.0, 5.0}
+
+
+@given(st.lists(st.integers(0, 2), min_size=4, max_size=4).map(tuple))
+def test_its_codec_gives_codes_back(turns: tuple[int, ...]) -> None:
+    assert turns_of(turned(turns)) == turns
+
+
+def test_its_grammar_allows_what_its_cursor_does(toy: Loaded) -> None:
+    """The way to vLLM, which decodes under it."""
+    tokenizer = llguidance.hf.from_tokenizer(toy.vocabulary.tokenizer)
+    start = CompiledFormat(TOY.format, toy.vocabulary).start()
+    grammar = llguidance.grammar_from("lark", to_lark(start))
+    for draw in planned(toy, n=4, numbers="drawn", seed=5):
+        matcher = llguidance.LLMatcher(tokenizer, grammar)
+        cursor, bits = start, llguidance.numpy.allocate_token_bitmask(1, tokenizer.vocab_size)
+        for token in draw.ids:
+            llguidance.numpy.fill_next_token_bitmask(matcher, bits, 0)
+            allowed = np.flatnonzero(np.unpackbits(bits.view(np.uint8), bitorder="little"))
+            assert allowed.tolist() == cursor.allowed().ids.tolist()
+            assert matcher.consume_token(token)
+            cursor = cursor.advance(token)
+        assert cursor.done
+        assert matcher.is_accepting()

@@ -6,6 +6,7 @@ import asyncio
 import random
 from collections.abc import AsyncGenerator, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -38,6 +39,7 @@ from looktwice.model.engines.engine import (
 )
 from looktwice.model.families.family import Foreseen, NextPicture
 from looktwice.model.formats.pieces import Value
+from looktwice.model.network.card import read_card
 from looktwice.model.network.model_card import ModelCard
 
 CARD: Final = ModelCard(
@@ -121,6 +123,9 @@ class ScriptedEngine:
 
     async def stop(self) -> None:
         self.stopped = True
+
+    async def load_weights(self, checkpoint: Path) -> None:
+        self.card_shown = replace(self.card_shown, revision=read_card(checkpoint)["revision"])
 
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         self.submitted.append(request)

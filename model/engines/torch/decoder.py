@@ -158,6 +158,19 @@ class Decoder:
         if request := self._scheduler.get(request_id):
             self._end(request)
 
+    def renew(self) -> None:
+        """Go on with the network's weights as they are now, see `Runner.renew`.
+
+        What steps take follows from the sizes of the network, so the latency model stays.
+
+        Raises:
+            EngineError: there are requests, which other weights have begun.
+        """
+        if not self.idle:
+            raise EngineError("weights can only change while there are no requests")
+        self._runner.renew()
+        self._drafter = Drafter()
+
     def step(self) -> list[StepEvent]:
         """Schedule, run, apply; returns what happened."""
         began_s = self._clock()

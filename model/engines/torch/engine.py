@@ -15,6 +15,7 @@ import torch
 
 from looktwice.model.engines.binding import Binding, binding_of
 from looktwice.model.engines.engine import DrawFinished, EngineError, Event, Load, PlanRequest, RequestError
+from looktwice.model.engines.gate import Gate
 from looktwice.model.engines.pictures import PictureThreads
 from looktwice.model.engines.requests import painted, prompt_tokens
 from looktwice.model.engines.torch.decoder import Counts, Decoder, Failed
@@ -27,10 +28,12 @@ from looktwice.model.engines.torch.threads import FreeCores, fit_threads
 from looktwice.model.engines.torch.worker import Worker
 from looktwice.model.engines.warm_up import warm_up
 from looktwice.model.network.allocator import FreedMemory
+from looktwice.model.network.card import CheckpointError
 from looktwice.model.network.checkpoint import load
 from looktwice.model.network.model_card import ModelCard
 from looktwice.model.network.precision import bfloat16_is_fast
 from looktwice.model.network.visual_codes import Frame
+from looktwice.model.network.weights import load_weights
 
 _DRAWS_A_SCENE: Final = 6
 """That most requests ask for."""
@@ -95,7 +98,8 @@ class TorchEngine:
         except BaseException:
             self._worker.close()
             raise
-        self._frames, self._pictures = Frames(self._loaded.inputs), PictureThreads()
+        self._card = self._loaded.card
+        self._frames, self._pictures, self._gate = Frames(self._loaded.inputs), PictureThreads(), Gate()
         self._decoding: Future[None] | None = None
         self._counts, self._rows_used = Counts(), 0
         self._broke: EngineError | None = None
@@ -105,7 +109,7 @@ class TorchEngine:
     @property
     def card(self) -> ModelCard:
         """What is loaded."""
-        return self._loaded.card
+        return self._card
 
     @property
     def load(self) -> Load:
@@ -146,6 +150,20 @@ class TorchEngine:
         if worker is not None:
             await asyncio.to_thread(worker.close)
 
+    async def load_weights(self, checkpoint: Path) -> None:
+        """Take new weights between steps; see `Engine.load_weights`. For a moment both are in memory."""
+        async with self._gate.change():
+            if self._decoding is None or self._decoding.done():
+                raise EngineError("the engine is not running")
+            taken: Future[None] = Future()
+            self._commands.put(lambda decoder: self._take(decoder, checkpoint, taken))
+            # A thread that was told to end before it comes to this never answers.
+            answer, end = asyncio.wrap_future(taken), asyncio.wrap_future(self._decoding)
+            await asyncio.wait([answer, end], return_when=asyncio.FIRST_COMPLETED)
+            if not answer.done():
+                raise EngineError("the engine was stopped")
+            answer.result()
+
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """Queue a request and iterate over its events; see `Engine.submit`."""
         if self._decoding is None or self._decoding.done():
@@ -157,17 +175,21 @@ class TorchEngine:
         # Now and not when the thread gets to it, which may be a long step later.
         submitted_s = time.monotonic()
         try:
-            binding, picture = await self._pictures.run(
-                lambda: self._prepared(request), request.scene.pictures
-            )
-            self._commands.put(lambda decoder: self._add(decoder, request, submitted_s, binding, picture))
-            remaining = request.controls.n
-            while remaining:
-                event = await events.get()
-                if isinstance(event, Failed):
-                    raise event.error
-                remaining -= isinstance(event, DrawFinished)
-                yield event
+            async with self._gate.request():
+                if events.empty():  # else it was cancelled before the gate
+                    binding, picture = await self._pictures.run(
+                        lambda: self._prepared(request), request.scene.pictures
+                    )
+                    self._commands.put(
+                        lambda decoder: self._add(decoder, request, submitted_s, binding, picture)
+                    )
+                remaining = request.controls.n
+                while remaining:
+                    event = await events.get()
+                    if isinstance(event, Failed):
+                        raise event.error
+                    remaining -= isinstance(event, DrawFinished)
+                    yield event
         finally:
             if self._listeners.pop(request.request_id, None):
                 self.cancel(request.request_id)
@@ -190,6 +212,22 @@ class TorchEngine:
         self._frames.look_at(request.scene)
         binding = binding_of(request, self._loaded.codec, self._loaded.vocabulary)
         return binding, expected_picture(request, self._loaded) if self._settings.shortcuts.speculate else ()
+
+    def _take(self, decoder: Decoder, checkpoint: Path, taken: Future[None]) -> None:
+        """Go on with the weights of a folder, in the decoding thread; ``taken`` says how that went."""
+        try:
+            # The network's own tensors are none of inference mode.
+            with torch.inference_mode(False):
+                card = load_weights(self._loaded, checkpoint)
+            decoder.renew()
+        except CheckpointError as error:
+            taken.set_exception(error)
+        except Exception as error:  # with half of the weights it must not go on
+            taken.set_exception(EngineError.because("the weights could not be taken", error))
+            raise
+        else:
+            self._card = card
+            taken.set_result(None)
 
     def _add(
         self,

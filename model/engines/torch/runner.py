@@ -106,7 +106,7 @@ class Runner:
     """Owns the network, keys and values; a `Memory` says what lies where. Call under `torch.inference_mode`.
 
     Args:
-        loaded: its weights must not change while the runner is used.
+        loaded: where its weights change, `renew` comes before the next call.
         rows: draws that can run at once.
         prompts: KV rows, each for a prompt and what usually `ROWS_A_TREE` rows write behind it; by default as
             many as rows.
@@ -150,22 +150,13 @@ class Runner:
         }
         # A row holds the prompt's last token too.
         self.row_tokens = 1 + max(format.longest() for format in self.formats.values())
+        self._frames, self._clip_bytes = frames or Frames(loaded.inputs), clip_bytes if reuse else 0
+        self._products, self._reproducible, self._reuse = products, reproducible, reuse
+        self._pass_size = repeatable_bucket if reproducible else bucket
+        self._capture = capture
+        self.renew()
         model: Any = loaded.model
         text = model.config.text_config
-        self._products = products
-        self._decoder = PackedDecoder(model.model.language_model, products, repeatable=reproducible)
-        self._head = AllowedHead(model.lm_head.weight)
-        self._reproducible = reproducible
-        self._pass_size = repeatable_bucket if reproducible else bucket
-        self._reuse, clip_bytes = reuse, clip_bytes if reuse else 0
-        self._pictures = ClipCache(clip_bytes)
-        self._vision = VisionEncoder(
-            loaded,
-            frames or Frames(loaded.inputs),
-            clip_bytes=clip_bytes,
-            products=products,
-            one_by_one=reproducible,
-        )
         kept = [loaded.inputs.longest_prompt(format) - 1 for format in loaded.card.formats]
         sizes = {
             "layers": text.num_hidden_layers,
@@ -181,10 +172,29 @@ class Runner:
         self._memory = KvRows(rows=self.prompts, length=self.kv_length, **sizes)
         self._shape = Shape(self._decoder.heads, self._memory.heads, self._memory.rows, self._memory.length)
         self._layout = compact_layout if capture is None else bucketed_layout
-        self._pass = self._run_pass if capture is None else Graphs(self._run_pass, capture)
         every_position = torch.arange(self.prompt_tokens + 1 + self.row_tokens, device=loaded.model.device)
         self._rotation = self._decoder.rotation(every_position.expand(3, -1))
-        self._heads: dict[str, Tensor] = {}
+
+    def renew(self) -> None:
+        """Take the network's weights as they are now: all that was made of others is made anew or dropped.
+
+        No prompt that was begun before may be fed any more, nor rows behind it.
+        """
+        model: Any = self.loaded.model
+        self._decoder = PackedDecoder(
+            model.model.language_model, self._products, repeatable=self._reproducible
+        )
+        self._head = AllowedHead(model.lm_head.weight)
+        self._vision = VisionEncoder(
+            self.loaded,
+            self._frames,
+            clip_bytes=self._clip_bytes,
+            products=self._products,
+            one_by_one=self._reproducible,
+        )
+        self._pictures, self._heads = ClipCache(self._clip_bytes), dict[str, Tensor]()
+        # Captured passes read the packed weights where they were.
+        self._pass = self._run_pass if self._capture is None else Graphs(self._run_pass, self._capture)
 
     def memory(self) -> Memory:
         """An empty slot table for the keys and values of this runner."""

@@ -20,6 +20,7 @@ from looktwice.model.engines.engine import (
     RequestError,
     Started,
 )
+from looktwice.model.engines.gate import Gate
 from looktwice.model.engines.pictures import PictureThreads
 from looktwice.model.engines.requests import begin, inputs_of, painted, prompt_tokens, read, told
 from looktwice.model.engines.transformers.decoding import Decoding, Prepared
@@ -30,6 +31,7 @@ from looktwice.model.network.checkpoint import load
 from looktwice.model.network.inputs import ModelInputs
 from looktwice.model.network.model_card import ModelCard
 from looktwice.model.network.visual_codes import Frame
+from looktwice.model.network.weights import load_weights
 
 _Tell = Callable[[Event | Exception], bool]
 """Hands an event on; False where nobody waits for more."""
@@ -59,7 +61,7 @@ class TransformersEngine:
             for name, family in self._families.items()
         }
         self._decoding = Decoding(self._loaded)
-        self._pictures = PictureThreads()
+        self._pictures, self._gate = PictureThreads(), Gate()
         self._thread: ThreadPoolExecutor | None = None
         self._ended: asyncio.Event | None = None
         self._running: dict[str, tuple[PlanRequest, asyncio.Queue[Event | Exception]]] = {}
@@ -99,6 +101,14 @@ class TransformersEngine:
         await asyncio.to_thread(thread.shutdown)
         self._ended.set()
 
+    async def load_weights(self, checkpoint: Path) -> None:
+        """Take new weights between two draws; see `Engine.load_weights`. For a moment both are in memory."""
+        async with self._gate.change():
+            if self._thread is None:
+                raise EngineError("the engine is not running")
+            taking = self._thread.submit(load_weights, self._loaded, checkpoint)
+            self._card = replace(await asyncio.wrap_future(taking), engine="transformers")
+
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """Queue a request and iterate over its events; see `Engine.submit`."""
         if (thread := self._thread) is None:
@@ -112,23 +122,24 @@ class TransformersEngine:
         running = self._running[request.request_id] = request, events
         writing: Future[None] | None = None
         try:
-            inputs = await self._pictures.run(partial(self._inputs, request), request.scene.pictures)
-            loop = asyncio.get_running_loop()
+            async with self._gate.request():
+                inputs = await self._pictures.run(partial(self._inputs, request), request.scene.pictures)
+                loop = asyncio.get_running_loop()
 
-            def tell(event: Event | Exception) -> bool:
-                loop.call_soon_threadsafe(events.put_nowait, event)
-                return self._running.get(request.request_id) is running
+                def tell(event: Event | Exception) -> bool:
+                    loop.call_soon_threadsafe(events.put_nowait, event)
+                    return self._running.get(request.request_id) is running
 
-            # Who was cancelled meanwhile has been told so.
-            if self._running.get(request.request_id) is running:
-                writing = thread.submit(self._write, request, start, inputs, tell)
-            remaining = request.controls.n
-            while remaining:
-                event = await events.get()
-                if isinstance(event, Exception):
-                    raise event
-                remaining -= isinstance(event, DrawFinished)
-                yield event
+                # Who was cancelled meanwhile has been told so.
+                if self._running.get(request.request_id) is running:
+                    writing = thread.submit(self._write, request, start, inputs, tell)
+                remaining = request.controls.n
+                while remaining:
+                    event = await events.get()
+                    if isinstance(event, Exception):
+                        raise event
+                    remaining -= isinstance(event, DrawFinished)
+                    yield event
         finally:
             if self._running.get(request.request_id) is running:
                 del self._running[request.request_id]

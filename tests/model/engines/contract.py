@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pytest
 
+from looktwice.model.bundled import CHECKPOINT
 from looktwice.model.driving.images import ImageError
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import Clip, Scene
@@ -27,6 +29,7 @@ from looktwice.model.engines.engine import (
     TextWritten,
 )
 from looktwice.model.families.registry import family_named
+from looktwice.model.network.card import CheckpointError
 
 Check = Callable[[Engine, Scene], Awaitable[None]]
 GIVEN: Final = parse_plan("- longitudinal\n  - 0.0s-2.5s: Keep Speed\n  - 2.5s-6.4s: Accelerate\n")
@@ -156,6 +159,62 @@ async def who_stops_is_told_and_may_start_again(engine: Engine, scene: Scene) ->
         await plan(engine, asked("late", scene, n=1))
     await engine.start()
     assert len(await plan(engine, asked("again", scene, n=1))) == 1
+
+
+async def new_weights_are_taken_between_requests(
+    engine: Engine, scene: Scene, other: Path, fresh: Callable[[Path], Engine]
+) -> None:
+    """Nothing is left of the old ones, nor, when these are back, of the new ones.
+
+    Args:
+        engine: runs, over the bundled checkpoint.
+        scene: that it can see.
+        other: a checkpoint folder that differs in its weights alone.
+        fresh: makes an engine over a folder that writes the same without chance.
+    """
+    revision = engine.card.revision
+
+    def greedy(name: str) -> PlanRequest:
+        return asked(name, scene, n=2, thinking="always", temperature=0.0, prefill=GIVEN, reasons="any")
+
+    async def drawn(name: str, by: Engine = engine) -> list[str]:
+        return [draw.text for draw in await plan(by, greedy(name))]
+
+    old = await drawn("old")
+    under_way = engine.submit(greedy("under way"))
+    assert isinstance(await anext(under_way), Started)
+    taking = asyncio.create_task(engine.load_weights(other))
+    await asyncio.sleep(0)
+    behind = asyncio.create_task(drawn("behind"))
+    assert [event.draw.text async for event in under_way if isinstance(event, DrawFinished)] == old
+    await taking
+    new = await drawn("new")
+    assert new != old
+    assert await behind == new
+    another = fresh(other)
+    assert replace(engine.card, engine="") == replace(another.card, engine="")
+    assert engine.card.revision != revision
+    await another.start()
+    try:
+        assert await drawn("fresh", another) == new
+    finally:
+        await another.stop()
+    await engine.load_weights(CHECKPOINT)
+    assert engine.card.revision == revision
+    assert await drawn("old again") == old
+
+
+async def weights_of_another_network_are_refused(engine: Engine, scene: Scene, unlike: Path) -> None:
+    before, card = await plan(engine, asked("before", scene, n=1)), engine.card
+    for folder, message in (
+        (unlike, "in its settings, tokenizer"),
+        (unlike / "none", "not a LookTwice"),
+    ):
+        with pytest.raises(CheckpointError, match=message):
+            await engine.load_weights(folder)
+    assert engine.card == card
+    [draw] = await plan(engine, asked("after", scene, n=1))
+    assert draw.text == before[0].text
 
 
 TELLING: Final[tuple[Check, ...]] = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator, Sequence
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,7 @@ from looktwice.model.engines.engine import (
     RequestError,
     SectionFinished,
 )
+from looktwice.model.network.card import CheckpointError
 from looktwice.model.network.model_card import ModelCard
 
 
@@ -77,6 +79,9 @@ class FakeEngine:
 
     async def stop(self) -> None:
         return None
+
+    async def load_weights(self, checkpoint: Path) -> None:
+        raise CheckpointError("a fake has no weights")
 
     def cancel(self, request_id: str) -> None:
         return None

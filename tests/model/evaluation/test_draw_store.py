@@ -21,6 +21,7 @@ from looktwice.model.engines.engine import (
 )
 from looktwice.model.evaluation.draw_store import DrawStore
 from looktwice.model.families.family import Attempt, Foreseen, NextPicture
+from looktwice.model.network.model_card import ModelCard
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import FakeEngine, draw_of
 
@@ -59,6 +60,30 @@ def test_what_was_asked_before_is_not_asked_again(tmp_path: Path) -> None:
     assert (len(first.requests), len(again.requests)) == (1, 0)
     assert len(made) == 3
     same(found, made)
+
+
+class ChangingEngine(FakeEngine):
+    """Takes new weights while a request waits."""
+
+    revision = "1"
+
+    @property
+    def card(self) -> ModelCard:
+        return replace(super().card, revision=self.revision)
+
+    async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
+        self.revision = "2"
+        async for event in super().submit(request):
+            yield event
+
+
+def test_draws_are_stored_by_the_weights_that_made_them(tmp_path: Path) -> None:
+    file, old, new = tmp_path / "draws.sqlite", FakeEngine(), ChangingEngine()
+    ask(DrawStore(ChangingEngine(), file), ASKED)
+    new.revision = "2"
+    ask(DrawStore(old, file), ASKED)
+    ask(DrawStore(new, file), ASKED)
+    assert (len(old.requests), len(new.requests)) == (1, 0)
 
 
 def test_draws_come_back_whole(tmp_path: Path) -> None:

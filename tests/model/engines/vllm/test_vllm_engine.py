@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 import pytest
@@ -33,6 +33,7 @@ from looktwice.model.engines.engine import (
     SectionFinished,
     Started,
     TextWritten,
+    Thinking,
 )
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.engines.vllm.engine import VllmEngine, VllmSettings
@@ -42,12 +43,17 @@ from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.replay import decisions
 from looktwice.model.formats.text import parse
 from looktwice.model.network.checkpoint import load, read_parts
-from looktwice.model.network.settings import NANO_SETTINGS
+from looktwice.model.network.settings import NANO_SETTINGS, VlaSettings
 from looktwice.model.training.batches import collate
 from looktwice.model.training.learner import ResponseLearner
 from looktwice.model.training.rollouts import rollout
-from tests.checkpoints import write_untrained
-from tests.model.engines.contract import CONTRACT, Check
+from tests.checkpoints import write_shaken, write_untrained
+from tests.model.engines.contract import (
+    CONTRACT,
+    Check,
+    new_weights_are_taken_between_requests,
+    weights_of_another_network_are_refused,
+)
 
 T = TypeVar("T")
 Run = Callable[[Awaitable[T]], T]
@@ -289,6 +295,44 @@ def test_decisions_are_as_likely_as_training_says(
 @pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
 def test_the_contract(loop: asyncio.AbstractEventLoop, vllm: VllmEngine, check: Check) -> None:
     loop.run_until_complete(check(vllm, BUNDLED[2]))
+
+
+def test_new_weights(
+    loop: asyncio.AbstractEventLoop, vllm: VllmEngine, untrained_checkpoint: Path, tmp_path: Path
+) -> None:
+    def fresh(folder: Path) -> Engine:
+        return TorchEngine(folder, TorchSettings(products=None))
+
+    other = write_shaken(tmp_path / "shaken", CHECKPOINT)
+    loop.run_until_complete(new_weights_are_taken_between_requests(vllm, BUNDLED[2], other, fresh))
+    loop.run_until_complete(weights_of_another_network_are_refused(vllm, BUNDLED[2], untrained_checkpoint))
+
+
+def test_both_engines_write_the_same_in_a_family_of_ones_own(
+    loop: asyncio.AbstractEventLoop, toy_family: None, tmp_path: Path
+) -> None:
+    """With numbers, repeats, codes of its own, and a branch of another name."""
+    checkpoint = write_untrained(tmp_path / "toy", settings=VlaSettings(name="toy", formats=("toy",)))
+    arguments = {"enforce_eager": True, "block_size": 32}
+    theirs = VllmEngine(checkpoint, VllmSettings(rows=8, dtype="float32", arguments=arguments))
+    requests = [
+        PlanRequest(f"{thinking}-{k}", scene, "toy", Controls(n=1, temperature=0.0, thinking=thinking))
+        for k, scene in enumerate(mixed_scenes(6))
+        for thinking in get_args(Thinking)
+    ]
+
+    async def draws(engine: Engine) -> list[Draw]:
+        await engine.start()
+        try:
+            return [draw for [draw] in await plans(engine, requests)]
+        finally:
+            await engine.stop()
+
+    written = loop.run_until_complete(draws(theirs))
+    expected = loop.run_until_complete(draws(TorchEngine(checkpoint, TorchSettings(products=None))))
+    assert [draw.text for draw in written] == [draw.text for draw in expected]
+    assert [draw.sections for draw in written] == [draw.sections for draw in expected]
+    assert {draw.looked_twice for draw in written} == {True, False}
 
 
 def test_sections_come_before_their_draw(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:

@@ -1,0 +1,76 @@
+"""New weights for a network that is loaded, from a folder that is the same in all else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from looktwice.model.network.card import CheckpointError
+from looktwice.model.network.checkpoint import Loaded, Parts, load
+from looktwice.model.network.model_card import ModelCard
+from looktwice.model.network.settings import CONFIG_KEY
+from looktwice.model.network.visual_codes import VisualCodes
+from looktwice.model.network.vla import VlaConfig
+
+_NO_SIZES: Final = {CONFIG_KEY, "_name_or_path", "dtype", "transformers_version"}
+"""Entries of a configuration that say nothing of the network's sizes and operations."""
+
+
+def load_weights(loaded: Loaded, folder: Path) -> ModelCard:
+    """Write the weights of another checkpoint into a network, in place.
+
+    Args:
+        loaded: whose network it is; it stays as it is where anything is raised.
+        folder: of the other checkpoint, in whatever type it is stored.
+
+    Returns:
+        The other checkpoint's card.
+
+    Raises:
+        CheckpointError: the folder is no usable checkpoint, or differs in more than its weights.
+    """
+    other = load(folder, loaded.model.dtype, str(loaded.model.device))
+    check_same_but_weights((loaded, loaded.model.config), (other, other.model.config), folder)
+    loaded.model.load_state_dict(other.model.state_dict())
+    return other.card
+
+
+def check_same_but_weights(
+    mine: tuple[Parts, VlaConfig], other: tuple[Parts, VlaConfig], folder: Path
+) -> None:
+    """Raise `CheckpointError` where the checkpoint of ``folder`` differs in more than its weights."""
+    (my_parts, my_config), (parts, config) = mine, other
+    same = {
+        "settings": replace(my_parts.settings, name="") == replace(parts.settings, name=""),
+        "tokenizer": my_parts.vocabulary.tokenizer.get_vocab() == parts.vocabulary.tokenizer.get_vocab(),
+        "trajectory codec": all(
+            np.array_equal(value, getattr(parts.codec, name)) for name, value in vars(my_parts.codec).items()
+        ),
+        "codes of pictures": _same_codes(my_parts.visual_codes, parts.visual_codes),
+        "network": _sizes(my_config.to_dict()) == _sizes(config.to_dict()),
+    }
+    if differing := [name for name, is_same in same.items() if not is_same]:
+        raise CheckpointError(
+            f"{folder} differs from the checkpoint that runs in its {', '.join(differing)}: "
+            "its weights cannot take their place, start an engine over it"
+        )
+
+
+def _same_codes(mine: VisualCodes | None, other: VisualCodes | None) -> bool:
+    if mine is None or other is None:
+        return mine is other
+    weights = other.state_dict()
+    return mine.width == other.width and all(
+        torch.equal(value, weights[name]) for name, value in mine.state_dict().items()
+    )
+
+
+def _sizes(config: Any) -> Any:
+    """A configuration without `_NO_SIZES`, at any depth."""
+    if not isinstance(config, dict):
+        return config
+    return {name: _sizes(value) for name, value in config.items() if name not in _NO_SIZES}
