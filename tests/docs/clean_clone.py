@@ -61,6 +61,11 @@ HELP_ONLY: Final = {
     "scenes import": "docs/own-cameras.md runs it",
     "train": "minutes to hours",
     "train create": "minutes",
+    "build outcomes": "it needs the simulator",
+    "build take": "it needs answers of the Batch API",
+    "score": "docs/scoring.md has its examples",
+    "feedback": "docs/feedback.md has its examples",
+    "failures": "it needs a checkpoint of ELF-VLA",
     "drive": "it needs the simulator",
     "loadtest": "a busy machine makes its run not valid, which is an exit code of 1",
     "egodriver": "it serves until it is ended",
@@ -68,6 +73,7 @@ HELP_ONLY: Final = {
     "bench precision": "minutes",
     "bench egodriver": "minutes",
     "bench http": "minutes",
+    "bench score": "minutes",
 }
 """Listed commands of which only the help is asked for, and why."""
 ACTIVATE: Final = "source .venv/bin/activate"

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from looktwice.clients.importers.comma2k19 import Film
@@ -51,6 +54,19 @@ def test_a_listed_command_has_the_options_that_are_shown(command: str, options: 
     told = CliRunner(env={"COLUMNS": "200"}).invoke(app, [*command.split(), "--help"])
     assert told.exit_code == 0, told.output
     assert [option for option in options if option not in told.output] == []
+
+
+def commands_of(command: Any, *path: str) -> Iterator[str]:
+    """The names of a command's own commands, down to those that have none."""
+    if not hasattr(command, "commands"):
+        yield " ".join(path)
+        return
+    for name, inner in command.commands.items():
+        yield from commands_of(inner, *path, name)
+
+
+def test_every_command_is_listed() -> None:
+    assert set(commands_of(typer.main.get_command(app))) <= {name for name, _ in LISTED}
 
 
 def test_every_command_that_is_listed_is_run_or_it_is_said_why_not() -> None:
