@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from looktwice.model.engines.engine import Event, Load, PlanRequest, RequestError
-from looktwice.model.network.card import CheckpointError
+from looktwice.model.engines.engine import EngineError, Event, Load, PlanRequest, RequestError
 from looktwice.model.network.model_card import ModelCard
 
 CARD: Final = ModelCard(
@@ -57,7 +56,7 @@ class NoModel:
 
     async def load_weights(self, checkpoint: Path) -> None:
         """There is nothing that takes them."""
-        raise CheckpointError("this service runs without a model")
+        raise EngineError("this service runs without a model")
 
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """Refuse ``request``."""

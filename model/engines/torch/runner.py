@@ -150,7 +150,9 @@ class Runner:
         }
         # A row holds the prompt's last token too.
         self.row_tokens = 1 + max(format.longest() for format in self.formats.values())
-        self._frames, self._clip_bytes = frames or Frames(loaded.inputs), clip_bytes if reuse else 0
+        # An empty `Frames` is false.
+        self._frames = Frames(loaded.inputs) if frames is None else frames
+        self._clip_bytes = clip_bytes if reuse else 0
         self._products, self._reproducible, self._reuse = products, reproducible, reuse
         self._pass_size = repeatable_bucket if reproducible else bucket
         self._capture = capture
