@@ -333,8 +333,8 @@ class Engine(Protocol):
         the old weights.
 
         Raises:
-            CheckpointError: the folder is no usable checkpoint, or differs in more than its weights; the
-                engine goes on as before.
+            CheckpointError: the folder is no usable checkpoint, or differs in more than its weights, or this
+                kind of engine takes none; it goes on as before.
             EngineError: the engine is not running, or broke over it.
         """
         ...

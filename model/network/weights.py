@@ -10,11 +10,10 @@ import numpy as np
 import torch
 
 from looktwice.model.network.card import CheckpointError
-from looktwice.model.network.checkpoint import Loaded, Parts, load
+from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.network.model_card import ModelCard
 from looktwice.model.network.settings import CONFIG_KEY
 from looktwice.model.network.visual_codes import VisualCodes
-from looktwice.model.network.vla import VlaConfig
 
 _NO_SIZES: Final = {CONFIG_KEY, "_name_or_path", "dtype", "transformers_version"}
 """Entries of a configuration that say nothing of the network's sizes and operations."""
@@ -34,24 +33,21 @@ def load_weights(loaded: Loaded, folder: Path) -> ModelCard:
         CheckpointError: the folder is no usable checkpoint, or differs in more than its weights.
     """
     other = load(folder, loaded.model.dtype, str(loaded.model.device))
-    check_same_but_weights((loaded, loaded.model.config), (other, other.model.config), folder)
+    _check_same_but_weights(loaded, other, folder)
     loaded.model.load_state_dict(other.model.state_dict())
     return other.card
 
 
-def check_same_but_weights(
-    mine: tuple[Parts, VlaConfig], other: tuple[Parts, VlaConfig], folder: Path
-) -> None:
+def _check_same_but_weights(mine: Loaded, other: Loaded, folder: Path) -> None:
     """Raise `CheckpointError` where the checkpoint of ``folder`` differs in more than its weights."""
-    (my_parts, my_config), (parts, config) = mine, other
     same = {
-        "settings": replace(my_parts.settings, name="") == replace(parts.settings, name=""),
-        "tokenizer": my_parts.vocabulary.tokenizer.get_vocab() == parts.vocabulary.tokenizer.get_vocab(),
+        "settings": replace(mine.settings, name="") == replace(other.settings, name=""),
+        "tokenizer": mine.vocabulary.tokenizer.get_vocab() == other.vocabulary.tokenizer.get_vocab(),
         "trajectory codec": all(
-            np.array_equal(value, getattr(parts.codec, name)) for name, value in vars(my_parts.codec).items()
+            np.array_equal(value, getattr(other.codec, name)) for name, value in vars(mine.codec).items()
         ),
-        "codes of pictures": _same_codes(my_parts.visual_codes, parts.visual_codes),
-        "network": _sizes(my_config.to_dict()) == _sizes(config.to_dict()),
+        "codes of pictures": _same_codes(mine.visual_codes, other.visual_codes),
+        "network": _sizes(mine.model.config.to_dict()) == _sizes(other.model.config.to_dict()),
     }
     if differing := [name for name, is_same in same.items() if not is_same]:
         raise CheckpointError(

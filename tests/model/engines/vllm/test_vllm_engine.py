@@ -42,18 +42,14 @@ from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.replay import decisions
 from looktwice.model.formats.text import parse
+from looktwice.model.network.card import CheckpointError
 from looktwice.model.network.checkpoint import load, read_parts
 from looktwice.model.network.settings import NANO_SETTINGS, VlaSettings
 from looktwice.model.training.batches import collate
 from looktwice.model.training.learner import ResponseLearner
 from looktwice.model.training.rollouts import rollout
-from tests.checkpoints import write_shaken, write_untrained
-from tests.model.engines.contract import (
-    CONTRACT,
-    Check,
-    new_weights_are_taken_between_requests,
-    weights_of_another_network_are_refused,
-)
+from tests.checkpoints import write_untrained
+from tests.model.engines.contract import CONTRACT, Check
 
 T = TypeVar("T")
 Run = Callable[[Awaitable[T]], T]
@@ -297,15 +293,9 @@ def test_the_contract(loop: asyncio.AbstractEventLoop, vllm: VllmEngine, check: 
     loop.run_until_complete(check(vllm, BUNDLED[2]))
 
 
-def test_new_weights(
-    loop: asyncio.AbstractEventLoop, vllm: VllmEngine, untrained_checkpoint: Path, tmp_path: Path
-) -> None:
-    def fresh(folder: Path) -> Engine:
-        return TorchEngine(folder, TorchSettings(products=None))
-
-    other = write_shaken(tmp_path / "shaken", CHECKPOINT)
-    loop.run_until_complete(new_weights_are_taken_between_requests(vllm, BUNDLED[2], other, fresh))
-    loop.run_until_complete(weights_of_another_network_are_refused(vllm, BUNDLED[2], untrained_checkpoint))
+def test_new_weights_are_refused(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
+    with pytest.raises(CheckpointError, match="start an engine over it"):
+        loop.run_until_complete(vllm.load_weights(CHECKPOINT))
 
 
 def test_both_engines_write_the_same_in_a_family_of_ones_own(
