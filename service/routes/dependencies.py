@@ -6,15 +6,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import structlog
+
 from looktwice.clients.labelling.teachers.teacher import Teacher
+from looktwice.clients.wire import Problem
 from looktwice.model.engines.engine import Engine
+from looktwice.service.admission.places import Admission, full_as_problem
+from looktwice.service.http.errors import problem_document
 from looktwice.service.http.idempotency import Idempotency
 from looktwice.service.operations.lifecycle import Lifecycle
 from looktwice.service.operations.metrics import Metrics
 from looktwice.service.operations.pulse import Pulse
 from looktwice.service.operations.settings import Settings
 from looktwice.service.planning.submitting import Planning
+from looktwice.service.problems import ProblemError, unforeseen
 from looktwice.service.scoring.process import Scorer
+
+log = structlog.stdlib.get_logger()
 
 
 @dataclass(frozen=True)
@@ -37,3 +45,19 @@ class Dependencies:
     began_s: int
     pulse: Pulse
     scorer: Scorer
+
+    def check_open(self, admission: Admission) -> None:
+        """Raise `ProblemError` while the service drains, or where ``admission`` has no place."""
+        self.lifecycle.check_accepting()
+        with full_as_problem():
+            admission.check_open()
+
+    def problem_within(self, error: Exception, request_id: str) -> Problem:
+        """What ended one scene of a batch, counted; the others go on. To be called while it is handled."""
+        if isinstance(error, ProblemError):
+            failure = error
+        else:
+            log.exception("scene of a batch failed")
+            failure = unforeseen()
+        self.metrics.count_problem_within(failure.kind)
+        return problem_document(failure, request_id)

@@ -9,7 +9,7 @@ from fastapi.openapi.models import Example
 
 import looktwice.clients.wire_feedback as wire_feedback
 from looktwice.clients.labelling.teachers.feedback import FeedbackTeacher
-from looktwice.service.admission.places import Admission, full_as_problem, let_in
+from looktwice.service.admission.places import Admission, let_in
 from looktwice.service.http.callers import while_connected
 from looktwice.service.http.openapi import PACKED, payloads, problems
 from looktwice.service.http.payloads import payload_route, respond
@@ -32,11 +32,6 @@ EXAMPLES: Final[dict[str, Example]] = {"why one of two trajectories is wrong": {
 def feedback_router(deps: Dependencies, admission: Admission) -> APIRouter:
     """The endpoint; it takes its places from the scorer's ``admission``."""
 
-    def check_open(_: Request) -> None:
-        deps.lifecycle.check_accepting()
-        with full_as_problem():
-            admission.check_open()
-
     async def given(asked: wire_feedback.FeedbackRequest, request_id: str) -> wire_feedback.FeedbackResponse:
         found = await deps.scorer.feedback(asked, request_id)
         response = found.response
@@ -46,7 +41,7 @@ def feedback_router(deps: Dependencies, admission: Admission) -> APIRouter:
             deps.metrics.count_feedback(each.written_by, correct=each.correct)
         return response
 
-    router = APIRouter(route_class=payload_route(check_open), tags=["scoring"])
+    router = APIRouter(route_class=payload_route(lambda _: deps.check_open(admission)), tags=["scoring"])
 
     @router.post(
         "/v1/feedback",

@@ -8,7 +8,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 
 import looktwice.clients.wire as wire
-from looktwice.service.admission.places import Admission, full_as_problem, let_in
+from looktwice.service.admission.places import Admission, let_in
 from looktwice.service.http.callers import while_connected
 from looktwice.service.http.openapi import PACKED, payloads, problems
 from looktwice.service.http.payloads import payload_route, respond
@@ -46,12 +46,7 @@ def label_router(deps: Dependencies) -> APIRouter:
     # A teacher that is slow must not gather callers and their pictures without end.
     admission = Admission(deps.settings.max_scenes, deps.settings.max_scenes, time.monotonic)
 
-    def check_open(_: Request) -> None:
-        deps.lifecycle.check_accepting()
-        with full_as_problem():
-            admission.check_open()
-
-    router = APIRouter(route_class=payload_route(check_open))
+    router = APIRouter(route_class=payload_route(lambda _: deps.check_open(admission)))
 
     @router.post(
         "/v1/label",

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Any, Final
 
-import structlog
 from fastapi import APIRouter, Body, Request
 from fastapi.openapi.models import Example
 from pydantic import BaseModel
@@ -15,7 +14,7 @@ from starlette.responses import Response
 
 import looktwice.clients.wire as wire
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
-from looktwice.service.http.errors import problem_document, validated
+from looktwice.service.http.errors import validated
 from looktwice.service.http.idempotency import IdempotencyKey, NotCached, made_before, once, refuse_key
 from looktwice.service.http.openapi import PACKED, answers_and_stream, payloads, problems
 from looktwice.service.http.payloads import payload_route, respond
@@ -55,14 +54,11 @@ from looktwice.service.problems import (
     UNSUPPORTED_MEDIA_TYPE,
     ProblemError,
     at,
-    unforeseen,
 )
 from looktwice.service.routes.arrivals import arrival_of
 from looktwice.service.routes.dependencies import Dependencies
 from looktwice.service.routes.examples import example_reflection, example_request
 from looktwice.service.routes.streaming import server_sent, streamed
-
-log = structlog.stdlib.get_logger()
 
 _TRY_AGAIN: Final = frozenset((429, 500, 503, 504))
 """What a scene of a batch may get that another try may better."""
@@ -202,11 +198,6 @@ async def _result(
             raise asked
         planned = await deps.planning.in_turn(asked, arrival)
         return wire.BatchResult(status=200, response=plan_answer(planned, arrival.request_id))
-    except ProblemError as error:
-        failure = error
-    except Exception:  # one scene must not end the others
-        log.exception("scene of a batch failed")
-        failure = unforeseen()
-    deps.metrics.count_problem_within(failure.kind)
-    document = problem_document(failure, arrival.request_id)
-    return wire.BatchResult(status=failure.kind.status, problem=document)
+    except Exception as error:
+        problem = deps.problem_within(error, arrival.request_id)
+    return wire.BatchResult(status=problem.status, problem=problem)

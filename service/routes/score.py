@@ -5,14 +5,13 @@ from __future__ import annotations
 import asyncio
 from typing import Annotated, Any, Final
 
-import structlog
 from fastapi import APIRouter, Body, Request
 from fastapi.openapi.models import Example
 
 import looktwice.clients.wire_scores as wire_scores
-from looktwice.service.admission.places import Admission, full_as_problem, let_in
+from looktwice.service.admission.places import Admission, let_in
 from looktwice.service.http.callers import while_connected
-from looktwice.service.http.errors import problem_document, validated
+from looktwice.service.http.errors import validated
 from looktwice.service.http.openapi import PACKED, payloads, problems
 from looktwice.service.http.payloads import payload_route, respond
 from looktwice.service.planning.events import Arrival
@@ -32,14 +31,10 @@ from looktwice.service.problems import (
     UNKNOWN_FIELD,
     UNKNOWN_SCENE,
     UNSUPPORTED_MEDIA_TYPE,
-    ProblemError,
-    unforeseen,
 )
 from looktwice.service.routes.arrivals import arrival_of
 from looktwice.service.routes.dependencies import Dependencies
 from looktwice.service.routes.examples import example_score
-
-log = structlog.stdlib.get_logger()
 
 EXAMPLES: Final[dict[str, Example]] = {"straight on behind a car": {"value": example_score()}}
 SCORING_REFUSALS: Final = (
@@ -52,27 +47,17 @@ SCORING_REFUSALS: Final = (
 def score_router(deps: Dependencies, admission: Admission) -> APIRouter:
     """The endpoints of the scorer; ``admission`` bounds how many requests it has."""
 
-    def check_open(_: Request) -> None:
-        deps.lifecycle.check_accepting()
-        with full_as_problem():
-            admission.check_open()
-
     async def result(given: Any, arrival: Arrival) -> wire_scores.ScoreResult:
         try:
             asked = await asyncio.to_thread(validated, wire_scores.ScoreRequest, given)
             return wire_scores.ScoreResult(
                 status=200, response=await deps.scorer.score(asked, arrival.request_id)
             )
-        except ProblemError as error:
-            failure = error
-        except Exception:  # one scene must not end the others
-            log.exception("scene of a batch failed")
-            failure = unforeseen()
-        deps.metrics.count_problem_within(failure.kind)
-        document = problem_document(failure, arrival.request_id)
-        return wire_scores.ScoreResult(status=failure.kind.status, problem=document)
+        except Exception as error:
+            problem = deps.problem_within(error, arrival.request_id)
+        return wire_scores.ScoreResult(status=problem.status, problem=problem)
 
-    router = APIRouter(route_class=payload_route(check_open), tags=["scoring"])
+    router = APIRouter(route_class=payload_route(lambda _: deps.check_open(admission)), tags=["scoring"])
     refusals = problems(*SCORING_REFUSALS)
 
     @router.post(

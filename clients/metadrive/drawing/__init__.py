@@ -1,1 +1,1 @@
-"""What an episode looks like: meshes, the stage, cameras; and text in pictures."""
+"""What an episode looks like: meshes, the stage, cameras."""

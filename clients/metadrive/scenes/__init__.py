@@ -1,1 +1,1 @@
-"""Labelled scenes of an episode, and what scene files contain."""
+"""Labelled scenes of an episode."""
