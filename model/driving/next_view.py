@@ -8,13 +8,26 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from looktwice.model.driving.cameras import CameraSpec
+from looktwice.model.driving.cameras import CAMERA_SPECS, CameraSpec
+from looktwice.model.driving.short_term import INERTIA
+from looktwice.model.driving.trajectory import FloatArray
 
 Array = npt.NDArray[np.float64]
 
 FAR_M: Final = 40.0
 """How far away everything is that is no road. Of 20, 40, 80 m and never, this one came nearest to what six
 rendered cameras saw half a second later."""
+
+
+def expected_view(frame: npt.NDArray[np.uint8], camera: str, history: FloatArray) -> npt.NDArray[np.uint8]:
+    """What a camera would see half a second later if only the ego moved, and kept its momentum.
+
+    Args:
+        frame: uint8 [h, w, 3], what it sees now.
+        camera: one of `CAMERAS`; taken for one that our models are trained with.
+        history: float32 [16, 4] of the ego.
+    """
+    return moved_view(frame, CAMERA_SPECS[camera], INERTIA.ego(history, None))
 
 
 def moved_view(

@@ -180,7 +180,7 @@ def read_parts(folder: Path) -> Parts:
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{folder}: its tokenizer cannot be loaded: {error}") from error
     _check_sizes(codec, vocabulary)
-    inputs = InputBuilder(vocabulary, settings)
+    inputs = InputBuilder(vocabulary, settings, visual_codes)
     return Parts(
         vocabulary=vocabulary,
         codec=codec,
@@ -287,7 +287,7 @@ def with_formats(loaded: Loaded, formats: Sequence[str], *, seed: int = 0) -> Lo
     return replace(
         loaded,
         vocabulary=vocabulary,
-        inputs=InputBuilder(vocabulary, settings),
+        inputs=InputBuilder(vocabulary, settings, loaded.visual_codes),
         card=replace(loaded.card, formats=settings.formats),
     )
 
@@ -312,7 +312,14 @@ def with_sketches(loaded: Loaded, stages: int, *, seed: int = 0) -> Loaded:
     assert model.sketch_books is not None
     model.sketch_books.fill(loaded.codec)
     model.train(False)
-    return replace(loaded, model=model, inputs=InputBuilder(loaded.vocabulary, wider))
+    inputs = InputBuilder(loaded.vocabulary, wider, loaded.visual_codes)
+    return replace(loaded, model=model, inputs=inputs)
+
+
+def with_visual_codes(loaded: Loaded, codes: VisualCodes) -> Loaded:
+    """A checkpoint with other codes of pictures, or with its first ones."""
+    inputs = InputBuilder(loaded.vocabulary, loaded.settings, codes)
+    return replace(loaded, inputs=inputs, visual_codes=codes, card=replace(loaded.card, paints=True))
 
 
 @torch.no_grad()

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from looktwice.model.driving.images import decode_image
+from looktwice.model.driving.images import ImageError, decode_image
+from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.scene import Scene
-from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.driving.trajectory import HISTORY_STEPS, FloatArray
 from looktwice.model.families.family import Attempt, Situation, TextInputs
 from looktwice.model.families.registry import family_named
 from looktwice.model.formats.cursor import CompiledFormat
@@ -18,9 +21,13 @@ from looktwice.model.network.patches import normalise, patchify, resize
 from looktwice.model.network.prompts import prompt_text
 from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.track_features import track_features
+from looktwice.model.network.visual_codes import VisualCodes, frame_of
 from looktwice.model.network.vocabulary import VIDEO_PAD, Vocabulary
 
 IntArray = npt.NDArray[np.int64]
+
+_EXPECTED_KEPT: Final = 64
+"""Pictures whose codes are kept: several parts of an engine ask for those of one request."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +73,18 @@ class ModelInputs:
 
 
 class InputBuilder:
-    """Builds inputs for one checkpoint. Safe to use from several threads."""
+    """Builds inputs for one checkpoint. Safe to use from several threads.
 
-    def __init__(self, vocabulary: Vocabulary, settings: VlaSettings) -> None:
+    ``visual_codes`` are those of the checkpoint, where it has any; see `expected`.
+    """
+
+    def __init__(
+        self, vocabulary: Vocabulary, settings: VlaSettings, visual_codes: VisualCodes | None = None
+    ) -> None:
         self._vocabulary = vocabulary
         self.settings = settings
+        self._visual_codes = visual_codes
+        self._codes_of = lru_cache(_EXPECTED_KEPT)(self._expected)
         self._prompts: dict[tuple[str, bool, bool], Prompt] = {}
         self._texts: dict[str, CompiledFormat] = {}
 
@@ -105,9 +119,29 @@ class InputBuilder:
         self, scene: Scene, format: str, attempt: Attempt | None = None, camera: str | None = None
     ) -> Prompt:
         """The prompt alone of what `build` gives; raises `FamilyError` and `FormatError` as it does."""
-        situation = Situation(scene.history, self.way(scene), attempt, camera)
+        situation = Situation(scene.history, self.way(scene), attempt, camera, self.expected(scene, camera))
         tracks = self.settings.with_tracks and scene.tracks is not None
         return self.prompt(format, situation, tracks=tracks)
+
+    def expected(self, scene: Scene, camera: str | None) -> tuple[int, ...] | None:
+        """The 98 codes of what a camera would see if only the ego moved; takes some ms, once for a picture.
+
+        None where no camera is named, the scene has no clip of it, or the checkpoint has no such codes.
+        """
+        shown = [clip.images[-1] for clip in scene.clips if clip.camera == camera]
+        if camera is None or not shown or self._visual_codes is None:
+            return None
+        return self._codes_of(shown[0], camera, scene.history.tobytes())
+
+    def _expected(self, picture: bytes, camera: str, history: bytes) -> tuple[int, ...] | None:
+        assert self._visual_codes is not None
+        try:
+            frame = frame_of(picture)
+        except ImageError:
+            # A picture that the tower does not look at must not decide whether the model answers.
+            return None
+        rows = np.frombuffer(history, np.float32).reshape(HISTORY_STEPS, -1)
+        return tuple(self._visual_codes.encode(expected_view(frame, camera, rows)).tolist())
 
     def way(self, scene: Scene) -> FloatArray | None:
         """The route [20, 2] that the network is given, or None."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset, Sampler
 
+from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import mirrored_camera
 from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, present_speed
@@ -32,7 +33,7 @@ from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.patches import patchify
 from looktwice.model.network.prompts import motion_text
 from looktwice.model.network.track_features import MIRRORED, without_route
-from looktwice.model.network.visual_codes import VisualCodes, frame_of
+from looktwice.model.network.visual_codes import Frame, VisualCodes, frame_of
 from looktwice.model.network.vocabulary import Vocabulary
 from looktwice.model.training.examples import Examples, example_frames
 from looktwice.model.training.own_plans import OwnPlans
@@ -46,8 +47,9 @@ Batch = dict[str, Tensor]
 _PLAIN_AN_ATTEMPT: Final = 4
 """So many plain examples take as long, and as much memory, as one with a draft and five sections on it."""
 _CHANCES: Final = ("tracks", "mirror", "blur")
-_ASKED_SHARE: Final = 0.5
-"""Of the pictures that are taught: the prompt asks for their camera. Others are of the model's own choice."""
+_ASKED_SHARE: Final = 0.8
+"""Of the pictures that are taught: the prompt asks for their camera, and shows what is expected of it. Others
+are of the model's own choice."""
 _MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
 """Of poses (x, y, z, heading)."""
 
@@ -162,6 +164,7 @@ class ResponseDataset(Dataset[Sample]):
         self._attempts = attempts
         self._own_plans = own_plans
         self._visual_codes, self._next = visual_codes, dict[tuple[int, str, bool], NextPicture]()
+        self._expected = dict[tuple[int, str, bool, bool], tuple[int, ...] | None]()
         self._examples, self._inputs, self._reflections = examples, inputs, reflections
         self._codec, self._vision = codec, vision
         self._soft = SoftCodes(codec, codec.vectors(examples.history, examples.future))
@@ -233,7 +236,8 @@ class ResponseDataset(Dataset[Sample]):
         ]
         camera = picture.camera if picture is not None and item.asked else None
         attempt = None if tried is None else tried.attempt
-        situation = Situation(history, route if item.route else None, attempt, camera)
+        expected = self._expected_codes(item, camera, history) if camera is not None else None
+        situation = Situation(history, route if item.route else None, attempt, camera, expected)
         return Sample(
             prompt=self._prompt(item, situation),
             responses=[self._target(item.task, lesson) for lesson in lessons],
@@ -251,14 +255,28 @@ class ResponseDataset(Dataset[Sample]):
         """What ``camera`` saw half a second later; its mirror image is that of the other side's camera."""
         key = (index, camera, mirror)
         if key not in self._next:
-            if self._visual_codes is None:
-                raise ValueError("pictures are to be taught, and there are no codes to write them in")
-            frame = frame_of(self._examples.next_picture(index, camera))
-            codes = self._visual_codes.encode(np.ascontiguousarray(frame[:, ::-1]) if mirror else frame)
+            frame = _frame(self._examples.next_picture(index, camera), mirror)
             self._next[key] = NextPicture(
-                mirrored_camera(camera) if mirror else camera, tuple(codes.tolist())
+                mirrored_camera(camera) if mirror else camera, self._codes_of(frame)
             )
         return self._next[key]
+
+    def _expected_codes(self, item: Item, camera: str, history: Array) -> tuple[int, ...] | None:
+        """What ``camera`` of the example, as it is or mirrored, would see then if only the ego moved."""
+        key = (item.index, camera, item.mirror, item.blur)
+        if key not in self._expected:
+            shown = self._examples.now_picture(item.index, mirrored_camera(camera) if item.mirror else camera)
+            self._expected[key] = (
+                None
+                if shown is None
+                else self._codes_of(expected_view(_frame(shown, item.mirror), camera, history))
+            )
+        return self._expected[key]
+
+    def _codes_of(self, frame: Frame) -> tuple[int, ...]:
+        if self._visual_codes is None:
+            raise ValueError("pictures are to be taught, and there are no codes to write them in")
+        return tuple(self._visual_codes.encode(frame).tolist())
 
     def _target(self, task: str, lesson: Lesson) -> Target:
         return make_target(
@@ -283,6 +301,12 @@ class ResponseDataset(Dataset[Sample]):
         return patchify(
             example_frames(self._examples, item.index, item.mirror, self._inputs), self._inputs.settings
         )
+
+
+def _frame(encoded: bytes, mirror: bool) -> Frame:
+    """A picture in the size that codes paint, or its mirror image."""
+    frame = frame_of(encoded)
+    return np.ascontiguousarray(frame[:, ::-1]) if mirror else frame
 
 
 def steady_history(speed_ms: float) -> Array:

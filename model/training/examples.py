@@ -32,7 +32,7 @@ from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.track_features import track_features
 from looktwice.model.training.dense import coarse, no_target, relative_motion
 
-CACHE_VERSION: Final = 7
+CACHE_VERSION: Final = 8
 DENSE_FAR_M: Final = 200.0
 """Ranges beyond are all the same to a dense target."""
 _NOTHING_KNOWN: Final = np.full(ROW_SIZE, np.nan, np.float32)
@@ -45,8 +45,8 @@ class Examples:
     Attributes:
         pictures: uint8, all encoded pictures one after the other, each distinct one once.
         picture_spans: int64 [N, cameras, 4, 2], first and last-plus-one byte of each picture.
-        next_spans: int64 [N, `CAMERAS`, 2], of what each camera saw half a second later; empty where
-            nothing is known.
+        now_spans, next_spans: int64 [N, `CAMERAS`, 2], of what each camera saw last, and half a second later;
+            empty where nothing is known.
         pictured: bool [N], which examples have pictures; those of drives without cameras have none.
         history: float32 [N, 16, 4].
         route: float32 [N, 20, 2]; NaN where a scene has none.
@@ -66,6 +66,7 @@ class Examples:
 
     pictures: npt.NDArray[np.uint8]
     picture_spans: npt.NDArray[np.int64]
+    now_spans: npt.NDArray[np.int64]
     next_spans: npt.NDArray[np.int64]
     pictured: npt.NDArray[np.bool_]
     history: FloatArray
@@ -89,6 +90,11 @@ class Examples:
         """One encoded picture."""
         first, last = self.picture_spans[index, camera, frame]
         return self.pictures[first:last].tobytes()
+
+    def now_picture(self, index: int, camera: str) -> bytes | None:
+        """What a camera saw last, encoded; None where the scene has no clip of it."""
+        first, last = self.now_spans[index, CAMERAS.index(camera)]
+        return self.pictures[first:last].tobytes() or None
 
     def next_cameras(self, index: int) -> tuple[str, ...]:
         """The cameras whose picture half a second later is known."""
@@ -138,6 +144,8 @@ class Examples:
             columns["picture_spans"].append(np.reshape(spans, (len(cameras), CLIP_FRAMES, 2)))
             later = {frame.camera: span(frame.image) for frame in labelled.next_frames}
             columns["pictured"].append(scene.has_pictures)
+            now = {clip.camera: span(clip.images[-1]) for clip in scene.clips if scene.has_pictures}
+            columns["now_spans"].append([now.get(camera, (0, 0)) for camera in CAMERAS])
             columns["next_spans"].append([later.get(camera, (0, 0)) for camera in CAMERAS])
             columns["history"].append(scene.history)
             columns["route"].append(
@@ -161,6 +169,7 @@ class Examples:
             columns["scene_id"].append(scene.scene_id)
         types: dict[str, Any] = {
             "picture_spans": np.int64,
+            "now_spans": np.int64,
             "next_spans": np.int64,
             "pictured": np.bool_,
             "plan_bins": np.int8,
@@ -185,7 +194,7 @@ class Examples:
         columns = {
             field.name: np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)
         }
-        for name in ("picture_spans", "next_spans"):
+        for name in ("picture_spans", "now_spans", "next_spans"):
             # Empty spans stay empty, wherever they lie.
             columns[name] = np.concatenate(
                 [getattr(part, name) + start for part, start in zip(parts, starts, strict=True)]

@@ -2,9 +2,8 @@
 
 Words, numbers and codes are drawn, and learned from by `looktwice.model.training.policy`: plans with their
 times, the branch and the codes of CF-VLA, thoughts and poses of ELF-VLA. The policy is the distribution that
-decodes: over the tokens that the format allows, at the temperature of the draws. The expert is imitated a
-    little
-beside it, against drivers who find a gap in the score.
+decodes: over the tokens that the format allows, at the temperature of the draws. Beside it the expert is
+imitated a little, against drivers who find a gap in the score.
 
 Where all draws of a scene fail, nothing says what would be better. There the network refines its best draw by
 feedback, of the built-in teacher or by rule, which knows what the expert did. The refinement joins the draws

@@ -23,7 +23,15 @@ from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.families.registry import family_named
 from looktwice.model.network.attention import MATMUL_ATTENTION
 from looktwice.model.network.card import LOG_FILE
-from looktwice.model.network.checkpoint import Loaded, create_nano, load, save, with_formats, with_sketches
+from looktwice.model.network.checkpoint import (
+    Loaded,
+    create_nano,
+    load,
+    save,
+    with_formats,
+    with_sketches,
+    with_visual_codes,
+)
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.corpus import nano_corpus, nano_phrases
 from looktwice.model.network.intent import IntentReader
@@ -152,7 +160,7 @@ def run(
     if recipe.goal == "read" and not loaded.settings.sketch_tokens:
         loaded = with_sketches(loaded, NANO_SETTINGS.sketch_tokens, seed=recipe.seed)
     if visual_codes is not None:
-        loaded = replace(loaded, visual_codes=load_visual_codes(visual_codes))
+        loaded = with_visual_codes(loaded, load_visual_codes(visual_codes))
     stages = list(loaded.card.details.get("stages", []))
     if vision_source is not None:
         vision = load(vision_source)

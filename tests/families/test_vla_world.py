@@ -16,11 +16,11 @@ import looktwice.clients.wire as wire
 from looktwice.clients.answers import PlannedDraw
 from looktwice.clients.planner import PlannerClient
 from looktwice.model.driving.cameras import CAMERA_SPECS
-from looktwice.model.driving.images import encode_png
+from looktwice.model.driving.images import decode_image, encode_png
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.next_view import moved_view
 from looktwice.model.driving.perceived import perceived_of
-from looktwice.model.driving.scene import Clip, LabelledScene, NextFrame
+from looktwice.model.driving.scene import Clip, LabelledScene, NextFrame, mirrored_camera
 from looktwice.model.driving.short_term import INERTIA
 from looktwice.model.engines.engine import Controls, Draw, PlanRequest, RequestError
 from looktwice.model.engines.requests import begin
@@ -38,7 +38,7 @@ from looktwice.model.families.vla_world.format import TIMES_S, UNSEEN
 from looktwice.model.families.vla_world.targets import WEIGHTS
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.grammar_export import to_lark
-from looktwice.model.network.checkpoint import Loaded, load, save
+from looktwice.model.network.checkpoint import Loaded, load, save, with_visual_codes
 from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes, frame_of
 from looktwice.model.network.vocabulary import END_OF_TEXT, Vocabulary
@@ -172,9 +172,15 @@ def test_what_the_camera_sees_now_saves_passes_and_changes_nothing(world: Loaded
         assert told["all"][1] < passes - 70
 
 
-def test_the_expected_picture_is_what_the_asked_camera_shows_last_moved_as_the_ego(world: Loaded) -> None:
+@pytest.fixture(scope="module")
+def painting(world: Loaded) -> Loaded:
     torch.manual_seed(0)
-    painting = replace(world, visual_codes=VisualCodes(24).eval())
+    return with_visual_codes(world, VisualCodes(24).eval())
+
+
+def test_the_expected_picture_is_what_the_asked_camera_shows_last_moved_as_the_ego(
+    world: Loaded, painting: Loaded
+) -> None:
     scene = noisy_scene(1)
     wide, _ = scene.clips
 
@@ -194,11 +200,50 @@ def test_the_expected_picture_is_what_the_asked_camera_shows_last_moved_as_the_e
     assert expected_picture(request, painting) == ()
 
 
-def test_the_camera_that_is_asked_for_stands_in_the_prompt(world: Loaded) -> None:
+def test_the_camera_that_is_asked_for_stands_in_the_prompt_with_what_it_may_see(
+    world: Loaded, painting: Loaded
+) -> None:
     scene = noisy_scene(1, route=True)
-    for camera, told in (("back", "Camera: CAM_BACK\n"), (None, "Camera: ANY\n")):
-        built = world.inputs.build(scene, "vla_world", camera=camera)
-        assert told in world.vocabulary.decode(built.prompt.ids.tolist())
+    wide = scene.clips[0].camera
+
+    def prompt(loaded: Loaded, camera: str | None) -> str:
+        built = loaded.inputs.build(scene, "vla_world", camera=camera)
+        assert len(built.prompt.ids) <= loaded.inputs.longest_prompt("vla_world")
+        return loaded.vocabulary.decode(built.prompt.ids.tolist())
+
+    for loaded, camera, told in (
+        (world, "back", "Camera: CAM_BACK\n"),
+        (world, None, "Camera: ANY\n"),
+        (world, wide, f"Camera: CAM_{wide.upper()}\n"),
+        (painting, "back", "Camera: CAM_BACK\n"),
+    ):
+        assert f"{told}If only the car moves, it sees: UNKNOWN\n" in prompt(loaded, camera)
+    expected = expected_picture(PlanRequest("a", scene, "vla_world", Controls(camera=wide)), painting)
+    assert len(expected) == PICTURE_CODES
+    assert f"it sees: <expected>{world.vocabulary.decode(expected)}</expected>\n" in prompt(painting, wide)
+
+
+def test_training_shows_what_the_asked_camera_may_see_as_the_engine_does(painting: Loaded) -> None:
+    plain = training_scene(1)
+    future, history = drive(12.0 + 0 * MIDDLES_S, 0.05)
+    random = np.random.default_rng(0)
+    ahead, left = (encode_png(random.integers(0, 256, (112, 224, 3), np.uint8)) for _ in range(2))
+    scene = replace(plain.scene, history=history, clips=(*plain.scene.clips, Clip("front_left", (left,) * 4)))
+    nexts = tuple(NextFrame(camera, ahead) for camera in ("front_left", "back"))
+    labelled = replace(plain, scene=scene, future=future, next_frames=nexts)
+    data = dataset(painting, [labelled], painting.visual_codes)
+    for camera, mirror in (("front_left", False), ("back", False), ("front_left", True)):
+        item = Item(0, "vla_world", True, camera=camera, asked=True, mirror=mirror)
+        seen = labelled
+        if mirror:
+            flipped = encode_png(np.ascontiguousarray(decode_image(left)[:, ::-1]))
+            clips = (*plain.scene.clips, Clip("front_right", (flipped,) * 4))
+            seen = mirrored_scene(replace(labelled, scene=replace(scene, clips=clips)))
+        asked = mirrored_camera(camera) if mirror else camera
+        built = painting.inputs.build(seen.scene, "vla_world", camera=asked)
+        assert data[item].prompt == built.prompt.ids.tolist(), camera
+        text = painting.vocabulary.decode(data[item].prompt)
+        assert ("it sees: <expected>" in text) == (camera == "front_left")
 
 
 def test_what_cannot_be_imagined_is_refused_by_name(world: Loaded) -> None:

@@ -345,16 +345,19 @@ def test_prompts_say_the_ego_status_in_the_papers_axes() -> None:
     assert VLA_WORLD.inputs is not None
     text = CompiledFormat(VLA_WORLD.inputs.format, VOCABULARY)
     route = np.stack([np.arange(4.0, 84.0, 4.0), np.full(20, -2.5)], 1).astype(np.float32)
-    for known, goal, camera, asked in (
-        (route, "RIGHT", None, "ANY"),
-        (route * 0, "FORWARD", "front", "CAM_FRONT"),
-        (-route, "LEFT", "back_left", "CAM_BACK_LEFT"),
-        (None, "UNKNOWN", None, "ANY"),
+    codes = tuple(range(PICTURE_CODES))
+    picture = f"<expected>{''.join(f'<|visual_{code}|>' for code in codes)}</expected>"
+    for known, goal, camera, asked, expected, shown in (
+        (route, "RIGHT", None, "ANY", None, "UNKNOWN"),
+        (route * 0, "FORWARD", "front", "CAM_FRONT", codes, picture),
+        (-route, "LEFT", "back_left", "CAM_BACK_LEFT", None, "UNKNOWN"),
+        (None, "UNKNOWN", None, "ANY", None, "UNKNOWN"),
     ):
-        told = text.render(describe(Situation(HISTORY, known, camera=camera)))
+        told = text.render(describe(Situation(HISTORY, known, camera=camera, expected=expected)))
         assert VOCABULARY.decode([token.id for token in told]) == (
             "Velocity: 12.0 m/s Heading Angular Velocity: 0.05 rad/s Acceleration: 0.0 m/s2\n"
             "Historical Trajectory: [(-0.7,-18.0), (-0.3,-12.0), (-0.1,-6.0)]\n"
             f"Mission Goal: {goal}\n"
             f"Camera: {asked}\n"
+            f"If only the car moves, it sees: {shown}\n"
         )

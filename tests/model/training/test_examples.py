@@ -107,6 +107,9 @@ def test_next_frames_are_kept_camera_by_camera() -> None:
     assert [examples.next_cameras(index) for index in range(3)] == [(), (), (FRONT_WIDE, "back_right")]
     assert examples.next_picture(2, "back_right") == b"behind"
     assert examples.next_picture(2, FRONT_WIDE) == wide
+    for camera in CAMERAS:
+        assert examples.now_picture(2, camera) == SCENES[1].scene.clip(camera).images[-1]
+    assert examples.now_picture(2, "back_right") is None
 
 
 def test_the_cache_gives_the_same_and_follows_its_file(tmp_path: Path) -> None:
