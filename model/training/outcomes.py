@@ -31,12 +31,14 @@ from looktwice.model.families.family import Attempt
 from looktwice.model.families.trajectory_codes import TRAJECTORY
 from looktwice.model.formats.replay import Decision, decisions
 from looktwice.model.network.checkpoint import Loaded
-from looktwice.model.training.batches import Item, ResponseDataset, Sample, collate
+from looktwice.model.training.batches import Sample, collate
 from looktwice.model.training.learner import ResponseLearner
 from looktwice.model.training.policy import advantages, policy_loss
 from looktwice.model.training.recipes import FeedbackWriter, OutcomeSettings
+from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.rewards import Rewards, rewards
 from looktwice.model.training.rollouts import with_draws
+from looktwice.model.training.sampler import Item
 
 _MAX_SEED = 2**31
 

@@ -40,7 +40,7 @@ from looktwice.model.network.visual_codes import load_visual_codes
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from looktwice.model.training.attempts import AttemptsOn, attempts_on
-from looktwice.model.training.batches import ResponseDataset, TaskSampler, collate
+from looktwice.model.training.batches import collate
 from looktwice.model.training.dense import DENSE_SHAPE
 from looktwice.model.training.examples import Examples, load_examples
 from looktwice.model.training.grounding import (
@@ -62,6 +62,8 @@ from looktwice.model.training.outcomes import OutcomeLearner, ScenePlaces, colla
 from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.recipes import Recipe
 from looktwice.model.training.reflections import OnExamples, reflections_on
+from looktwice.model.training.responses import ResponseDataset
+from looktwice.model.training.sampler import TaskSampler
 from looktwice.model.training.trainer import LearnerTrainer, Validate
 from looktwice.model.training.validation import open_loop
 from looktwice.model.training.vision_cache import open_vision

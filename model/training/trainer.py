@@ -16,8 +16,8 @@ from transformers import Trainer, TrainerCallback, TrainingArguments
 from looktwice.model.network.allocator import FreedMemory
 from looktwice.model.network.card import LOG_FILE
 from looktwice.model.network.vla import is_vision
-from looktwice.model.training.batches import TaskSampler
 from looktwice.model.training.recipes import Recipe
+from looktwice.model.training.sampler import TaskSampler
 
 _STATE_FILE: Final = "learner.pt"
 

@@ -35,8 +35,9 @@ from looktwice.model.formats.grammar_export import to_lark
 from looktwice.model.formats.text import parse
 from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.network.settings import VlaSettings
-from looktwice.model.training.batches import Item, ResponseDataset
 from looktwice.model.training.examples import Examples
+from looktwice.model.training.responses import ResponseDataset
+from looktwice.model.training.sampler import Item
 from looktwice.model.training.targets import make_target
 from looktwice.service.operations.metrics import Metrics
 from looktwice.service.operations.settings import Settings

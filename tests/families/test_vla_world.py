@@ -42,8 +42,9 @@ from looktwice.model.network.checkpoint import Loaded, load, save, with_visual_c
 from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes, frame_of
 from looktwice.model.network.vocabulary import END_OF_TEXT, Vocabulary
-from looktwice.model.training.batches import Item, ResponseDataset
 from looktwice.model.training.examples import Examples
+from looktwice.model.training.responses import ResponseDataset
+from looktwice.model.training.sampler import Item
 from looktwice.service.operations.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.model.driving.drives import MIDDLES_S, agent, drive, labelled_scene

@@ -17,10 +17,11 @@ from looktwice.model.families.elf_vla.targets import WEIGHTS
 from looktwice.model.families.family import JudgedAttempt
 from looktwice.model.network.checkpoint import Loaded, load, with_formats
 from looktwice.model.training.attempts import attempts_on
-from looktwice.model.training.batches import Item, ResponseDataset, TaskSampler
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.recipes import NANO
+from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.run import RunSettings, run
+from looktwice.model.training.sampler import Item, TaskSampler
 from tests.model.driving.test_thoughts import SOME
 from tests.model.training.scenes import training_scene
 

@@ -17,9 +17,11 @@ from looktwice.model.families.family import Reflection, Situation
 from looktwice.model.formats.pieces import FormatError
 from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.network.vocabulary import FUTURE_START, TRACK, VIDEO_PAD
-from looktwice.model.training.batches import Item, ResponseDataset, Sample, TaskSampler, collate
+from looktwice.model.training.batches import Sample, collate
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.learner import ResponseLearner
+from looktwice.model.training.responses import ResponseDataset
+from looktwice.model.training.sampler import Item, TaskSampler
 from tests.model.training.scenes import training_scene
 
 

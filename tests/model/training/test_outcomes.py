@@ -23,11 +23,12 @@ from looktwice.model.engines.engine import Draw, PlanRequest
 from looktwice.model.formats.replay import decisions
 from looktwice.model.network.checkpoint import load
 from looktwice.model.network.settings import NANO_SETTINGS
-from looktwice.model.training.batches import Item, collate
+from looktwice.model.training.batches import collate
 from looktwice.model.training.outcomes import OutcomeLearner
 from looktwice.model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_with
 from looktwice.model.training.rewards import RewardWeights, form_reward, goal_reward, rewards
 from looktwice.model.training.run import RunSettings, run
+from looktwice.model.training.sampler import Item
 from tests.checkpoints import write_untrained
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
 from tests.model.evaluation.fakes import draw_of

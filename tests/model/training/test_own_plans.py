@@ -11,9 +11,10 @@ from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
 from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
 from looktwice.model.network.checkpoint import Loaded, load
-from looktwice.model.training.batches import Item, ResponseDataset
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.own_plans import OwnPlans
+from looktwice.model.training.responses import ResponseDataset
+from looktwice.model.training.sampler import Item
 from looktwice.model.training.targets import Target
 from looktwice.model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene

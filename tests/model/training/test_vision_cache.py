@@ -11,9 +11,11 @@ from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
 from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
 from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.network.patches import patchify
-from looktwice.model.training.batches import Item, ResponseDataset, collate
+from looktwice.model.training.batches import collate
 from looktwice.model.training.examples import Examples, example_frames
 from looktwice.model.training.learner import ResponseLearner
+from looktwice.model.training.responses import ResponseDataset
+from looktwice.model.training.sampler import Item
 from looktwice.model.training.vision_cache import VisionCache, open_vision
 from tests.model.training.scenes import training_scene
 
