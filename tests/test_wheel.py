@@ -17,7 +17,8 @@ from tests.test_architecture import PACKAGES, ROOT
 
 DATA = (
     *("py.typed", "model/bundled/scenes.parquet", "model/bundled/looktwice-nano/model.safetensors"),
-    *("model/bundled/looktwice-nano/README.md", "service/inspector/index.html", "loadtests/page.html"),
+    *("model/bundled/looktwice-nano/README.md", "model/bundled/elf-nano/model.safetensors"),
+    *("service/inspector/index.html", "loadtests/page.html"),
 )
 
 
@@ -73,7 +74,9 @@ def modules() -> Iterator[PurePosixPath]:
 def test_there_is_one_name_and_all_modules_and_files(wheel: Path) -> None:
     found = contents(wheel)
     assert {name.parts[0] for name in found} == {"looktwice"}
-    code = {name for name in found if name.suffix == ".py" and "looktwice-nano" not in name.parts}
+    code = {
+        name for name in found if name.suffix == ".py" and not {"looktwice-nano", "elf-nano"} & {*name.parts}
+    }
     assert code == {*modules(), PurePosixPath("looktwice/__init__.py")}
     assert {PurePosixPath("looktwice", name) for name in DATA} <= found
 

@@ -1,11 +1,13 @@
-"""What comes with the package: the nano checkpoint and a few test scenes."""
+"""What comes with the package: a checkpoint of each family that was trained, and a few test scenes."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Final
 
-CHECKPOINT: Final = Path(__file__).parent / "looktwice-nano"
-"""The default checkpoint's folder."""
-SCENES: Final = Path(__file__).parent / "scenes.parquet"
+_HERE: Final = Path(__file__).parent
+CHECKPOINTS: Final = {name: _HERE / name for name in ("looktwice-nano", "elf-nano")}
+"""Their folders, by the names that commands take; the first one is the default."""
+CHECKPOINT: Final = CHECKPOINTS["looktwice-nano"]
+SCENES: Final = _HERE / "scenes.parquet"
 """Labelled test scenes for the demo (simulator seeds 600000 and up)."""

@@ -6,11 +6,11 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
-from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.bundled import CHECKPOINT, CHECKPOINTS, SCENES
 
 
 @contextmanager
@@ -26,26 +26,36 @@ def reported_errors() -> Iterator[None]:
 def _found(checkpoint: Path) -> Path:
     if checkpoint.exists():
         return checkpoint
+    if str(checkpoint) in CHECKPOINTS:
+        return CHECKPOINTS[str(checkpoint)]
     from looktwice.model.network.hub import checkpoint_folder
 
     with reported_errors():
         return checkpoint_folder(checkpoint)
 
 
+_CHECKPOINT_HELP: Final = (
+    f"Checkpoint folder, one that comes along ({', '.join(CHECKPOINTS)}), or OWNER/NAME[@REVISION] on the "
+    "Hugging Face hub."
+)
 Checkpoint = Annotated[
     Path,
     typer.Option(
         "--checkpoint",
-        help="Checkpoint folder, or OWNER/NAME[@REVISION] on the Hugging Face hub.",
+        help=_CHECKPOINT_HELP,
         show_default=str(CHECKPOINT.name),
         callback=_found,
     ),
 ]
-OptionalCheckpoint = Annotated[
+Optional_CHECKPOINT_HELP: Final = (
+    f"Checkpoint folder, one that comes along ({', '.join(CHECKPOINTS)}), or OWNER/NAME[@REVISION] on the "
+    "Hugging Face hub."
+)
+Checkpoint = Annotated[
     Path | None,
     typer.Option(
         "--checkpoint",
-        help="Checkpoint folder, or OWNER/NAME[@REVISION] on the Hugging Face hub.",
+        help=_CHECKPOINT_HELP,
         callback=lambda checkpoint: checkpoint and _found(checkpoint),
     ),
 ]
