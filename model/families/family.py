@@ -251,6 +251,7 @@ class Family:
         lesson_needs: parts of a `Lesson` that ``teach`` cannot do without; scenes whose annotations do not
             tell them are left out of training.
         title: what tables of measures call it; its name without one.
+        about: what a model of this family does, for cards: "A model that …".
         dialects: other formats of the same name, for checkpoints whose reflections are written otherwise.
         refines: whether its prompts hold an `Attempt`, which every request then has to bring.
         imagination: where it may imagine a picture.
@@ -275,6 +276,7 @@ class Family:
     teach: Callable[[Lesson], Values] | None = None
     lesson_needs: tuple[LessonPart, ...] = ()
     title: str | None = None
+    about: str = "gives a trajectory"
     dialects: Mapping[ReflectionLanguage, Format] = field(default_factory=dict)
     refines: bool = False
     imagination: Imagination | None = None

@@ -36,13 +36,14 @@ def write_card(folder: Path, settings: VlaSettings, parameters: int, details: Ma
     (folder / CARD_FILE).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
 
 
-def write_details(folder: Path, details: Mapping[str, Any]) -> None:
-    """Add to what the card tells beside the weights, and renew its revision.
+def write_about(folder: Path, settings: VlaSettings, details: Mapping[str, Any]) -> None:
+    """Renew a card's name, formats and revision, and add to what it tells beside the weights.
 
     Raises:
         CheckpointError: as `read_card` and `weights_revision` do.
     """
     card = read_card(folder)
+    card |= {"name": settings.name, "formats": list(settings.formats)}
     card["details"] |= details
     card["revision"] = weights_revision(folder)
     (folder / CARD_FILE).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")

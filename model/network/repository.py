@@ -8,11 +8,16 @@ encoders.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from looktwice.model.network.card import CheckpointError, read_card, write_details
+from looktwice.model.families.family import Family
+from looktwice.model.families.registry import family_named
+from looktwice.model.families.trajectory_codes import CODES, TRAJECTORY
+from looktwice.model.formats.pieces import Codes, walk
+from looktwice.model.network.card import CheckpointError, read_card, write_about
 from looktwice.model.network.processor import LookTwiceProcessor, processor_config
 from looktwice.model.network.prompts import chat_template
 from looktwice.model.network.settings import CONFIG_KEY, SettingsError, VlaSettings
@@ -32,18 +37,25 @@ class {name}(_{name}):
 '''
 
 
-def write_repository(folder: Path, figures: Mapping[str, str] | None = None) -> None:
+def write_repository(
+    folder: Path,
+    figures: Mapping[str, str] | None = None,
+    *,
+    name: str | None = None,
+    formats: Sequence[str] | None = None,
+) -> None:
     """Add to a checkpoint folder, or renew in it, what a model repository needs; weights stay as they are.
 
     Args:
         folder: with ``config.json``, tokenizer, weights and ``looktwice.json``.
         figures: measured values by what was measured, kept in ``looktwice.json``; None keeps what is there.
+        name: what the checkpoint is called from now on; None keeps its name.
+        formats: which of its formats it is for, the first one its default; None keeps all.
 
     Raises:
-        CheckpointError: the folder is no checkpoint.
+        CheckpointError: the folder is no checkpoint, or does not write one of ``formats``.
     """
-    write_details(folder, {} if figures is None else {"figures": dict(figures)})
-    card = read_card(folder)
+    read_card(folder)
     path = folder / "config.json"
     try:
         config: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -51,6 +63,14 @@ def write_repository(folder: Path, figures: Mapping[str, str] | None = None) -> 
         settings = VlaSettings.from_dict(extra)
     except (OSError, ValueError, KeyError, AttributeError, SettingsError) as error:
         raise CheckpointError(f"{path} is no configuration of ours: {error}") from error
+    kept = settings.formats if formats is None else tuple(formats)
+    if not kept or (unknown := set(kept) - set(settings.formats)):
+        asked = min(unknown) if kept else "no format"
+        raise CheckpointError(f"{folder} does not write {asked}: it writes {', '.join(settings.formats)}")
+    settings = replace(settings, name=name or settings.name, formats=kept)
+    config[CONFIG_KEY] |= {"name": settings.name, "formats": list(kept)}
+    write_about(folder, settings, {} if figures is None else {"figures": dict(figures)})
+    card = read_card(folder)
     config["auto_map"] = {auto: f"{_MODEL_CODE}.{LookTwiceVla.__name__}" for auto in _AUTO_MODELS}
     _write(path, json.dumps(config, indent=2, sort_keys=True))
     _write(folder / "processor_config.json", json.dumps(processor_config(settings), indent=2, sort_keys=True))
@@ -70,7 +90,7 @@ def _write(path: Path, text: str) -> None:
 
 def model_card(card: Mapping[str, Any], settings: VlaSettings) -> str:
     """``README.md`` of a checkpoint, from its ``looktwice.json`` and its settings."""
-    details = card["details"]
+    details, families = card["details"], [family_named(name) for name in settings.formats]
     inputs = ", ".join(("pictures", "ego history", *settings.inputs))
     lines = [
         "---",
@@ -82,14 +102,14 @@ def model_card(card: Mapping[str, Any], settings: VlaSettings) -> str:
         "",
         f"# {card['name']}",
         "",
-        "A model that writes a driving plan in words, may look at it twice, and gives 6.4 s of trajectory. "
+        f"A model that {families[0].about}. "
         f"It has {card['parameters'] / 1e6:.1f} million parameters; revision `{card['revision']}`.",
         "",
         "**Not for road use.** It must not drive a vehicle, nor advise whoever drives one.",
         "",
         "## Use",
         "",
-        "For research on plans that are looked at twice, and to try out planners and their interfaces.",
+        "For research on driving models that say what they do, and to try out planners and their interfaces.",
         "",
         "```python",
         "from transformers import AutoModel, AutoProcessor",
@@ -112,7 +132,7 @@ def model_card(card: Mapping[str, Any], settings: VlaSettings) -> str:
         f"| cameras | {', '.join(settings.cameras)}; {settings.image_width} x {settings.image_height} px, "
         "four pictures each, half a second apart |",
         f"| response formats | {', '.join(settings.formats)} |",
-        f"| trajectory | 64 poses at 10 Hz, six codes of {settings.codec_size} |",
+        f"| trajectory | {_trajectories(families, settings)} |",
         "",
         "## Limits",
         "",
@@ -129,6 +149,15 @@ def model_card(card: Mapping[str, Any], settings: VlaSettings) -> str:
         *_measured(details.get("figures") or {}),
     ]
     return "\n".join(lines)
+
+
+def _trajectories(families: Sequence[Family], settings: VlaSettings) -> str:
+    """Poses and times of what families give, and the codes that some write it in."""
+    told = dict.fromkeys(f"{len(each.times_s)} poses up to {each.times_s[-1]:g} s" for each in families)
+    pieces = [piece for each in families for piece in walk(each.format.body)]
+    if any(isinstance(piece, Codes) and piece.alphabet == TRAJECTORY for piece in pieces):
+        told[f"{CODES} codes of {settings.codec_size}"] = None
+    return ", ".join(told)
 
 
 def _trained(details: Mapping[str, Any]) -> Iterable[str]:

@@ -16,13 +16,18 @@ def describe(
         list[str] | None,
         typer.Option(help="WHAT=VALUE, once for each measured value; those told before are replaced."),
     ] = None,
+    name: Annotated[str | None, typer.Option(help="What the checkpoint is called from now on.")] = None,
+    format: Annotated[
+        list[str] | None,
+        typer.Option(help="A format that it is for, once for each; the first is its default. All without."),
+    ] = None,
 ) -> None:
     """Write model card, processor and chat template into a checkpoint folder; weights stay as they are."""
     with reported_errors():
         from looktwice.model.network.repository import CARD, write_repository
 
         figures = dict(map(_split, figure)) if figure else None
-        write_repository(folder, figures)
+        write_repository(folder, figures, name=name, formats=format)
         typer.echo(str(folder / CARD))
 
 

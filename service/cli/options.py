@@ -47,11 +47,7 @@ Checkpoint = Annotated[
         callback=_found,
     ),
 ]
-Optional_CHECKPOINT_HELP: Final = (
-    f"Checkpoint folder, one that comes along ({', '.join(CHECKPOINTS)}), or OWNER/NAME[@REVISION] on the "
-    "Hugging Face hub."
-)
-Checkpoint = Annotated[
+OptionalCheckpoint = Annotated[
     Path | None,
     typer.Option(
         "--checkpoint",

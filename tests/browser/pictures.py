@@ -1,8 +1,9 @@
 """`make pictures`: the README's pictures, of the bundled checkpoint, each with its name and revision inside.
 
-They show the bundled scene and the seed, of a few, whose second look helps most: it brings the trajectory
-nearer to the expert's than the first plan alone would, and the parts of the draw agree. Those of draws to
-drive by come first. Without any, the first scene.
+They show the bundled scene and the seed, of a few, whose second look helps most, in draws whose parts agree:
+the trajectory scores better by NAVSIM's rules than behind the first plan alone or, where both score the same,
+comes nearer to the expert's. None fails, and of equals one to drive by comes first. Without any, the first
+scene.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from looktwice.clients.planner import PlannerClient, RetryPolicy
 from looktwice.clients.wire import Controls
 from looktwice.model.bundled import CHECKPOINT, SCENES
 from looktwice.model.driving.facts import LANE_WIDTH_M
+from looktwice.model.driving.pdm.judging import SceneJudge
+from looktwice.model.driving.pdm.labelled import plans_of
 from looktwice.model.driving.route_frame import RouteFrame
 from looktwice.model.driving.scene import LabelledScene, Scene
 from looktwice.model.driving.scene_store import read_scenes
@@ -58,8 +61,9 @@ def stamped(source: Path, target: Path) -> None:
 
 def chosen(planner: PlannerClient, scenes: list[LabelledScene]) -> tuple[int, int, int]:
     """Which scene, which seed, and which of its draws."""
-    found: list[tuple[bool, float, int, int, int]] = []
+    found: list[tuple[float, bool, float, int, int, int]] = []
     for place, labelled in enumerate(scenes):
+        judge = SceneJudge(labelled)
         for seed in SEEDS:
             looked = planner.plan(labelled.scene, Controls(n=DRAWS, seed=seed))
             never: Sequence[PlannedDraw] = ()
@@ -70,10 +74,12 @@ def chosen(planner: PlannerClient, scenes: list[LabelledScene]) -> tuple[int, in
                     never
                     or planner.plan(labelled.scene, Controls(n=DRAWS, seed=seed, thinking="never")).draws
                 )
+                both = np.stack([never[number].trajectory, draw.trajectory])
+                before, after = judge.scores(plans_of(both), "v2.2").partial_score.round(2).tolist()
                 farther_m = ade_m(draw, labelled) - ade_m(never[number], labelled)
-                if farther_m < 0:
-                    found.append((number != looked.agreed, farther_m, place, seed, number))
-    _, _, place, seed, number = min(found, default=(True, 0.0, 0, 0, 0))
+                if after > max(before, 0) or (after == before > 0 and farther_m < 0):
+                    found.append((before - after, number != looked.agreed, farther_m, place, seed, number))
+    *_, place, seed, number = min(found, default=(0, 0, 0))
     return place, seed, number
 
 
@@ -83,12 +89,13 @@ def ade_m(draw: PlannedDraw, labelled: LabelledScene) -> float:
 
 
 def lanes_agree(draw: PlannedDraw, scene: Scene) -> bool:
-    """Whether the trajectory leaves the route's lane exactly where the plan changes lanes."""
+    """Whether the trajectory leaves the route's lane where the plan changes lanes alone, and to that side."""
     assert scene.route is not None
     left_m = RouteFrame(scene.route).places(draw.trajectory[-1:, :2])[0, 1]
     plan = draw.revised_plan or draw.plan
-    changes = plan is not None and any("Change" in action.word for action in plan.lane or ())
-    return bool(abs(left_m) > LANE_WIDTH_M / 2) == changes
+    changes = {action.word for action in plan.lane or () if "Change" in action.word} if plan else set()
+    ends = {f"{'Left' if left_m > 0 else 'Right'} Lane Change"} if abs(left_m) > LANE_WIDTH_M / 2 else set()
+    return changes == ends
 
 
 def show_inspector(url: str, scene_id: str, seed: int, draw: int, path: Path) -> None:

@@ -19,5 +19,6 @@ CF_VLA: Final = Family(
     trajectory=its.TRAJECTORY,
     read=read,
     title="meta-act",
+    about="writes a driving plan in words, may look at it twice, and gives 6.4 s of trajectory",
 )
 """plan, branch { act: trajectory | reflect: reflection, revised plan, trajectory }"""

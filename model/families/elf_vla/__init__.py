@@ -16,7 +16,7 @@ _TASK: Final = (
 """Figure 6, shortened."""
 
 
-def _family(name: str, task: str, inputs: TextInputs, title: str, *, refines: bool) -> Family:
+def _family(name: str, task: str, inputs: TextInputs, title: str, about: str, *, refines: bool) -> Family:
     return Family(
         format=its.free_text(name),
         dialects={"phrases": its.phrases(name)},
@@ -29,11 +29,19 @@ def _family(name: str, task: str, inputs: TextInputs, title: str, *, refines: bo
         teach=teach,
         lesson_needs=("thoughts",),
         title=title,
+        about=about,
         refines=refines,
     )
 
 
-ELF_VLA: Final = _family("elf_vla", _TASK, BASE, "think-answer", refines=False)
+ELF_VLA: Final = _family(
+    "elf_vla",
+    _TASK,
+    BASE,
+    "think-answer",
+    "says what matters around the car and what it does next, and gives eight poses over 4 s",
+    refines=False,
+)
 """think, answer"""
 
 ELF_VLA_REFINE: Final = _family(
@@ -41,6 +49,7 @@ ELF_VLA_REFINE: Final = _family(
     f"{_TASK} Refine the draft by the feedback on it.",
     WITH_ATTEMPT,
     "refine-answer",
+    "refines a draft of eight poses by feedback on it",
     refines=True,
 )
 """The same, with a draft and feedback on it in the prompt."""

@@ -25,6 +25,7 @@ TRAJ_ONLY: Final = Family(
     trajectory=TRAJECTORY,
     read=read,
     title="traj-only",
+    about="gives 6.4 s of trajectory at once",
     teach=teach,
 )
 """trajectory"""

@@ -29,6 +29,7 @@ VLA_WORLD: Final = Family(
     teach=teach,
     lesson_needs=("perceived",),
     title="perceive-think-answer",
+    about="says what is around, may paint what a camera will see, and gives waypoints over 3 s",
     imagination=Imagination(
         *(its.IMAGINE, its.IMAGINED, its.UNSEEN, its.CAMERA),
         cameras=its.CAMERA_OPTIONS,

@@ -20,7 +20,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from typer.testing import CliRunner
 
-from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.bundled import CHECKPOINT, CHECKPOINTS, SCENES
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.families.registry import family_named
 from looktwice.model.network.card import CheckpointError, read_card
@@ -83,11 +83,13 @@ def test_the_snippet_of_the_card_runs_with_its_folder(tmp_path: Path) -> None:
     assert re.fullmatch(r"torch\.Size\(\[1, [0-9]+, [0-9]+\]\)\n", done.stdout)
 
 
-def test_the_bundled_folder_is_what_is_written_today(tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(CHECKPOINT, tmp_path / "looktwice-nano"))
+@pytest.mark.parametrize("name", CHECKPOINTS)
+def test_the_bundled_folders_are_what_is_written_today(tmp_path: Path, name: str) -> None:
+    bundled = CHECKPOINTS[name]
+    folder = Path(shutil.copytree(bundled, tmp_path / name))
     write_repository(folder)
     for file in folder.iterdir():
-        assert file.read_bytes() == (CHECKPOINT / file.name).read_bytes(), f"{file.name}: looktwice describe"
+        assert file.read_bytes() == (bundled / file.name).read_bytes(), f"{file.name}: looktwice describe"
 
 
 @pytest.mark.parametrize("scene_tokens", [0, 16])
@@ -136,6 +138,24 @@ def test_describe_keeps_weights_and_records_figures(folder: Path) -> None:
     write_repository(folder)
     assert (folder / "README.md").read_text() == card, "figures are kept"
     assert (folder / "model.safetensors").read_bytes() == weights
+
+
+def test_describe_names_a_checkpoint_and_what_it_is_for(folder: Path) -> None:
+    weights, before = (folder / "model.safetensors").read_bytes(), read_parts(folder)
+    assert before.settings.formats == ("cf_vla", "traj_only")
+    refused = CliRunner().invoke(app, ["describe", str(folder), "--name", "b", "--format", "elf_vla"])
+    assert refused.exit_code == 2
+    assert "does not write elf_vla: it writes cf_vla, traj_only" in " ".join(refused.output.split())
+    assert read_parts(folder).card == before.card
+    told = ["describe", str(folder), "--name", "quick", "--format", "traj_only"]
+    assert CliRunner().invoke(app, told).exit_code == 0
+    after = read_parts(folder)
+    assert (after.card.name, after.settings.name) == ("quick", "quick")
+    assert after.card.formats == after.settings.formats == ("traj_only",)
+    assert (folder / "model.safetensors").read_bytes() == weights
+    card = (folder / "README.md").read_text()
+    assert "# quick\n\nA model that gives 6.4 s of trajectory at once. " in card
+    assert f"| trajectory | 64 poses up to 6.4 s, 6 codes of {after.codec.size} |" in card
 
 
 @pytest.mark.parametrize("figure", ["none", "a=", "=3", "a|b=3"])

@@ -1,0 +1,86 @@
+"""What ships of ELF-VLA, as users meet it: it thinks, answers and refines over HTTP and by command."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from looktwice.clients import wire
+from looktwice.clients.planner import PlannerClient, RetryPolicy, refine_request
+from looktwice.model.bundled import CHECKPOINTS, SCENES
+from looktwice.model.driving.pdm.judging import SceneJudge
+from looktwice.model.driving.pdm.labelled import plans_of
+from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.driving.trajectory import constant_velocity
+from looktwice.model.engines.torch.engine import TorchEngine
+from looktwice.service.operations.settings import Settings
+from tests.end_to_end.test_bundled import looktwice
+from tests.service.serving import Served, serve
+
+BUNDLED = list(read_scenes(SCENES))
+CHECKPOINT = CHECKPOINTS["elf-nano"]
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served[TorchEngine]]:
+    with serve(TorchEngine(CHECKPOINT), Settings(bundled_scenes=SCENES)) as served:
+        yield served
+
+
+@pytest.fixture(scope="module")
+def planner(served: Served[TorchEngine]) -> Iterator[PlannerClient]:
+    with PlannerClient(served.url, RetryPolicy(timeout_s=120)) as planner:
+        yield planner
+
+
+def test_it_is_small_and_tells_how_it_was_made(served: Served[TorchEngine]) -> None:
+    assert sum(file.stat().st_size for file in CHECKPOINT.rglob("*")) < 40_000_000
+    [card] = served.http.get("/v1/models").json()["models"]
+    assert (card["name"], card["refines"]) == ("elf-nano", ["elf_vla_refine"])
+    assert [stage["name"] for stage in card["details"]["stages"]][-2:] == ["elf-sft", "elf-sft"]
+
+
+def test_it_says_what_is_there_and_scores_better_than_keeping_on(planner: PlannerClient) -> None:
+    """Over the twelve scenes; `looktwice evaluate --preset failures` tells it of many."""
+    own, kept_on = list[float](), list[float]()
+    for labelled in BUNDLED:
+        answer = planner.plan(labelled.scene, wire.Controls(n=6, seed=1), format="elf_vla")
+        for draw in answer.draws:
+            assert draw.thinking is not None
+            assert draw.thinking.startswith("Road edges: ")
+            assert draw.trajectory.shape == (8, 4)
+        judge = SceneJudge(labelled)
+        agreed = answer.draws[answer.agreed].trajectory
+        steady = constant_velocity(labelled.scene.history)[4:40:5]
+        for scores, poses in ((own, agreed), (kept_on, steady)):
+            scores.append(float(judge.scores(plans_of(poses[None]), "v1.1").partial_score[0]))
+    assert np.mean(own) > np.mean(kept_on) + 0.1
+
+
+def test_refinements_of_drafts_that_fail_score_better(planner: PlannerClient) -> None:
+    before, after = list[float](), list[float]()
+    for labelled in BUNDLED:
+        scene = labelled.given(route=True, tracks=True)
+        steady = constant_velocity(labelled.scene.history)[4:40:5]
+        told = planner.refine(refine_request(scene, steady, controls=wire.ReflectControls(n=4, seed=1)))
+        scores = [
+            None if each is None else each.partial_score
+            for each in (told.before, *(draw.after for draw in told.draws))
+        ]
+        known = [score for score in scores if score is not None]
+        assert len(known) == 5
+        if known[0] < 0.8:
+            before.append(known[0])
+            after.append(sum(known[1:]) / 4)
+    assert len(before) > 2
+    assert np.mean(after) > np.mean(before) + 0.1
+
+
+def test_commands_take_it_by_its_name() -> None:
+    done = looktwice("plan", "--checkpoint", "elf-nano", "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["draws"][0]["text"].startswith("<think>Road edges: ")
