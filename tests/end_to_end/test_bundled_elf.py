@@ -57,7 +57,8 @@ def test_it_says_what_is_there_and_scores_better_than_keeping_on(planner: Planne
         steady = constant_velocity(labelled.scene.history)[4:40:5]
         for scores, poses in ((own, agreed), (kept_on, steady)):
             scores.append(float(judge.scores(plans_of(poses[None]), "v1.1").partial_score[0]))
-    assert np.mean(own) > np.mean(kept_on) + 0.1
+    # Where nothing is known of a plan, such as one far off every lane, it is worth nothing.
+    assert np.nan_to_num(own).mean() > np.nan_to_num(kept_on).mean() + 0.1
 
 
 def test_refinements_of_drafts_that_fail_score_better(planner: PlannerClient) -> None:
