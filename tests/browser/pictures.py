@@ -2,8 +2,7 @@
 
 They show the bundled scene and the seed, of a few, whose second look helps most, in draws whose parts agree:
 the trajectory scores better by NAVSIM's rules than behind the first plan alone or, where both score the same,
-comes nearer to the expert's. None fails, and of equals one to drive by comes first. Without any, the first
-scene.
+comes nearer to the expert's. None fails. Draws to drive by come first. Without any, the first scene.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ def stamped(source: Path, target: Path) -> None:
 
 def chosen(planner: PlannerClient, scenes: list[LabelledScene]) -> tuple[int, int, int]:
     """Which scene, which seed, and which of its draws."""
-    found: list[tuple[float, bool, float, int, int, int]] = []
+    found: list[tuple[bool, float, float, int, int, int]] = []
     for place, labelled in enumerate(scenes):
         judge = SceneJudge(labelled)
         for seed in SEEDS:
@@ -78,7 +77,7 @@ def chosen(planner: PlannerClient, scenes: list[LabelledScene]) -> tuple[int, in
                 before, after = judge.scores(plans_of(both), "v2.2").partial_score.round(2).tolist()
                 farther_m = ade_m(draw, labelled) - ade_m(never[number], labelled)
                 if after > max(before, 0) or (after == before > 0 and farther_m < 0):
-                    found.append((before - after, number != looked.agreed, farther_m, place, seed, number))
+                    found.append((number != looked.agreed, before - after, farther_m, place, seed, number))
     *_, place, seed, number = min(found, default=(0, 0, 0))
     return place, seed, number
 
