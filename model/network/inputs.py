@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import lru_cache
+from threading import Lock
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from cachetools import LRUCache
 
+from looktwice.model.driving.hashing import hash_of
 from looktwice.model.driving.images import ImageError, decode_image
 from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.scene import Scene
-from looktwice.model.driving.trajectory import HISTORY_STEPS, FloatArray
+from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.families.family import Attempt, Situation, TextInputs
 from looktwice.model.families.registry import family_named
 from looktwice.model.formats.cursor import CompiledFormat
@@ -27,7 +30,7 @@ from looktwice.model.network.vocabulary import VIDEO_PAD, Vocabulary
 IntArray = npt.NDArray[np.int64]
 
 _EXPECTED_KEPT: Final = 64
-"""Pictures whose codes are kept: several parts of an engine ask for those of one request."""
+"""Pictures whose codes are kept; several parts of an engine ask for those of one request."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +87,8 @@ class InputBuilder:
         self._vocabulary = vocabulary
         self.settings = settings
         self._visual_codes = visual_codes
-        self._codes_of = lru_cache(_EXPECTED_KEPT)(self._expected)
+        self._expected: LRUCache[str, tuple[int, ...] | None] = LRUCache(_EXPECTED_KEPT)
+        self._lock = Lock()
         self._prompts: dict[tuple[str, bool, bool], Prompt] = {}
         self._texts: dict[str, CompiledFormat] = {}
 
@@ -131,17 +135,18 @@ class InputBuilder:
         shown = [clip.images[-1] for clip in scene.clips if clip.camera == camera]
         if camera is None or not shown or self._visual_codes is None:
             return None
-        return self._codes_of(shown[0], camera, scene.history.tobytes())
-
-    def _expected(self, picture: bytes, camera: str, history: bytes) -> tuple[int, ...] | None:
-        assert self._visual_codes is not None
-        try:
-            frame = frame_of(picture)
-        except ImageError:
-            # A picture that the tower does not look at must not decide whether the model answers.
-            return None
-        rows = np.frombuffer(history, np.float32).reshape(HISTORY_STEPS, -1)
-        return tuple(self._visual_codes.encode(expected_view(frame, camera, rows)).tolist())
+        key = hash_of(shown[0], camera, scene.history.tobytes())
+        with self._lock:
+            if key in self._expected:
+                return self._expected[key]
+        codes: tuple[int, ...] | None = None
+        # A picture that the tower does not look at must not decide whether the model answers.
+        with suppress(ImageError):
+            view = expected_view(frame_of(shown[0]), camera, scene.history)
+            codes = tuple(self._visual_codes.encode(view).tolist())
+        with self._lock:
+            self._expected[key] = codes
+        return codes
 
     def way(self, scene: Scene) -> FloatArray | None:
         """The route [20, 2] that the network is given, or None."""

@@ -211,7 +211,9 @@ class TorchEngine:
         """Do what would hold up the decoding thread."""
         self._frames.look_at(request.scene)
         binding = binding_of(request, self._loaded.codec, self._loaded.vocabulary)
-        return binding, expected_picture(request, self._loaded) if self._settings.shortcuts.speculate else ()
+        # The prompt holds it too, whether or not it is guessed from.
+        picture = expected_picture(request, self._loaded)
+        return binding, picture if self._settings.shortcuts.speculate else ()
 
     def _take(self, decoder: Decoder, checkpoint: Path, taken: Future[None]) -> None:
         """Go on with the weights of a folder, in the decoding thread; ``taken`` says how that went."""
