@@ -11,7 +11,7 @@ from typing import Any
 
 import uvicorn
 
-PATIENCE_S = 30
+PATIENCE_S = 120
 
 
 def free_port() -> int:
