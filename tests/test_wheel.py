@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 
+from looktwice.model.bundled import CHECKPOINTS
 from tests.docs.clean_clone import copy_clone
 from tests.test_architecture import PACKAGES, ROOT
 
@@ -74,9 +75,7 @@ def modules() -> Iterator[PurePosixPath]:
 def test_there_is_one_name_and_all_modules_and_files(wheel: Path) -> None:
     found = contents(wheel)
     assert {name.parts[0] for name in found} == {"looktwice"}
-    code = {
-        name for name in found if name.suffix == ".py" and not {"looktwice-nano", "elf-nano"} & {*name.parts}
-    }
+    code = {name for name in found if name.suffix == ".py" and not CHECKPOINTS.keys() & {*name.parts}}
     assert code == {*modules(), PurePosixPath("looktwice/__init__.py")}
     assert {PurePosixPath("looktwice", name) for name in DATA} <= found
 

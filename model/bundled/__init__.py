@@ -1,4 +1,4 @@
-"""What comes with the package: a checkpoint of each family that was trained, and a few test scenes."""
+"""What comes with the package: trained checkpoints, trained codes of pictures, and a few test scenes."""
 
 from __future__ import annotations
 

@@ -36,8 +36,8 @@ def write_card(folder: Path, settings: VlaSettings, parameters: int, details: Ma
     (folder / CARD_FILE).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
 
 
-def write_about(folder: Path, settings: VlaSettings, details: Mapping[str, Any]) -> None:
-    """Renew a card's name, formats and revision, and add to what it tells beside the weights.
+def write_about(folder: Path, settings: VlaSettings, details: Mapping[str, Any]) -> dict[str, Any]:
+    """Renew a card's name, formats and revision, add to what it tells beside the weights, and return it.
 
     Raises:
         CheckpointError: as `read_card` and `weights_revision` do.
@@ -47,6 +47,7 @@ def write_about(folder: Path, settings: VlaSettings, details: Mapping[str, Any])
     card["details"] |= details
     card["revision"] = weights_revision(folder)
     (folder / CARD_FILE).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+    return card
 
 
 def read_card(folder: Path) -> dict[str, Any]:

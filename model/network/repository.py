@@ -69,8 +69,7 @@ def write_repository(
         raise CheckpointError(f"{folder} does not write {asked}: it writes {', '.join(settings.formats)}")
     settings = replace(settings, name=name or settings.name, formats=kept)
     config[CONFIG_KEY] |= {"name": settings.name, "formats": list(kept)}
-    write_about(folder, settings, {} if figures is None else {"figures": dict(figures)})
-    card = read_card(folder)
+    card = write_about(folder, settings, {} if figures is None else {"figures": dict(figures)})
     config["auto_map"] = {auto: f"{_MODEL_CODE}.{LookTwiceVla.__name__}" for auto in _AUTO_MODELS}
     _write(path, json.dumps(config, indent=2, sort_keys=True))
     _write(folder / "processor_config.json", json.dumps(processor_config(settings), indent=2, sort_keys=True))

@@ -6,7 +6,6 @@ import asyncio
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -15,7 +14,7 @@ import pytest
 from PIL import Image
 
 from looktwice.clients import wire
-from looktwice.clients.planner import PlannerClient, PlanResult, RetryPolicy
+from looktwice.clients.planner import PlannerClient, PlanResult
 from looktwice.model.bundled import CHECKPOINT, SCENES
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import split_of_seed
@@ -27,22 +26,9 @@ from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.text import parse
 from looktwice.model.network.checkpoint import read_parts
-from looktwice.service.operations.settings import Settings
-from tests.service.serving import Served, serve
+from tests.service.serving import Served
 
 BUNDLED = list(read_scenes(SCENES))
-
-
-@pytest.fixture(scope="module")
-def served() -> Iterator[Served[TorchEngine]]:
-    with serve(TorchEngine(CHECKPOINT), Settings(bundled_scenes=SCENES)) as served:
-        yield served
-
-
-@pytest.fixture(scope="module")
-def planner(served: Served[TorchEngine]) -> Iterator[PlannerClient]:
-    with PlannerClient(served.url, RetryPolicy(timeout_s=120)) as planner:
-        yield planner
 
 
 def test_bundled_scenes_are_twelve_test_scenes_that_show_every_tag() -> None:

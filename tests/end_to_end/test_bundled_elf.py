@@ -3,37 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 
 import numpy as np
-import pytest
 
 from looktwice.clients import wire
-from looktwice.clients.planner import PlannerClient, RetryPolicy, refine_request
+from looktwice.clients.planner import PlannerClient, refine_request
 from looktwice.model.bundled import CHECKPOINTS, SCENES
 from looktwice.model.driving.pdm.judging import SceneJudge
 from looktwice.model.driving.pdm.labelled import plans_of
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.trajectory import constant_velocity
 from looktwice.model.engines.torch.engine import TorchEngine
-from looktwice.service.operations.settings import Settings
 from tests.end_to_end.test_bundled import looktwice
-from tests.service.serving import Served, serve
+from tests.service.serving import Served
 
 BUNDLED = list(read_scenes(SCENES))
 CHECKPOINT = CHECKPOINTS["elf-nano"]
-
-
-@pytest.fixture(scope="module")
-def served() -> Iterator[Served[TorchEngine]]:
-    with serve(TorchEngine(CHECKPOINT), Settings(bundled_scenes=SCENES)) as served:
-        yield served
-
-
-@pytest.fixture(scope="module")
-def planner(served: Served[TorchEngine]) -> Iterator[PlannerClient]:
-    with PlannerClient(served.url, RetryPolicy(timeout_s=120)) as planner:
-        yield planner
 
 
 def test_it_is_small_and_tells_how_it_was_made(served: Served[TorchEngine]) -> None:
