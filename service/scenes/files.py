@@ -27,9 +27,9 @@ MAX_UNPACKED_BYTES: Final = 256_000_000
 """Of a dropped file: Parquet packs so well that a small file could fill the memory."""
 MAX_MEMORY_BYTES: Final = 512_000_000
 """Of data; about 150 MB are taken by libraries, and 130 MB more by 60 scenes."""
-MAX_PROCESSOR_S: Final = 20
-MAX_WAIT_S: Final = 120
-"""Who reads goes last: on a machine whose processors are taken, little work takes long."""
+MAX_CPU_S: Final = 20
+PATIENCE_S: Final = 3 * MAX_CPU_S
+"""On a machine that is busy otherwise, where who reads goes last."""
 MAX_ANSWER_BYTES: Final = 64_000_000
 _PARQUET: Final = b"PAR1"
 """How a whole file begins, and how it ends."""
@@ -61,10 +61,10 @@ async def read_scene_file(content: bytes) -> bytes:
             limit=MAX_ANSWER_BYTES,
         )
         try:
-            async with asyncio.timeout(MAX_WAIT_S):
+            async with asyncio.timeout(PATIENCE_S):
                 told, complaint = await reader.communicate()
         except TimeoutError:
-            raise _refusal(f"the file takes longer than {MAX_WAIT_S} s to read") from None
+            raise _refusal(f"the file takes longer than {PATIENCE_S} s to read") from None
         finally:
             with contextlib.suppress(ProcessLookupError):
                 reader.kill()
@@ -102,7 +102,7 @@ def _refuse_bombs(path: Path) -> None:
 
 def main(path: Path) -> int:
     """Write a file's scenes to standard output; what is wrong with it goes to standard error."""
-    for kind, limit in ((resource.RLIMIT_DATA, MAX_MEMORY_BYTES), (resource.RLIMIT_CPU, MAX_PROCESSOR_S)):
+    for kind, limit in ((resource.RLIMIT_DATA, MAX_MEMORY_BYTES), (resource.RLIMIT_CPU, MAX_CPU_S)):
         resource.setrlimit(kind, (limit, limit))
     try:
         told = wire.SceneFile(scenes=scenes_of_file(path)).model_dump_json().encode()
