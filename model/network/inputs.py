@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from threading import Lock
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -91,6 +91,10 @@ class InputBuilder:
         self._lock = Lock()
         self._prompts: dict[tuple[str, bool, bool], Prompt] = {}
         self._texts: dict[str, CompiledFormat] = {}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> InputBuilder:
+        # `transformers` copies processors with all that they hold, and a lock cannot be copied.
+        return InputBuilder(self._vocabulary, self.settings, self._visual_codes)
 
     @property
     def video_grid_thw(self) -> IntArray:
