@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 from fastapi import FastAPI
 from pydantic import BaseModel
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+from starlette.routing import Route
 
 from looktwice.clients.wire import (
     MSGPACK_MEDIA_TYPE,
@@ -100,28 +104,37 @@ def describe(app: FastAPI, *, keys: bool) -> None:
         app: with all its routes.
         keys: whether it takes none but those with a key.
     """
-    generate = app.openapi
+    generate, describing = app.openapi, threading.Lock()
 
     def openapi() -> dict[str, Any]:
-        if app.openapi_schema is None:
-            description = generate()
-            description["servers"] = [{"url": "/", "description": "where this description comes from"}]
-            description["tags"] = [{"name": name, "description": text} for name, text in _TAGS.items()]
-            for path, operations in description["paths"].items():
-                for operation in operations.values():
-                    _move_problems(operation["responses"])
-                    if path in OPEN_PATHS:
-                        del operation["responses"][str(MISDIRECTED.status)]
-                    elif keys:
-                        operation["security"] = [{"key": []}]
-            if keys:
-                scheme = {"type": "http", "scheme": "bearer"}
-                description["components"]["securitySchemes"] = {"key": scheme}
-            for unused in ("HTTPValidationError", "ValidationError"):
-                description["components"]["schemas"].pop(unused, None)
-        return generate()
+        with describing:
+            return app.openapi_schema or described()
+
+    def described() -> dict[str, Any]:
+        description = generate()
+        description["servers"] = [{"url": "/", "description": "where this description comes from"}]
+        description["tags"] = [{"name": name, "description": text} for name, text in _TAGS.items()]
+        for path, operations in description["paths"].items():
+            for operation in operations.values():
+                _move_problems(operation["responses"])
+                if path in OPEN_PATHS:
+                    del operation["responses"][str(MISDIRECTED.status)]
+                elif keys:
+                    operation["security"] = [{"key": []}]
+        if keys:
+            scheme = {"type": "http", "scheme": "bearer"}
+            description["components"]["securitySchemes"] = {"key": scheme}
+        for unused in ("HTTPValidationError", "ValidationError"):
+            description["components"]["schemas"].pop(unused, None)
+        return description
+
+    def answer(_: Request) -> JSONResponse:
+        return JSONResponse(app.openapi())
 
     app.openapi = openapi  # type: ignore[method-assign]
+    # FastAPI's own route comes later: it does half a second of work in the event loop, this one in a thread.
+    assert app.openapi_url is not None
+    app.router.routes.insert(0, Route(app.openapi_url, answer, include_in_schema=False))
 
 
 def _move_problems(responses: dict[str, dict[str, Any]]) -> None:

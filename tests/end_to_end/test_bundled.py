@@ -8,7 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pytest
 from PIL import Image
@@ -195,4 +194,4 @@ def test_a_damaged_scene_file_says_so(tmp_path: Path) -> None:
 
 
 def test_it_is_ready(served: Served[TorchEngine]) -> None:
-    assert httpx.get(f"{served.url}/readyz").status_code == 200
+    served.until_ready()

@@ -146,7 +146,7 @@ def test_probes_are_answered_when_no_more_connections_are(engine: ScriptedEngine
         try:
             served.until(lambda: httpx.get(f"{served.url}/v1/models").status_code == 503)
             assert httpx.get(f"{served.url}/healthz").status_code == 200
-            assert httpx.get(f"{served.url}/readyz?verbose").status_code == 200
+            served.until(lambda: httpx.get(f"{served.url}/readyz?verbose").status_code == 200)
         finally:
             for other in others:
                 other.close()

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
+from fastapi.openapi.utils import get_openapi
 
 from looktwice.clients.wire import PlanRequest
 from looktwice.service.app import create_app
@@ -12,12 +15,34 @@ from looktwice.service.http.auth import OPEN_PATHS
 from looktwice.service.operations.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served
+from tests.sockets import PATIENCE_S
 
 
 @pytest.fixture(scope="module")
 def description(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     none: Path = tmp_path_factory.mktemp("none") / "none.parquet"
     return create_app(ScriptedEngine(), Settings(bundled_scenes=none)).openapi()
+
+
+def test_others_are_answered_while_it_is_made(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, go_on = Event(), Event()
+
+    def slow(**options: Any) -> dict[str, Any]:
+        begun.set()
+        assert go_on.wait(PATIENCE_S)
+        return get_openapi(**options)
+
+    monkeypatch.setattr("fastapi.applications.get_openapi", slow)
+    with ThreadPoolExecutor() as pool:
+        asking = [pool.submit(served.http.get, "/openapi.json") for _ in range(2)]
+        assert begun.wait(PATIENCE_S)
+        try:
+            assert served.http.get("/healthz").status_code == 200
+        finally:
+            go_on.set()
+        first, second = (each.result().json() for each in asking)
+    assert first == second
+    assert first["servers"]
 
 
 def test_every_error_is_described_as_a_problem(description: dict[str, Any]) -> None:

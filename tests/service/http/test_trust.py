@@ -77,4 +77,4 @@ def test_an_exception_in_one_request_is_that_requests_alone(served: Served, engi
     assert served.http.post("/v1/plan", json=body()).status_code == 500
     engine.failure = None
     assert served.http.post("/v1/plan", json=body()).status_code == 200
-    assert served.http.get("/readyz").status_code == 200
+    served.until_ready()

@@ -74,7 +74,7 @@ def test_damaged_bundled_scenes_are_told(engine: ScriptedEngine, scene_file: Pat
         found = problem(served.http.get("/v1/scenes"), "scenes-unreadable")
         assert "truncated" in found.detail
         assert str(tmp_path) not in found.detail, "paths of the server are nobody's business"
-        assert served.http.get("/readyz").status_code == 200
+        served.until_ready()
 
 
 def test_bundled_scenes_are_read_once(scene_file: Path, tmp_path: Path) -> None:
