@@ -256,6 +256,8 @@ class Family:
         refines: whether its prompts hold an `Attempt`, which every request then has to bring.
         imagination: where it may imagine a picture.
         actions: what its responses say that they do, where tables can count it.
+        rewards: what a response is worth beside the expert's trajectory [64, 4] at 10 Hz, part by part from 0
+            to 1; None where drivers' scores alone tell.
 
     Raises:
         FamilyError: the format lacks a section, the branch or the imagination that is declared, times do not
@@ -281,6 +283,7 @@ class Family:
     refines: bool = False
     imagination: Imagination | None = None
     actions: Actions | None = None
+    rewards: Callable[[FloatArray, Reading], Mapping[str, float]] | None = None
 
     def __post_init__(self) -> None:
         imagination = self.imagination

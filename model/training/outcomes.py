@@ -1,9 +1,9 @@
 """Learning from what comes of the network's own draws: they are made, judged and learned from in one step.
 
 Words, numbers and codes are drawn, and learned from by `looktwice.model.training.policy`: plans with their
-times, the branch and the codes of CF-VLA, thoughts and poses of ELF-VLA. The policy is the distribution that
-decodes: over the tokens that the format allows, at the temperature of the draws. Beside it the expert is
-imitated a little, against drivers who find a gap in the score.
+times, the branch and the codes of CF-VLA, thoughts and poses of ELF-VLA, all of VLA-World. The policy is
+the distribution that decodes: over the tokens that the format allows, at the temperature of the draws. Beside
+it the expert is imitated a little, against drivers who find a gap in the score.
 
 Where all draws of a scene fail, nothing says what would be better. There the network refines its best draw by
 feedback, of the built-in teacher or by rule, which knows what the expert did. The refinement joins the draws
@@ -13,6 +13,7 @@ as an answer to the first prompt: so the first answer learns what feedback led t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -28,15 +29,16 @@ from looktwice.model.engines.engine import Controls, Draw, PlanRequest
 from looktwice.model.engines.torch.offline import draws_of
 from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.families.family import Attempt
+from looktwice.model.families.registry import family_named
 from looktwice.model.families.trajectory_codes import TRAJECTORY
 from looktwice.model.formats.replay import Decision, decisions
 from looktwice.model.network.checkpoint import Loaded
 from looktwice.model.training.batches import Sample, collate
 from looktwice.model.training.learner import ResponseLearner
-from looktwice.model.training.policy import advantages, policy_loss
+from looktwice.model.training.policy import advantages, divergence, policy_loss
 from looktwice.model.training.recipes import FeedbackWriter, OutcomeSettings
 from looktwice.model.training.responses import ResponseDataset
-from looktwice.model.training.rewards import Rewards, rewards
+from looktwice.model.training.rewards import Rewards, RewardWeights, family_rewards, rewards
 from looktwice.model.training.rollouts import with_draws
 from looktwice.model.training.sampler import Item
 
@@ -94,9 +96,11 @@ class OutcomeLearner(nn.Module):
             raise ValueError(f"{len(scenes)} scenes do not go with {len(data)} examples")
         self.learner = learner
         self._loaded, self._data, self._scenes = loaded, data, scenes
-        self._task, self._settings = task, settings
+        self._task, self._family, self._settings = task, family_named(task), settings
         self._route_share, self._tracks_share = route_share, tracks_share
         self._runner: Runner | None = None
+        # In a tuple, so that it is none of this module's own: it is neither trained nor saved.
+        self._first = (deepcopy(learner).requires_grad_(False),) if settings.divergence else ()
 
     def forward(self, places: Tensor) -> dict[str, Tensor]:
         """The loss of one step from scenes int64 [b], and its parts without gradients."""
@@ -116,10 +120,10 @@ class OutcomeLearner(nn.Module):
         worth = []
         for own, other in zip(judged, again, strict=True):
             group = own.total if other is None else np.concatenate([own.total, other.total])
-            worth.append(advantages(torch.from_numpy(group)[None])[0])
+            worth.append(advantages(torch.from_numpy(group)[None], normalised=self._settings.normalised)[0])
         samples = [self._data[item] for item in items]
         imitated = self.learner(**collate(samples))
-        policy, ratio = self._policy(samples, draws, refined, worth)
+        policy, ratio, apart = self._policy(samples, draws, refined, worth)
         loss = policy + self._settings.imitation * imitated["loss"]
         reward = np.stack([each.total for each in judged])
         parts = {name: float(np.mean([told.parts[name] for told in judged])) for name in judged[0].parts}
@@ -132,6 +136,8 @@ class OutcomeLearner(nn.Module):
             # Over all scenes of the step: those that are not refined gain nothing.
             refined_rate = float(np.mean([other is not None for other in again]))
             parts |= {"refined_rate": refined_rate, "refined_gain": float(np.mean(gains))}
+        if self._first:
+            parts["divergence"] = float(apart)
         return {
             "loss": loss,
             "policy_ratio": ratio,
@@ -150,7 +156,10 @@ class OutcomeLearner(nn.Module):
         )
 
     def _judged(self, judge: SceneJudge, draws: Sequence[Draw]) -> Rewards:
-        return rewards(judge, draws, self._settings.rewards, self._settings.version)
+        weights = self._settings.rewards
+        if isinstance(weights, RewardWeights):
+            return rewards(judge, draws, weights, self._settings.version)
+        return family_rewards(self._family, judge.labelled.future, draws, weights)
 
     def _request(self, number: int, item: Item) -> PlanRequest:
         """A scene's draws, all with random numbers of the step."""
@@ -228,8 +237,10 @@ class OutcomeLearner(nn.Module):
         draws: Sequence[Sequence[Draw]],
         refined: Sequence[Sequence[Draw]],
         worth: Sequence[Tensor],
-    ) -> tuple[Tensor, Tensor]:
-        """The policy's loss and mean ratio; scenes whose draws are worth the same cost nothing.
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The policy's loss, its mean ratio, and its divergence from where it began, which the loss counts.
+
+        Scenes whose draws are worth the same cost nothing.
 
         Args:
             samples: the prompts that were answered.
@@ -239,7 +250,7 @@ class OutcomeLearner(nn.Module):
         settings = self._settings
         told = [place for place, each in enumerate(worth) if bool(each.any())]
         if not told:
-            return torch.zeros(()), torch.ones(())
+            return torch.zeros(()), torch.ones(()), torch.zeros(())
         batch = collate([with_draws(samples[place], [*draws[place], *refined[place]]) for place in told])
         made, before = list[list[Decision]](), list[Tensor | None]()
         for place in told:
@@ -255,7 +266,14 @@ class OutcomeLearner(nn.Module):
         found = policy_loss(
             now, before, torch.cat([worth[place] for place in told]), clip=settings.clip, **gamma
         )
-        return found.loss, found.ratio
+        loss, apart = found.loss, torch.zeros(())
+        for first in self._first:
+            with torch.no_grad():
+                here = first.to(loss.device)
+                then = here.log_probabilities(batch, made, settings.temperature)
+            apart = divergence(now, then)
+            loss = loss + settings.divergence * apart
+        return loss, found.ratio, apart.detach()
 
     def _drawn(self, draw: Draw) -> list[Decision]:
         """The decisions of a draw that were drawn: all but trajectory codes of least expected error."""

@@ -28,13 +28,33 @@ class PolicyLoss(NamedTuple):
     clipped: Tensor
 
 
-def advantages(rewards: Tensor) -> Tensor:
+_LEAST_DEVIATION = 1e-4
+
+
+def advantages(rewards: Tensor, *, normalised: bool = False) -> Tensor:
     """By how much a draw is better than its scene's mean: [scenes, draws], as ``rewards``.
 
-    Not divided by their deviation, which would make much of scenes where nearly nothing differs
-    (https://arxiv.org/abs/2503.20783).
+    Args:
+        rewards: of draws.
+        normalised: divided by the scene's deviation, as GRPO has it and VLA-World (equation 7). That makes
+            much of scenes where nearly nothing differs (https://arxiv.org/abs/2503.20783).
     """
-    return rewards - rewards.mean(dim=1, keepdim=True)
+    found = rewards - rewards.mean(dim=1, keepdim=True)
+    return found / (rewards.std(dim=1, keepdim=True) + _LEAST_DEVIATION) if normalised else found
+
+
+def divergence(now: Sequence[Tensor], before: Sequence[Tensor]) -> Tensor:
+    """How far a network has gone from another one: a scalar, its gradients those of ``now``.
+
+    An estimate from draws of the divergence that GRPO holds small (its equation 4): 0 where both say the
+    same, and nowhere negative.
+
+    Args:
+        now: log-probabilities [decisions] of each response.
+        before: those that the other network gives.
+    """
+    apart = torch.cat(list(before)) - torch.cat(list(now))
+    return (apart.exp() - apart - 1).mean()
 
 
 def policy_loss(

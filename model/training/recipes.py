@@ -17,6 +17,7 @@ from looktwice.model.engines.engine import Decision
 from looktwice.model.families.cf_vla.targets import CODE_WEIGHTS, NANO_WEIGHTS, PAPER_WEIGHTS
 from looktwice.model.families.elf_vla import targets as elf_vla
 from looktwice.model.families.vla_world import targets as vla_world
+from looktwice.model.families.vla_world.rewards import REWARDS as VLA_WORLD_REWARDS
 from looktwice.model.training.rewards import RewardWeights
 from looktwice.model.training.targets import SectionWeights
 
@@ -56,8 +57,10 @@ class OutcomeSettings:
         codes: how trajectory codes are chosen; those of least expected error are no draws, and nothing is
             learned from how they turned out.
         imitation: weight of the loss on the expert's responses, beside that of the draws.
-        rewards: what counts.
+        rewards: what counts: what comes of draws, or the rewards of their family by name, with weights.
         version: whose rules score draws.
+        normalised: see `advantages`.
+        divergence: weight of the `divergence` from the network that training began with.
         refining: what becomes of scenes whose draws all fail; None for nothing.
     """
 
@@ -66,8 +69,10 @@ class OutcomeSettings:
     codes: Decision = "least_error"
     clip: float = 0.2
     imitation: float = 0.01
-    rewards: RewardWeights = field(default_factory=RewardWeights)
+    rewards: RewardWeights | Mapping[str, float] = field(default_factory=RewardWeights)
     version: Version = "v2.2"
+    normalised: bool = False
+    divergence: float = 0.0
     refining: RefineSettings | None = None
 
 
@@ -251,10 +256,22 @@ NANO: Final[Mapping[str, Recipe]] = (
                 refining=RefineSettings("elf_vla_refine"),
             ),
         ),
+        # Appendix A.1; the paper gives no weights of the rewards.
+        "world-rl": replace(
+            _OUTCOME,
+            name="world-rl",
+            batch_size=8,
+            tasks={"vla_world": 1.0},
+            weights=vla_world.WEIGHTS,
+            error_weight=0.0,
+            outcome=OutcomeSettings(
+                rewards=dict.fromkeys(VLA_WORLD_REWARDS, 1.0), normalised=True, divergence=0.01
+            ),
+        ),
     }
 )
 """The stages of the shipped checkpoint, the control of its last one, the second and third stages of
-ELF-VLA, the first two of VLA-World, and outcome training."""
+ELF-VLA, those of VLA-World, and outcome training."""
 
 
 def refining_with(recipe: Recipe, **changes: Any) -> Recipe:

@@ -21,6 +21,7 @@ from looktwice.model.driving.pdm.world import Array
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.engines.engine import Draw
+from looktwice.model.families.family import Family, Reading
 
 _FAR_M = 10.0
 _GOAL_BOUNDS_M: Final = (2.0, 4.0, 6.0, 10.0, 15.0)
@@ -52,11 +53,11 @@ class RewardWeights:
 
 
 class Rewards(NamedTuple):
-    """What `rewards` gives.
+    """What `rewards` and `family_rewards` give.
 
     Attributes:
         total: float32 [draws].
-        outcome: float32 [draws], NAVSIM's scores alone.
+        outcome: float32 [draws], NAVSIM's scores alone; the total where they are not asked.
         parts: means over the draws, for a log.
     """
 
@@ -111,6 +112,34 @@ def rewards(
         "form": float(form.mean()),
     }
     return Rewards(total.astype(np.float32), outcome.astype(np.float32), parts)
+
+
+def family_rewards(
+    family: Family, future: FloatArray, draws: Sequence[Draw], weights: Mapping[str, float]
+) -> Rewards:
+    """What draws of one scene are worth by their family's own rewards.
+
+    Args:
+        family: that has such rewards.
+        future: float32 [64, 4], the expert's trajectory at 10 Hz.
+        draws: responses to the scene, at least one.
+        weights: of the rewards by name; all of the family's.
+
+    Raises:
+        ValueError: the family has no rewards, or others than those that are weighed.
+    """
+    if family.rewards is None:
+        raise ValueError(f"{family.name} has no rewards of its own")
+    judged = [
+        family.rewards(future, Reading(draw.trajectory, foreseen=draw.foreseen, action=draw.action))
+        for draw in draws
+    ]
+    if judged[0].keys() != weights.keys():
+        raise ValueError(f"rewards are {', '.join(judged[0])}, and {', '.join(weights)} are weighed")
+    parts = {name: np.array([each[name] for each in judged]) for name in weights}
+    total = sum(weights[name] * worth for name, worth in parts.items())
+    found = np.asarray(total, np.float32)
+    return Rewards(found, found, {name: float(worth.mean()) for name, worth in parts.items()})
 
 
 def goal_reward(away_m: FloatArray) -> Array:

@@ -73,7 +73,7 @@ class TaskSampler(BatchSampler):
         next_cameras: of each example, the cameras whose picture half a second later can be taught; none
             without it.
         picture_share: share of the examples with such cameras that are taught a picture, of one of them;
-            half of these are asked for it.
+            most of these are asked for it.
         seed: of the order; every epoch has another one.
         processes: so many batches in a row are alike, as those who share the work wait for the slowest.
         reflected: int64 [r], the example that each reflection is on.

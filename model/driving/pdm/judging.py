@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -107,8 +108,12 @@ class SceneJudge:
 
     def __init__(self, labelled: LabelledScene) -> None:
         self.labelled = labelled
-        self._world, self._expert = world_of(labelled), plans_of(labelled.future)
+        self._expert = plans_of(labelled.future)
         self._others = Others(self._expert, "expert")
+
+    @cached_property
+    def _world(self) -> World:
+        return world_of(self.labelled)
 
     def scores(
         self, plans: Array, version: Version, *, previous: Array | None = None, forgive: bool = False

@@ -7,6 +7,7 @@ from looktwice.model.families.vla_world import format as its
 from looktwice.model.families.vla_world.actions import ACTIONS
 from looktwice.model.families.vla_world.inputs import INPUTS
 from looktwice.model.families.vla_world.read import perceived, pictured, predicted, read, thoughts_text
+from looktwice.model.families.vla_world.rewards import rewards
 from looktwice.model.families.vla_world.targets import teach
 
 _TASK: Final = (
@@ -41,5 +42,6 @@ VLA_WORLD: Final = Family(
         pictured=pictured,
     ),
     actions=ACTIONS,
+    rewards=rewards,
 )
 """perception, prediction, a picture or none, think, action, answer"""

@@ -3,7 +3,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from functools import cache
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,10 +14,10 @@ from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.perceived import Perceived, PerceivedAgent
 from looktwice.model.driving.scene import CAMERAS
 from looktwice.model.driving.trajectory import constant_turn_rate
-from looktwice.model.families.family import FamilyError, Lesson, NextPicture, Situation
+from looktwice.model.families.family import FamilyError, Foreseen, Lesson, NextPicture, Reading, Situation
 from looktwice.model.families.picture_codes import PICTURE, PICTURE_CODEBOOK, PICTURE_CODES
 from looktwice.model.families.vla_world import VLA_WORLD
-from looktwice.model.families.vla_world.actions import action_of
+from looktwice.model.families.vla_world.actions import action_of, counted
 from looktwice.model.families.vla_world.format import (
     CAMERA_OPTIONS,
     FORWARD_M,
@@ -36,6 +36,7 @@ from looktwice.model.families.vla_world.format import (
 )
 from looktwice.model.families.vla_world.inputs import describe
 from looktwice.model.families.vla_world.read import read
+from looktwice.model.families.vla_world.rewards import REWARDS, STEADY_SHARE, rewards
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.pieces import FormatError, Values
 from looktwice.model.formats.text import parse
@@ -361,3 +362,56 @@ def test_prompts_say_the_ego_status_in_the_papers_axes() -> None:
             f"Camera: {asked}\n"
             f"If only the car moves, it sees: {shown}\n"
         )
+
+
+def reading_of(waypoints: list[list[float]], **foreseen: Any) -> Reading:
+    """A response that does what its waypoints do, and foresees the first of them."""
+    action = action_of(waypoints)
+    x_m, y_m = waypoints[0]
+    told = {"x_m": x_m, "y_m": y_m, "direction": action.direction} | foreseen
+    seen = Foreseen(SEEN, picture=None, **told)
+    return Reading(read_trajectory(told_points(waypoints)), foreseen=seen, action=counted(action))
+
+
+EXPERT = FUTURE[4:30:5, :2].tolist()
+
+
+def test_the_experts_own_response_is_worth_everything() -> None:
+    found = rewards(FUTURE, reading_of(EXPERT))
+    assert tuple(found) == REWARDS
+    # Waypoints are rounded to 0.1 m, which is 0.4 m/s² in an acceleration.
+    assert found == pytest.approx({"prediction": 1, "action": 1, "trajectory": 1}, abs=0.1)
+
+
+def test_each_reward_is_lost_by_its_own_fault() -> None:
+    right = rewards(FUTURE, reading_of(EXPERT))
+    for worse, part in (
+        (reading_of(EXPERT, x_m=EXPERT[0][0] + 0.5), "prediction"),
+        (reading_of(EXPERT, direction="Left"), "prediction"),
+        (replace(reading_of(EXPERT), action=("left", "decelerate")), "action"),
+        (replace(reading_of(EXPERT), action=("forward", "keep")), "action"),
+    ):
+        found = rewards(FUTURE, worse)
+        assert {name for name in REWARDS if found[name] < right[name] - 1e-6} == {part}
+    assert rewards(FUTURE, replace(reading_of(EXPERT), action=("left", "keep")))["action"] == 0
+
+
+def test_a_trajectory_loses_by_distance_and_by_jerks() -> None:
+    def worth(waypoints: list[list[float]]) -> float:
+        return rewards(FUTURE, reading_of(waypoints))["trajectory"]
+
+    ever_farther = [
+        worth([[x + off * time_s, y] for (x, y), time_s in zip(EXPERT, TIMES_S, strict=True)])
+        for off in (0.0, 0.5, 1.0, 2.0, 4.0)
+    ]
+    assert ever_farther == sorted(ever_farther, reverse=True)
+    # So far off nothing is left but that it is steady.
+    assert ever_farther[-2:] == pytest.approx([STEADY_SHARE] * 2, abs=0.1)
+    jerky = [[x + (0.3 if step % 2 else -0.3), y] for step, (x, y) in enumerate(EXPERT)]
+    aside = [[x + 0.3, y] for x, y in EXPERT]
+    assert worth(jerky) < worth(aside) - 0.8 * STEADY_SHARE
+
+
+def test_responses_that_foresee_nothing_have_no_rewards() -> None:
+    with pytest.raises(FamilyError, match="nothing is foreseen"):
+        rewards(FUTURE, Reading(read_trajectory(told_points(EXPERT))))

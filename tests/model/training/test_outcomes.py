@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from looktwice.model.driving.pdm.judging import SceneJudge
+from looktwice.model.driving.perceived import Perceived
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.driving.trajectory import (
@@ -20,13 +21,21 @@ from looktwice.model.driving.trajectory import (
     constant_velocity,
 )
 from looktwice.model.engines.engine import Draw, PlanRequest
+from looktwice.model.families.family import Foreseen
+from looktwice.model.families.registry import family_named
 from looktwice.model.formats.replay import decisions
 from looktwice.model.network.checkpoint import load
 from looktwice.model.network.settings import NANO_SETTINGS
 from looktwice.model.training.batches import collate
 from looktwice.model.training.outcomes import OutcomeLearner
 from looktwice.model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_with
-from looktwice.model.training.rewards import RewardWeights, form_reward, goal_reward, rewards
+from looktwice.model.training.rewards import (
+    RewardWeights,
+    family_rewards,
+    form_reward,
+    goal_reward,
+    rewards,
+)
 from looktwice.model.training.run import RunSettings, run
 from looktwice.model.training.sampler import Item
 from tests.checkpoints import write_untrained
@@ -294,6 +303,41 @@ def test_an_answer_that_only_feedback_leads_to_becomes_likelier(
     assert max(worths) < 0.5
     gained = likely[-1] - likely[0]
     assert gained > 10 if injected else gained < 2
+
+
+def test_imagining_responses_are_learned_from_their_own_rewards(two_scenes: Path, tmp_path: Path) -> None:
+    settings = replace(NANO_SETTINGS, formats=("vla_world",))
+    source = write_untrained(tmp_path / "untrained", narrow=True, settings=settings)
+    recipe = NANO["world-rl"]
+    assert recipe.outcome is not None
+    recipe = replace(recipe, steps=2, batch_size=2, outcome=replace(recipe.outcome, draws=2))
+    # A first step that goes far: what has gone from the start shows in the second.
+    recipe = replace(recipe, warmup_steps=0, learning_rate=1e-3)
+    ratios = noted("policy_ratio", recipe, two_scenes, source, tmp_path)
+    assert ratios == pytest.approx([1.0, 1.0], abs=1e-4)
+    apart = noted("divergence", recipe, two_scenes, source, tmp_path / "again")
+    assert apart[0] == pytest.approx(0, abs=1e-6)
+    assert apart[1] > 1e-4
+    [stage] = load(tmp_path / "rl").card.details["stages"]
+    assert stage["outcome"]["rewards"] == {"prediction": 1.0, "action": 1.0, "trajectory": 1.0}
+    torch.testing.assert_close(
+        load(tmp_path / "rl").model.lm_head.weight, load(tmp_path / "again" / "rl").model.lm_head.weight
+    )
+
+
+def test_rewards_that_a_family_does_not_have_are_refused() -> None:
+    draw = draw_of(BRAKES.future)
+    with pytest.raises(ValueError, match="elf_vla has no rewards of its own"):
+        family_rewards(family_named("elf_vla"), BRAKES.future, [draw], {"action": 1.0})
+    seen = Foreseen(Perceived((), 1.0, 1.0), 5.0, 0.0, "Forward", None)
+    draw = replace(draw, trajectory=draw.trajectory[4:30:5], foreseen=seen, action=("forward", "keep"))
+    with pytest.raises(ValueError, match="rewards are prediction, action, trajectory, and action are"):
+        family_rewards(family_named("vla_world"), BRAKES.future, [draw], {"action": 1.0})
+    weights = {"prediction": 0.0, "action": 2.0, "trajectory": 0.0}
+    found = family_rewards(family_named("vla_world"), BRAKES.future, [draw], weights)
+    # It stops, and says that it keeps its speed.
+    assert found.total == pytest.approx([1.0])
+    assert found.parts["action"] == 0.5
 
 
 def test_one_scene_that_is_half_learned_is_answered_better_and_better(tmp_path: Path) -> None:

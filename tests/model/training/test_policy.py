@@ -4,12 +4,28 @@ import pytest
 import torch
 from torch import Tensor
 
-from looktwice.model.training.policy import advantages, policy_loss
+from looktwice.model.training.policy import advantages, divergence, policy_loss
 
 
 def test_draws_are_compared_with_their_own_scene() -> None:
     worth = advantages(torch.tensor([[1.0, 0.0], [5.0, 5.0]]))
     torch.testing.assert_close(worth, torch.tensor([[0.5, -0.5], [0.0, 0.0]]))
+
+
+def test_they_may_be_compared_by_their_deviation() -> None:
+    worth = advantages(torch.tensor([[1.0, 0.0, -1.0], [0.3, 0.2, 0.1], [5.0, 5.0, 5.0]]), normalised=True)
+    expected = torch.tensor([[1.0, 0.0, -1.0], [1.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
+    torch.testing.assert_close(worth, expected, atol=2e-3, rtol=0)
+
+
+def test_divergence_is_that_of_two_distributions() -> None:
+    """Over all draws of one decision, weighed by how often they are drawn, it is exact."""
+    now, before = (torch.tensor(each).softmax(-1).log() for each in ([1.0, 0.0, -1.0], [0.5, 0.5, -2.0]))
+    shares = now.exp()
+    estimates = torch.stack([divergence([now[k : k + 1]], [before[k : k + 1]]) for k in range(3)])
+    assert bool((estimates > 0).all())
+    torch.testing.assert_close((shares * estimates).sum(), (shares * (now - before)).sum())
+    assert divergence([now], [now]) == 0
 
 
 def test_before_the_first_update_the_gradient_is_that_of_the_policy() -> None:
