@@ -9,7 +9,7 @@ from looktwice.clients.wire_values import rows, wire_agents, wire_scene
 from looktwice.model.driving.outcome import Outcome
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import Scene
-from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray
+from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, at_times
 from looktwice.model.driving.view import Surroundings
 
 
@@ -66,9 +66,19 @@ def imagine_request(
     scene: Scene,
     camera: wire.Camera,
     controls: wire_imagine.ImagineControls = wire_imagine.ImagineControls(),
+    trajectory: FloatArray | None = None,
 ) -> wire_imagine.ImagineRequest:
-    """The body of POST /v1/imagine for what ``camera`` sees half a second after ``scene``."""
-    return wire_imagine.ImagineRequest(scene=wire_scene(scene), camera=camera, controls=controls)
+    """The body of POST /v1/imagine for what ``camera`` sees half a second after ``scene``.
+
+    With a ``trajectory`` [64, 4] at 10 Hz it asks what the camera would see if the ego drove that.
+    """
+    motion = None
+    if trajectory is not None:
+        x_m, y_m, _, heading_rad = at_times(trajectory, TEN_HZ_S, (wire_imagine.SECONDS_AHEAD,))[0].tolist()
+        motion = wire.Motion(x_m=x_m, y_m=y_m, heading_rad=heading_rad)
+    return wire_imagine.ImagineRequest(
+        scene=wire_scene(scene), camera=camera, motion=motion, controls=controls
+    )
 
 
 def label_request(

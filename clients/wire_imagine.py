@@ -17,6 +17,7 @@ from looktwice.clients.wire import (
     Finite,
     Length,
     ModelName,
+    Motion,
     Nearby,
     Problem,
     RequestModel,
@@ -60,6 +61,11 @@ class ImagineRequest(RequestModel):
     scene: Scene
     camera: Camera = Field(
         description="Whose picture is to be imagined; it need not be among the cameras of the scene."
+    )
+    motion: Motion | None = Field(
+        default=None,
+        description="Asks what the camera would see if the ego did this, such as a trajectory's pose in half "
+        "a second. null leaves it to the model.",
     )
     controls: ImagineControls = Field(default=ImagineControls(), description="n pictures are made.")
     stream: bool = Field(

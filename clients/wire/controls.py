@@ -14,6 +14,14 @@ Reasons = Literal["in_view", "any"]
 Imagine = Literal["auto", "never", "always"]
 
 
+class Motion(RequestModel):
+    """Where the ego will be in half a second, in its frame of now; farther than 40 m away is refused."""
+
+    x_m: Finite = Field(description="Ahead.")
+    y_m: Finite = Field(default=0.0, description="To the left.")
+    heading_rad: Finite = Field(default=0.0, description="Counter-clockwise.")
+
+
 class MetaAction(RequestModel):
     """One named intent over one time interval."""
 
@@ -105,4 +113,9 @@ class Controls(ReflectControls):
         default=None,
         description="Whose picture is imagined, where one is; it need not be in the scene. null leaves it to "
         "the model.",
+    )
+    motion: Motion | None = Field(
+        default=None,
+        description="Where the ego will be when that picture is taken; needs a camera. null leaves it to the "
+        "model.",
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple, dataclass
 from typing import Final
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy.typing as npt
 
 from looktwice.model.driving.cameras import CAMERA_SPECS, CameraSpec
 from looktwice.model.driving.short_term import INERTIA
-from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.driving.trajectory import FloatArray, GeometryError
 
 Array = npt.NDArray[np.float64]
 
@@ -19,15 +20,44 @@ FAR_M: Final = 40.0
 rendered cameras saw half a second later."""
 
 
-def expected_view(frame: npt.NDArray[np.uint8], camera: str, history: FloatArray) -> npt.NDArray[np.uint8]:
-    """What a camera would see half a second later if only the ego moved, and kept its momentum.
+MOST_M: Final = 40.0
+"""Farther nobody comes in half a second."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where the ego will be in half a second, in its frame of now.
+
+    Raises:
+        GeometryError: a number is not finite, or the ego would be farther away than `MOST_M`.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+    def __post_init__(self) -> None:
+        away_m = math.hypot(self.x_m, self.y_m)
+        if not (math.isfinite(self.heading_rad) and away_m <= MOST_M):
+            raise GeometryError(
+                f"nobody comes to ({self.x_m}, {self.y_m}) m with a heading of {self.heading_rad} in half a "
+                f"second; {MOST_M:g} m are the most"
+            )
+
+
+def expected_view(
+    frame: npt.NDArray[np.uint8], camera: str, history: FloatArray, motion: Motion | None = None
+) -> npt.NDArray[np.uint8]:
+    """What a camera would see half a second later if only the ego moved.
 
     Args:
         frame: uint8 [h, w, 3], what it sees now.
         camera: one of `CAMERAS`; taken for one that our models are trained with.
         history: float32 [16, 4] of the ego.
+        motion: of the ego; without one it keeps its momentum.
     """
-    return moved_view(frame, CAMERA_SPECS[camera], INERTIA.ego(history, None))
+    pose = INERTIA.ego(history, None) if motion is None else astuple(motion)
+    return moved_view(frame, CAMERA_SPECS[camera], pose)
 
 
 def moved_view(

@@ -13,10 +13,11 @@ from typing import Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from looktwice.model.driving.next_view import Motion
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import CAMERAS, Scene
 from looktwice.model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S, FloatArray, at_10_hz
-from looktwice.model.families.family import Attempt, Foreseen
+from looktwice.model.families.family import Attempt, Foreseen, View
 from looktwice.model.formats.pieces import Plain, Value
 from looktwice.model.network.model_card import ModelCard
 
@@ -73,6 +74,8 @@ class Controls:
         imagine: who decides whether a picture is imagined: ``auto`` leaves it to the model. For formats that
             imagine.
         camera: whose picture is imagined, if one is; the prompt asks for it. None leaves it to the model.
+        motion: where the ego will be when that picture is taken: forced, and asked for with the camera. None
+            leaves it to the model.
     """
 
     thinking: Thinking = "adaptive"
@@ -90,6 +93,7 @@ class Controls:
     logprobs: bool = False
     imagine: Imagine = "auto"
     camera: str | None = None
+    motion: Motion | None = None
 
     def __post_init__(self) -> None:
         if self.thinking not in ("adaptive", "always", "never"):
@@ -106,6 +110,8 @@ class Controls:
                 raise RequestError(f"unknown camera {self.camera!r}; known are {', '.join(CAMERAS)}")
             if self.imagine == "never":
                 raise RequestError("camera has no meaning with imagine: never")
+        if self.motion is not None and self.camera is None:
+            raise RequestError("motion has no meaning without the camera whose picture is imagined")
         if not isinstance(self.n, int) or not 1 <= self.n <= MAX_DRAWS:
             raise RequestError(f"n must be a whole number in 1..{MAX_DRAWS}, got {self.n}")
         if not 0.0 <= self.temperature <= 2.0:
@@ -126,6 +132,11 @@ class Controls:
     def imagines(self) -> bool | None:
         """Whether these controls decide for a picture; None leaves it to the draw."""
         return None if self.imagine == "auto" else self.imagine == "always"
+
+    @property
+    def view(self) -> View | None:
+        """The picture that is asked for, if one is."""
+        return None if self.camera is None else View(self.camera, self.motion)
 
     def second_look(self, think_probability: float) -> bool | None:
         """Whether these controls decide for a second look; None leaves it to the draw."""

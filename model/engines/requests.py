@@ -21,9 +21,10 @@ from looktwice.model.engines.engine import (
 )
 from looktwice.model.engines.reason_mask import ReasonMask
 from looktwice.model.engines.response import Response, SectionText
-from looktwice.model.families.family import Attempt, Branch, Family
+from looktwice.model.families.family import Attempt, Branch, Family, View
 from looktwice.model.formats.cursor import CompiledFormat, Cursor
 from looktwice.model.formats.pieces import NOTHING, FormatError
+from looktwice.model.formats.said import Said
 from looktwice.model.formats.text import parse
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.model_card import ModelCard
@@ -59,7 +60,7 @@ def begin(
     _check_attempt(request, family)
     picks = decided(request, family)
     try:
-        start = formats[request.format].start(given_plans(request, family), picks)
+        start = formats[request.format].start(given_plans(request, family), picks, said(request, family))
     except FormatError as error:
         raise RequestError(f"prefill: {error}") from error
     cameras = {clip.camera for clip in request.scene.clips}
@@ -87,6 +88,14 @@ def decided(request: PlanRequest, family: Family) -> dict[str, str]:
     if controls.imagine != "auto" or controls.camera is not None:
         raise RequestError(f"imagine: responses in format {request.format!r} imagine no pictures")
     return {}
+
+
+def said(request: PlanRequest, family: Family) -> Said:
+    """What sections say that the caller has decided; for families that imagine."""
+    imagination, motion = family.imagination, request.controls.motion
+    if imagination is None or motion is None:
+        return {}
+    return {imagination.prediction: imagination.predicting(motion.x_m, motion.y_m)}
 
 
 def given_plans(request: PlanRequest, family: Family) -> dict[str, Plan]:
@@ -131,7 +140,7 @@ def told(
 
 
 def inputs_of(
-    builder: InputBuilder, scene: Scene, format: str, attempt: Attempt | None, camera: str | None
+    builder: InputBuilder, scene: Scene, format: str, attempt: Attempt | None, view: View | None
 ) -> ModelInputs:
     """A scene as the network takes it.
 
@@ -140,7 +149,7 @@ def inputs_of(
         ImageError: a picture is damaged.
     """
     try:
-        return builder.build(scene, format, attempt, camera)
+        return builder.build(scene, format, attempt, view)
     except ImageError:
         raise
     except ValueError as error:
@@ -149,8 +158,8 @@ def inputs_of(
 
 def prompt_tokens(builder: InputBuilder, request: PlanRequest) -> int:
     """See `Engine.prompt_tokens`."""
-    camera = request.controls.camera
-    return len(builder.prompt_for(request.scene, request.format, request.attempt, camera).ids)
+    view = request.controls.view
+    return len(builder.prompt_for(request.scene, request.format, request.attempt, view).ids)
 
 
 def read(

@@ -16,6 +16,7 @@ from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryErr
 from looktwice.model.families.prompts import Attempt as Attempt
 from looktwice.model.families.prompts import Situation as Situation
 from looktwice.model.families.prompts import TextInputs as TextInputs
+from looktwice.model.families.prompts import View as View
 from looktwice.model.formats.pieces import (
     Format,
     FormatError,
@@ -63,6 +64,8 @@ class Imagination:
         perception, prediction: the sections before it, of what is around and of where the ego will be.
         perceived, predicted, pictured: what the values of these three sections say. When somebody comes near
             may be written later: a perception alone does not tell.
+        predicting: the first values of the prediction, which say where the ego will be, of metres ahead and
+            to the left.
     """
 
     name: str
@@ -76,6 +79,7 @@ class Imagination:
     perceived: Callable[[tuple[Value, ...]], Perceived]
     predicted: Callable[[tuple[Value, ...]], Predicted]
     pictured: Callable[[tuple[Value, ...]], NextPicture]
+    predicting: Callable[[float, float], tuple[Value, ...]]
 
     def picks(self, imagines: bool | None, camera: str | None) -> dict[str, str]:
         """The options that are decided, by choice.

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
+from looktwice.model.driving.next_view import Motion
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.formats.pieces import Format, Values
 
@@ -20,6 +22,18 @@ class Attempt:
 
     trajectory: FloatArray
     feedback: str
+
+
+class View(NamedTuple):
+    """A picture that is asked for: what a camera will see in half a second.
+
+    Attributes:
+        camera: one of `CAMERAS`.
+        motion: where the ego will be then; None where nobody decides that.
+    """
+
+    camera: str
+    motion: Motion | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,6 +35,7 @@ from looktwice.model.formats.pieces import (
     with_picks,
 )
 from looktwice.model.formats.plan_tracks import with_given
+from looktwice.model.formats.said import Said, with_said
 from looktwice.model.formats.starts import check, first_bytes
 from looktwice.model.formats.trie import Node, build_trie
 from looktwice.model.formats.writing import Token as Token
@@ -148,20 +149,25 @@ class CompiledFormat:
         check(self)
 
     def start(
-        self, given: Mapping[str, Plan] | None = None, picks: Mapping[str, str] | None = None
+        self,
+        given: Mapping[str, Plan] | None = None,
+        picks: Mapping[str, str] | None = None,
+        said: Said | None = None,
     ) -> Cursor:
         """A cursor at the beginning; plans of the sections in ``given`` are forced, equal neighbours joined.
 
         Args:
             given: plans by section.
             picks: by the name of a choice, the text of the option that is to be taken.
+            said: what further sections say; see `with_said`.
 
         Raises:
             FormatError: ``given`` names a section without a plan, or a plan beyond the format; or ``picks`` a
-                choice or an option that there is not.
+                choice or an option that there is not; or ``said`` what a section cannot say.
         """
         body = self.body(given)
-        return self._enter((with_picks(body, picks) if picks else body, "", None), None)
+        body = with_picks(body, picks) if picks else body
+        return self._enter((with_said(body, said) if said else body, "", None), None)
 
     def body(self, given: Mapping[str, Plan] | None = None) -> Piece:
         """The format's declaration, with the plans of the sections in ``given`` forced; see `start`."""
@@ -236,7 +242,8 @@ class CompiledFormat:
         if key not in self._codes:
             books = self.codebooks(piece.alphabet)
             self._codes[key] = np.arange(books[place % len(books)].start, books[place % len(books)].stop)
-        return self._codes[key]
+        known = self._codes[key]
+        return known if piece.only is None else known[piece.only[place]][None]
 
     def spellings(self, piece: Codes, place: int) -> Texts:
         """The texts of the codes that may stand at a place."""

@@ -218,6 +218,7 @@ class Codes:
     Attributes:
         size: codes that each codebook must have; None for any number.
         ordered: whether the codes are evenly spaced numbers, the least one first.
+        only: the codes that are written; None where any may be.
     """
 
     alphabet: str
@@ -225,6 +226,7 @@ class Codes:
     size: int | None = None
     name: str | None = None
     ordered: bool = False
+    only: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.count < 1:

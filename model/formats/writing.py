@@ -48,36 +48,62 @@ def write(compiled: CompiledFormat, body: Piece, values: Values) -> list[Token]:
     return writer.tokens
 
 
-class _Source(Protocol):
+class Source(Protocol):
+    """Values that pieces take."""
+
     def take(self, name: str | None) -> Value:
         """The next value, or that of a name."""
+        ...
+
+    @property
+    def left(self) -> bool:
+        """Whether there are values that were not taken."""
+        ...
 
 
-class _InOrder:
+class InOrder:
+    """Values that are taken one after the other."""
+
     def __init__(self, values: collections.abc.Sequence[Value], where: str) -> None:
         self._left, self._where = list(reversed(values)), where
 
     def take(self, name: str | None) -> Value:
+        """The next value; raises `FormatError` where there is none."""
         if not self._left:
             raise FormatError(f"{self._where} needs a value")
         return self._left.pop()
 
+    @property
+    def left(self) -> bool:
+        """Whether there are values that were not taken."""
+        return bool(self._left)
+
     def finish(self) -> None:
+        """Raise `FormatError` where values are left."""
         if self._left:
             raise FormatError(f"{self._where} has more values than the format writes: {self._left[-1]!r}")
 
 
-class _ByName:
+class ByName:
+    """Values that are taken by their names."""
+
     def __init__(self, values: Mapping[str, Value]) -> None:
         self._left = dict(values)
 
     def take(self, name: str | None) -> Value:
+        """The value of a name; raises `FormatError` where there is none."""
         assert name is not None, "a record's values have names"
         if name not in self._left:
             raise FormatError(f"a record needs a value {name!r}")
         return self._left.pop(name)
 
+    @property
+    def left(self) -> bool:
+        """Whether there are values that were not taken."""
+        return bool(self._left)
+
     def finish(self) -> None:
+        """Raise `FormatError` where values are left."""
         if self._left:
             raise FormatError(f"a record has values that the format does not write: {', '.join(self._left)}")
 
@@ -85,16 +111,16 @@ class _ByName:
 class _Writer:
     def __init__(self, compiled: CompiledFormat, values: Values) -> None:
         self._compiled, self._values = compiled, values
-        self._sections: dict[str, _InOrder] = {}
+        self._sections: dict[str, InOrder] = {}
         self.tokens: list[Token] = []
 
-    def section(self, name: str) -> _InOrder:
+    def section(self, name: str) -> InOrder:
         """The values of a section that are not written yet."""
         if name not in self._sections:
-            self._sections[name] = _InOrder(self._values.all(name), f"section {name!r}")
+            self._sections[name] = InOrder(self._values.all(name), f"section {name!r}")
         return self._sections[name]
 
-    def write(self, piece: Piece, section: str, source: _Source) -> None:
+    def write(self, piece: Piece, section: str, source: Source) -> None:
         match piece:
             case Literal(text):
                 self._emit(self._compiled.literal(text), section)
@@ -125,7 +151,7 @@ class _Writer:
                 record = source.take(name)
                 if not isinstance(record, Mapping):
                     raise FormatError(f"section {section!r}: {record!r} is no record")
-                fields = _ByName(record)
+                fields = ByName(record)
                 self.write(body, section, fields)
                 fields.finish()
             case Compound():
@@ -133,7 +159,7 @@ class _Writer:
                     values = piece.split(source.take(piece.name))
                 except FormatError as error:
                     raise FormatError(f"section {section!r}: {error}") from error
-                within = _InOrder(values, f"section {section!r}")
+                within = InOrder(values, f"section {section!r}")
                 self.write(self._compiled.expanded(piece), section, within)
                 within.finish()
             case Narrowing():

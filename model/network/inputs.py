@@ -17,7 +17,7 @@ from looktwice.model.driving.images import ImageError, decode_image
 from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.scene import Scene
 from looktwice.model.driving.trajectory import FloatArray
-from looktwice.model.families.family import Attempt, Situation, TextInputs
+from looktwice.model.families.family import Attempt, Situation, TextInputs, View
 from looktwice.model.families.registry import family_named
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.network.patches import normalise, patchify, resize
@@ -102,11 +102,11 @@ class InputBuilder:
         return np.array([self.settings.grid] * len(self.settings.cameras), np.int64)
 
     def build(
-        self, scene: Scene, format: str, attempt: Attempt | None = None, camera: str | None = None
+        self, scene: Scene, format: str, attempt: Attempt | None = None, view: View | None = None
     ) -> ModelInputs:
         """The inputs of ``scene`` for a response in ``format``, which may refine an attempt.
 
-        ``camera`` is the one whose next picture is asked for, if any.
+        ``view`` is the picture that is asked for, if any.
 
         Raises:
             SceneError: a camera is missing.
@@ -115,7 +115,7 @@ class InputBuilder:
             FormatError: its family says of the scene what its prompt cannot say.
         """
         return ModelInputs(
-            prompt=self.prompt_for(scene, format, attempt, camera),
+            prompt=self.prompt_for(scene, format, attempt, view),
             patches=np.concatenate([self.patches(pictures) for pictures in self.slices(scene)]),
             video_grid_thw=self.video_grid_thw,
             history=scene.history,
@@ -124,30 +124,33 @@ class InputBuilder:
         )
 
     def prompt_for(
-        self, scene: Scene, format: str, attempt: Attempt | None = None, camera: str | None = None
+        self, scene: Scene, format: str, attempt: Attempt | None = None, view: View | None = None
     ) -> Prompt:
         """The prompt alone of what `build` gives; raises `FamilyError` and `FormatError` as it does."""
-        situation = Situation(scene.history, self.way(scene), attempt, camera, self.expected(scene, camera))
+        camera = None if view is None else view.camera
+        situation = Situation(scene.history, self.way(scene), attempt, camera, self.expected(scene, view))
         tracks = self.settings.with_tracks and scene.tracks is not None
         return self.prompt(format, situation, tracks=tracks)
 
-    def expected(self, scene: Scene, camera: str | None) -> tuple[int, ...] | None:
-        """The 98 codes of what a camera would see if only the ego moved; takes some ms, once for a picture.
+    def expected(self, scene: Scene, view: View | None) -> tuple[int, ...] | None:
+        """The 98 codes of a view if only the ego moved; takes some ms, once for a picture.
 
-        None where no camera is named, the scene has no clip of it, or the checkpoint has no such codes.
+        None where no view is asked for, the scene has no clip of its camera, or the checkpoint no such codes.
         """
-        shown = [clip.images[-1] for clip in scene.clips if clip.camera == camera]
-        if camera is None or not shown or self._visual_codes is None:
+        if view is None or self._visual_codes is None:
             return None
-        key = hash_of(shown[0], camera, scene.history.tobytes())
+        shown = [clip.images[-1] for clip in scene.clips if clip.camera == view.camera]
+        if not shown:
+            return None
+        key = hash_of(shown[0], repr(view), scene.history.tobytes())
         with self._lock:
             if key in self._expected:
                 return self._expected[key]
         codes: tuple[int, ...] | None = None
         # A picture that the tower does not look at must not decide whether the model answers.
         with suppress(ImageError):
-            view = expected_view(frame_of(shown[0]), camera, scene.history)
-            codes = tuple(self._visual_codes.encode(view).tolist())
+            moved = expected_view(frame_of(shown[0]), view.camera, scene.history, view.motion)
+            codes = tuple(self._visual_codes.encode(moved).tolist())
         with self._lock:
             self._expected[key] = codes
         return codes

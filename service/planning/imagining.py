@@ -65,7 +65,12 @@ def imagining_of(asked: wire_imagine.ImagineRequest, card: ModelCard) -> Imagini
     planning = wire.PlanRequest(
         scene=asked.scene,
         controls=wire.Controls(
-            **dict(asked.controls), thinking="adaptive", imagine="always", camera=asked.camera, logprobs=True
+            **dict(asked.controls),
+            thinking="adaptive",
+            imagine="always",
+            camera=asked.camera,
+            motion=asked.motion,
+            logprobs=True,
         ),
         format=format,
         stream=asked.stream,

@@ -12,6 +12,7 @@ import numpy as np
 
 import looktwice.clients.wire as wire
 from looktwice.model.driving.images import ImageError, check_image
+from looktwice.model.driving.next_view import Motion
 from looktwice.model.driving.plan import GROUPS, TICKS, MetaAction, Plan, PlanError, parse_plan
 from looktwice.model.driving.scene import Clip, Scene, SceneError, Track
 from looktwice.model.driving.trajectory import (
@@ -98,7 +99,7 @@ def engine_request(
         _check_imagining(asked.controls, format)
         given = asked.controls.prefill
         prefill = None if given is None else plan_of(given, "/controls/prefill")
-        controls = _controls(asked.controls, prefill, asked.controls.imagine, asked.controls.camera)
+        controls = _controls(asked.controls, prefill, asked.controls)
         attempt = _attempt(asked.attempt, format)
     scene = scene_of(asked.scene, geometry)
     return PlanRequest(engine_id, scene, format, controls, attempt, live=asked.stream)
@@ -113,8 +114,8 @@ def _check_imagining(asked: wire.Controls, format: str) -> None:
     """Raise `ProblemError` where a choice to imagine is made for a format that cannot."""
     if family_named(format).imagination is not None:
         return
-    for name, value, left_open in (("imagine", asked.imagine, "auto"), ("camera", asked.camera, None)):
-        if value != left_open:
+    for name, left_open in (("imagine", "auto"), ("camera", None), ("motion", None)):
+        if getattr(asked, name) != left_open:
             raise at(CANNOT_IMAGINE, f"/controls/{name}", f"{format} imagines no pictures; leave it out")
 
 
@@ -226,9 +227,9 @@ def _limit(values: np.ndarray[tuple[int, ...], np.dtype[np.floating]], largest: 
 def _controls(
     asked: wire.ReflectControls,
     prefill: Plan | None,
-    imagine: wire.Imagine = "auto",
-    camera: wire.Camera | None = None,
+    imagining: wire.Controls = wire.Controls(),
 ) -> Controls:
+    motion = imagining.motion
     try:
         return Controls(
             thinking=asked.thinking,
@@ -244,10 +245,11 @@ def _controls(
             bind=asked.bind,
             reasons=asked.reasons,
             logprobs=asked.logprobs,
-            imagine=imagine,
-            camera=camera,
+            imagine=imagining.imagine,
+            camera=imagining.camera,
+            motion=None if motion is None else Motion(motion.x_m, motion.y_m, motion.heading_rad),
         )
-    except RequestError as error:
+    except (RequestError, GeometryError) as error:
         raise at(INVALID_CONTROLS, "/controls", str(error)) from None
 
 

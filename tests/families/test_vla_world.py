@@ -18,7 +18,7 @@ from looktwice.clients.planner import PlannerClient
 from looktwice.model.driving.cameras import CAMERA_SPECS
 from looktwice.model.driving.images import decode_image, encode_png
 from looktwice.model.driving.labeller import expert_plan
-from looktwice.model.driving.next_view import moved_view
+from looktwice.model.driving.next_view import Motion, moved_view
 from looktwice.model.driving.perceived import perceived_of
 from looktwice.model.driving.scene import Clip, LabelledScene, NextFrame, mirrored_camera
 from looktwice.model.driving.short_term import INERTIA
@@ -31,7 +31,7 @@ from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.engines.torch.shortcuts import Shortcuts
 from looktwice.model.evaluation.open_loop import evaluate_draws
 from looktwice.model.families.cf_vla import CF_VLA
-from looktwice.model.families.family import FamilyError, Lesson, NextPicture
+from looktwice.model.families.family import FamilyError, Lesson, NextPicture, View
 from looktwice.model.families.picture_codes import PICTURE_CODES
 from looktwice.model.families.vla_world import VLA_WORLD
 from looktwice.model.families.vla_world.format import TIMES_S, UNSEEN
@@ -173,6 +173,28 @@ def test_what_the_camera_sees_now_saves_passes_and_changes_nothing(world: Loaded
         assert told["all"][1] < passes - 70
 
 
+def test_a_motion_that_is_given_is_predicted_and_seen(world: Loaded, painting: Loaded) -> None:
+    motion = Motion(6.23, -1.5, -0.2)
+    for draw in planned(world, n=2, imagine="always", camera="back", motion=motion, logprobs=True, seed=1):
+        assert draw.foreseen is not None
+        assert (draw.foreseen.x_m, draw.foreseen.y_m) == pytest.approx((6.2, -1.5))
+        assert "0.5s later is (<|lateral_m_0515|>,<|forward_m_0562|>), and the direction is " in draw.text
+        # The point is no choice of the model's, the direction is.
+        assert draw.section_logprobs["prediction"] < 0
+        [lateral] = world.vocabulary.encode("<|lateral_m_0515|>")
+        assert draw.logprobs[draw.ids.index(lateral)] is None
+    scene = noisy_scene(1, route=True)
+    wide = scene.clips[0].camera
+
+    def shown(motion: Motion | None) -> tuple[int, ...]:
+        asked = PlanRequest("a", scene, "vla_world", Controls(camera=wide, motion=motion))
+        assert expected_picture(asked, painting)
+        return expected_picture(asked, painting)
+
+    x_m, y_m, heading_rad = INERTIA.ego(scene.history, None).tolist()
+    assert shown(Motion(x_m, y_m, heading_rad)) == shown(None) != shown(motion)
+
+
 @pytest.fixture(scope="module")
 def painting(world: Loaded) -> Loaded:
     torch.manual_seed(0)
@@ -208,7 +230,7 @@ def test_the_camera_that_is_asked_for_stands_in_the_prompt_with_what_it_may_see(
     wide = scene.clips[0].camera
 
     def prompt(loaded: Loaded, camera: str | None) -> str:
-        built = loaded.inputs.build(scene, "vla_world", camera=camera)
+        built = loaded.inputs.build(scene, "vla_world", view=Controls(camera=camera).view)
         assert len(built.prompt.ids) <= loaded.inputs.longest_prompt("vla_world")
         return loaded.vocabulary.decode(built.prompt.ids.tolist())
 
@@ -241,7 +263,7 @@ def test_training_shows_what_the_asked_camera_may_see_as_the_engine_does(paintin
             clips = (*plain.scene.clips, Clip("front_right", (flipped,) * 4))
             seen = mirrored_scene(replace(labelled, scene=replace(scene, clips=clips)))
         asked = mirrored_camera(camera) if mirror else camera
-        built = painting.inputs.build(seen.scene, "vla_world", camera=asked)
+        built = painting.inputs.build(seen.scene, "vla_world", view=View(asked))
         assert data[item].prompt == built.prompt.ids.tolist(), camera
         text = painting.vocabulary.decode(data[item].prompt)
         assert ("it sees: <expected>" in text) == (camera == "front_left")
@@ -252,6 +274,8 @@ def test_what_cannot_be_imagined_is_refused_by_name(world: Loaded) -> None:
         Controls(imagine="never", camera="front")
     with pytest.raises(RequestError, match="unknown camera 'rear'"):
         Controls(camera="rear")
+    with pytest.raises(RequestError, match="motion has no meaning without the camera"):
+        Controls(motion=Motion(1.0, 0.0, 0.0))
     plain = {"cf_vla": CF_VLA}
     compiled = {"cf_vla": CompiledFormat(CF_VLA.format, world.vocabulary)}
     for controls in (Controls(imagine="always"), Controls(imagine="never"), Controls(camera="front")):

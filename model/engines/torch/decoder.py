@@ -292,8 +292,8 @@ class Decoder:
         for tree in trees:
             assert tree.kv_row is not None
             asked = tree.request.plan_request
-            camera = asked.controls.camera
-            scenes.append(PromptRequest(asked.scene, asked.format, tree.kv_row, asked.attempt, camera))
+            view = asked.controls.view
+            scenes.append(PromptRequest(asked.scene, asked.format, tree.kv_row, asked.attempt, view))
         events: list[StepEvent] = []
         for tree, begun in zip(trees, self._runner.begin_prompts(scenes), strict=True):
             if tree.request.phase is Phase.ENDED:

@@ -12,7 +12,7 @@ def expected_picture(request: PlanRequest, parts: Parts) -> tuple[int, ...]:
 
     Empty where `InputBuilder.expected` has none, or the checkpoint writes no pictures.
     """
-    codes = parts.inputs.expected(request.scene, request.controls.camera)
+    codes = parts.inputs.expected(request.scene, request.controls.view)
     if codes is None or PICTURE not in parts.vocabulary.alphabets:
         return ()
     [ids] = parts.vocabulary.alphabets[PICTURE]

@@ -41,7 +41,7 @@ from looktwice.model.engines.torch.layout import (
 from looktwice.model.engines.torch.memory import IntArray, Memory, SlotMapping
 from looktwice.model.engines.torch.packed import Attention, PackedDecoder, Rotation
 from looktwice.model.engines.torch.vision import Encoded, VisionEncoder
-from looktwice.model.families.family import Attempt, Family
+from looktwice.model.families.family import Attempt, Family, View
 from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.network.checkpoint import Loaded
@@ -59,7 +59,7 @@ class PromptRequest(NamedTuple):
     format: str
     kv_row: int
     attempt: Attempt | None = None
-    camera: str | None = None
+    view: View | None = None
 
 
 @dataclass(eq=False)
@@ -345,9 +345,9 @@ class Runner:
         return self._decoder(embeddings, rotation, attention, wanted.to(device) if len(wanted) else None)
 
     def _begin_prompt(self, asked: PromptRequest, encoded: Encoded) -> Prompt:
-        loaded, (scene, format, kv_row, attempt, camera) = self.loaded, asked
+        loaded, (scene, format, kv_row, attempt, view) = self.loaded, asked
         route, tracks = loaded.inputs.way(scene), loaded.inputs.tracks(scene)
-        prompt = loaded.inputs.prompt_for(scene, format, attempt, camera)
+        prompt = loaded.inputs.prompt_for(scene, format, attempt, view)
         embedded = loaded.model.embed_prompt(prompt, encoded.tokens, scene.history, route, tracks)
         shown = format.encode() + encoded.digest
         rotation = self._decoder.rotation(embedded.position_ids)

@@ -164,8 +164,8 @@ class TransformersEngine:
         events.put_nowait(error)
 
     def _inputs(self, request: PlanRequest) -> ModelInputs:
-        scene, format, camera = request.scene, request.format, request.controls.camera
-        return inputs_of(self._loaded.inputs, scene, format, request.attempt, camera)
+        scene, format, view = request.scene, request.format, request.controls.view
+        return inputs_of(self._loaded.inputs, scene, format, request.attempt, view)
 
     def _write(self, request: PlanRequest, start: Cursor, inputs: ModelInputs, tell: _Tell) -> None:
         """Write all draws, in the thread; ends where nobody waits for them any more."""

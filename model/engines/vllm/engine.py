@@ -23,7 +23,7 @@ from looktwice.model.engines.requests import begin, inputs_of, painted, prompt_t
 from looktwice.model.engines.vllm.decoding import Decoding, VllmPrompt
 from looktwice.model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
 from looktwice.model.engines.warm_up import warm_up
-from looktwice.model.families.family import Attempt
+from looktwice.model.families.family import Attempt, View
 from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import Active, CompiledFormat, Cursor, Rest
 from looktwice.model.formats.grammar_export import to_lark
@@ -166,9 +166,9 @@ class VllmEngine:
         self._running[request.request_id] = decoding
         try:
             scene, format, attempt = request.scene, request.format, request.attempt
-            camera = request.controls.camera
+            view = request.controls.view
             prompt = await self._pictures.run(
-                lambda: self.prompt(scene, format, attempt, camera), scene.pictures
+                lambda: self.prompt(scene, format, attempt, view), scene.pictures
             )
             async with aclosing(decoding.events(prompt)) as events:
                 async for event in events:
@@ -190,15 +190,15 @@ class VllmEngine:
             decoding.fail(EngineError("the request was cancelled"))
 
     def prompt(
-        self, scene: Scene, format: str, attempt: Attempt | None = None, camera: str | None = None
+        self, scene: Scene, format: str, attempt: Attempt | None = None, view: View | None = None
     ) -> VllmPrompt:
-        """A scene as vLLM takes it, with the attempt that is to be refined, and the camera to be imagined.
+        """A scene as vLLM takes it, with the attempt that is to be refined, and the picture to be seen.
 
         Raises:
             RequestError: the scene cannot be made into inputs (a missing camera).
             ImageError: a picture is damaged.
         """
-        inputs = inputs_of(self._parts.inputs, scene, format, attempt, camera)
+        inputs = inputs_of(self._parts.inputs, scene, format, attempt, view)
         ids, items = inputs.prompt.ids, items_of(inputs, self._parts.settings)
         # vLLM wants one placeholder an item and repeats it by itself.
         repeated = np.isin(ids, [self._parts.vocabulary.id_of(PLACEHOLDERS[kind]) for kind in items])

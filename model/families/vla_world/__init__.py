@@ -6,7 +6,14 @@ from looktwice.model.families.family import Family, Imagination
 from looktwice.model.families.vla_world import format as its
 from looktwice.model.families.vla_world.actions import ACTIONS
 from looktwice.model.families.vla_world.inputs import INPUTS
-from looktwice.model.families.vla_world.read import perceived, pictured, predicted, read, thoughts_text
+from looktwice.model.families.vla_world.read import (
+    perceived,
+    pictured,
+    predicted,
+    predicting,
+    read,
+    thoughts_text,
+)
 from looktwice.model.families.vla_world.rewards import rewards
 from looktwice.model.families.vla_world.targets import teach
 
@@ -40,6 +47,7 @@ VLA_WORLD: Final = Family(
         perceived=perceived,
         predicted=predicted,
         pictured=pictured,
+        predicting=predicting,
     ),
     actions=ACTIONS,
     rewards=rewards,

@@ -41,6 +41,11 @@ def predicted(values: tuple[Value, ...]) -> Predicted:
     return Predicted(x_m, y_m, str(direction))
 
 
+def predicting(x_m: float, y_m: float) -> tuple[Value, ...]:
+    """The first value of a prediction: where the ego will be."""
+    return (its.told_points([[x_m, y_m]])[0],)
+
+
 def pictured(values: tuple[Value, ...]) -> NextPicture:
     """The picture that is imagined."""
     codes, camera = cast("tuple[tuple[int, ...], str]", values)

@@ -5,7 +5,8 @@ import numpy.typing as npt
 import pytest
 
 from looktwice.model.driving.cameras import CAMERA_SPECS
-from looktwice.model.driving.next_view import FAR_M, moved_view
+from looktwice.model.driving.next_view import FAR_M, Motion, expected_view, moved_view
+from looktwice.model.driving.trajectory import GeometryError
 
 FRONT = CAMERA_SPECS["front"]
 
@@ -23,6 +24,24 @@ def spot(frame: npt.NDArray[np.uint8]) -> tuple[float, float]:
     """Column and row of the middle of what is white."""
     rows, columns = np.nonzero(frame[..., 0])
     return float(columns.mean()), float(rows.mean())
+
+
+def test_a_motion_takes_the_place_of_momentum() -> None:
+    frame = np.random.default_rng(0).integers(0, 256, (112, 224, 3), np.uint8)
+    history = np.zeros((16, 4), np.float32)
+    history[:, 0] = np.arange(-15, 1)
+    moved = expected_view(frame, "front", history, Motion(2.0, 0.5, 0.1))
+    np.testing.assert_array_equal(moved, moved_view(frame, FRONT, np.array([2.0, 0.5, 0.1])))
+    np.testing.assert_array_equal(expected_view(frame, "front", history, Motion(0.0, 0.0, 0.0)), frame)
+    assert (expected_view(frame, "front", history) != moved).any()
+
+
+@pytest.mark.parametrize(
+    "pose", [(40.1, 0.0, 0.0), (-30.0, 30.0, 0.0), (np.nan, 0.0, 0.0), (1.0, 0.0, np.inf)]
+)
+def test_a_motion_that_nobody_makes_is_refused(pose: tuple[float, float, float]) -> None:
+    with pytest.raises(GeometryError, match="in half a second; 40 m are the most"):
+        Motion(*pose)
 
 
 @pytest.mark.parametrize("camera", ["front", "front_left", "back_right", "back"])

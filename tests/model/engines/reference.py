@@ -10,7 +10,7 @@ import numpy.typing as npt
 from torch import Tensor, nn
 
 from looktwice.model.engines.engine import Draw, PlanRequest
-from looktwice.model.engines.requests import decided, given_plans, read
+from looktwice.model.engines.requests import decided, given_plans, read, said
 from looktwice.model.engines.sampling import probabilities
 from looktwice.model.engines.transformers.decoding import Decoding
 from looktwice.model.families.family import Family
@@ -71,9 +71,9 @@ def reference(
 
 def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> tuple[Draw, Shares]:
     controls, decoding = request.controls, Decoding(loaded)
-    inputs = loaded.inputs.build(request.scene, request.format, request.attempt, controls.camera)
+    inputs = loaded.inputs.build(request.scene, request.format, request.attempt, controls.view)
     compiled = CompiledFormat(family.format, loaded.vocabulary)
-    start = compiled.start(given_plans(request, family), decided(request, family))
+    start = compiled.start(given_plans(request, family), decided(request, family), said(request, family))
     asked = decoding.begin(request, family, start, inputs)
     shares: Shares = {}
     for position, step in enumerate(decoding.write(asked, index)):

@@ -13,6 +13,7 @@ from looktwice.model.families.traj_only import TRAJ_ONLY
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.pieces import Format, FormatError, Value, Values
 from looktwice.model.formats.plan_tracks import MAX_SEGMENTS
+from looktwice.model.formats.said import Said
 from looktwice.model.formats.text import parse
 from tests.model.formats.strategies import VOCABULARY, branching_formats, cf_vla_values, plans
 from tests.model.formats.test_laws import walk
@@ -184,6 +185,31 @@ def test_choices_can_be_made_beforehand(values: Values, picked: str) -> None:
 def test_only_options_that_there_are_can_be_picked(picks: dict[str, str], message: str) -> None:
     with pytest.raises(FormatError, match=message):
         COMPILED.start(picks=picks)
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"mood": ("glad",)}, "section 'mood' has more values than the format writes: 'glad'"),
+        ({"trajectory": ((0,) * 6,)}, "section 'trajectory' has more values"),
+        ({"branch": ("Sure,",)}, "'Sure,' is none of Action:, Thinking:"),
+        ({"thinking": ("Too fast.",)}, "section 'thinking' has more values"),
+        ({"plan": ("Keep Lane",)}, "a plan is needed, not 'Keep Lane'"),
+    ],
+)
+def test_only_what_a_section_can_say_is_decided(said: Said, message: str) -> None:
+    with pytest.raises(FormatError, match=message):
+        COMPILED.start(said=said)
+
+
+def test_codes_may_be_decided() -> None:
+    compiled = CompiledFormat(TRAJ_ONLY.format, VOCABULARY)
+    values = Values({"trajectory": ((3, 1, 4, 1, 5, 9),)})
+    forced, cursor = compiled.start(said=values.by_section).forced()
+    assert cursor.done
+    assert forced == compiled.render(values)
+    with pytest.raises(FormatError, match=r"6 codes are needed, not \(1, 2\)"):
+        compiled.start(said={"trajectory": ((1, 2),)})
 
 
 @given(cf_vla_values())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from looktwice.model.formats.cursor import CompiledFormat, Cursor, Token
@@ -48,6 +48,27 @@ def test_what_is_rendered_can_be_written_by_the_cursor(data: st.DataObject, comp
         assert token.id in cursor.allowed().ids
         assert token.section == cursor.section
         cursor = cursor.advance(token.id)
+    assert cursor.done
+
+
+@given(st.data(), compiled_formats())
+def test_what_is_decided_is_forced_and_the_rest_is_not(data: st.DataObject, compiled: CompiledFormat) -> None:
+    values = data.draw(values_of(compiled))
+    section = data.draw(st.sampled_from([*values, "nowhere"]))
+    count = data.draw(st.integers(0, len(values.all(section))))
+    try:
+        cursor = compiled.start(said={section: values.all(section)[:count]})
+    except FormatError:
+        # Behind a choice, and in words, nothing can be decided.
+        assume(False)
+    plain = compiled.start()
+    for token in compiled.render(values):
+        allowed, before = cursor.allowed().ids, plain.allowed().ids
+        assert token.id in allowed
+        assert set(allowed) <= set(before)
+        if token.section == section and count == len(values.all(section)):
+            assert len(allowed) == 1
+        cursor, plain = cursor.advance(token.id), plain.advance(token.id)
     assert cursor.done
 
 

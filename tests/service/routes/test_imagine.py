@@ -243,6 +243,26 @@ def test_unknown_cameras_are_refused_by_name(served: Served[TorchEngine]) -> Non
     problem(served.http.post(PATH, json=asked(controls={"n": 65})), "invalid-controls")
 
 
+def test_a_motion_is_predicted_and_one_that_nobody_makes_is_refused(served: Served[TorchEngine]) -> None:
+    future = np.zeros((64, 4), np.float32)
+    future[:, 0], future[:, 1], future[:, 3] = np.arange(1, 65), 0.1 * np.arange(1, 65), 0.02
+    controls = ImagineControls(n=2, seed=1)
+    request = imagine_request(scene(), "back", controls, trajectory=future)
+    assert request.motion is not None
+    assert tuple(request.motion.model_dump().values()) == pytest.approx((5.0, 0.5, 0.02))
+    told = imagined(served, request.model_dump())
+    assert [(each.prediction.x_m, each.prediction.y_m) for each in told.pictures] == [(5.0, 0.5)] * 2
+    free = imagined(served, imagine_request(scene(), "back", controls).model_dump())
+    assert free.pictures != told.pictures
+    far = problem(served.http.post(PATH, json=asked(motion={"x_m": 41.0})), "invalid-controls")
+    assert "nobody comes to (41.0, 0.0) m" in far.errors[0].detail
+    endless = problem(served.http.post(PATH, json=asked(motion={"y_m": 1.0})), "invalid-request")
+    assert endless.errors[0].pointer == "/motion/x_m"
+    alone = body() | {"format": "vla_world", "controls": {"motion": {"x_m": 1.0}}}
+    told_of = problem(served.http.post("/v1/plan", json=alone), "invalid-controls")
+    assert "without the camera" in told_of.errors[0].detail
+
+
 def test_models_that_cannot_imagine_or_paint_are_named() -> None:
     engine = ScriptedEngine()
     with serve(engine, Settings()) as served:

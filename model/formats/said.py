@@ -1,0 +1,80 @@
+"""Formats in which sections say what was decided beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TypeAlias
+
+from looktwice.model.formats.pieces import (
+    Choice,
+    Codes,
+    Compound,
+    FormatError,
+    Literal,
+    Maybe,
+    Piece,
+    Record,
+    Section,
+    Sequence,
+    Shorthand,
+    Value,
+)
+from looktwice.model.formats.writing import ByName, InOrder, Source
+
+Said: TypeAlias = Mapping[str, tuple[Value, ...]]
+"""By section its first values, in order; those behind them are left open."""
+
+
+def with_said(body: Piece, said: Said) -> Piece:
+    """``body`` with the first values of sections decided: nothing else can be written there.
+
+    Raises:
+        FormatError: a section cannot say this, or is written only behind a choice that is not decided.
+    """
+    sources = {name: InOrder(values, f"section {name!r}") for name, values in said.items()}
+    found = _decided(body, sources.get(""), sources)
+    for source in sources.values():
+        source.finish()
+    return found
+
+
+def _decided(piece: Piece, values: Source | None, sources: Mapping[str, Source]) -> Piece:
+    """``piece`` as it writes the values that it takes, and as it is where there are none left."""
+    match piece:
+        case Section(name, body):
+            return Section(name, _decided(body, sources.get(name), sources))
+        case Sequence(parts):
+            return Sequence(tuple(_decided(part, values, sources) for part in parts))
+        case Literal():
+            return piece
+        case _ if values is None or not values.left:
+            return piece
+        case Choice(options, name):
+            text = values.take(name)
+            for option in options:
+                if option.text == text:
+                    return Sequence((Literal(option.text), _decided(option.then, values, sources)))
+            raise FormatError(f"{text!r} is none of {', '.join(option.text for option in options)}")
+        case Maybe(inner, name):
+            return _decided(inner, values, sources) if values.take(name) else Literal("")
+        case Codes():
+            codes = values.take(piece.name)
+            if not isinstance(codes, tuple) or len(codes) != piece.count:
+                raise FormatError(f"{piece.count} codes are needed, not {codes!r}")
+            return replace(piece, only=tuple(code for code in codes if isinstance(code, int)))
+        case Record(body, name):
+            record = values.take(name)
+            if not isinstance(record, Mapping):
+                raise FormatError(f"{record!r} is no record")
+            fields = ByName(record)
+            decided = _decided(body, fields, sources)
+            fields.finish()
+            return decided
+        case Compound():
+            within = InOrder(piece.split(values.take(piece.name)), "a value")
+            return _decided(piece.expand(), within, sources)
+        case Shorthand():
+            return _decided(piece.expand(), values, sources)
+        case _:
+            raise FormatError(f"what a {type(piece).__name__} says cannot be decided")
