@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from looktwice.model.driving.images import ImageError
 from looktwice.model.driving.plan import Plan
@@ -36,16 +36,22 @@ if TYPE_CHECKING:
     from looktwice.model.network.visual_codes import Frame, VisualCodes
 
 
+PictureCodes: TypeAlias = tuple[int, ...] | None
+"""Those of a picture that is expected, or None."""
+
+
 def begin(
     request: PlanRequest,
     card: ModelCard,
     families: Mapping[str, Family],
     formats: Mapping[str, CompiledFormat],
+    expected: PictureCodes = None,
 ) -> Cursor:
     """The cursor at which the response to a request begins.
 
     Args:
         families, formats: of the checkpoint, by name.
+        expected: see `InputBuilder.expected`.
 
     Raises:
         RequestError: it can never be served: an unknown format, a missing camera, a prefill that the format
@@ -60,7 +66,9 @@ def begin(
     _check_attempt(request, family)
     picks = decided(request, family)
     try:
-        start = formats[request.format].start(given_plans(request, family), picks, said(request, family))
+        start = formats[request.format].start(
+            given_plans(request, family), picks, said(request, family, expected)
+        )
     except FormatError as error:
         raise RequestError(f"prefill: {error}") from error
     cameras = {clip.camera for clip in request.scene.clips}
@@ -90,12 +98,11 @@ def decided(request: PlanRequest, family: Family) -> dict[str, str]:
     return {}
 
 
-def said(request: PlanRequest, family: Family) -> Said:
-    """What sections say that the caller has decided; for families that imagine."""
-    imagination, motion = family.imagination, request.controls.motion
-    if imagination is None or motion is None:
+def said(request: PlanRequest, family: Family, expected: PictureCodes) -> Said:
+    """What sections say that is decided beforehand; for families that imagine."""
+    if family.imagination is None or request.controls.imagine == "never":
         return {}
-    return {imagination.prediction: imagination.predicting(motion.x_m, motion.y_m)}
+    return family.imagination.said(expected, request.controls.motion)
 
 
 def given_plans(request: PlanRequest, family: Family) -> dict[str, Plan]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
+from looktwice.model.driving.next_view import Motion
 from looktwice.model.driving.perceived import Perceived
 from looktwice.model.driving.phrases import ReflectionLanguage
 from looktwice.model.driving.plan import Plan
@@ -30,6 +31,7 @@ from looktwice.model.formats.pieces import (
     walk,
     with_picks,
 )
+from looktwice.model.formats.said import Decided, Said
 
 
 class FamilyError(ValueError):
@@ -66,6 +68,7 @@ class Imagination:
             may be written later: a perception alone does not tell.
         predicting: the first values of the prediction, which say where the ego will be, of metres ahead and
             to the left.
+        expecting: the first values of the picture, which say what is expected of it, of 98 codes or None.
     """
 
     name: str
@@ -80,6 +83,17 @@ class Imagination:
     predicted: Callable[[tuple[Value, ...]], Predicted]
     pictured: Callable[[tuple[Value, ...]], NextPicture]
     predicting: Callable[[float, float], tuple[Value, ...]]
+    expecting: Callable[[tuple[int, ...] | None], tuple[Decided, ...]]
+
+    def said(self, expected: tuple[int, ...] | None, motion: Motion | None = None) -> Said:
+        """What is decided beforehand.
+
+        Args:
+            expected: 98 codes of what the camera would see if only the ego moved; None where that is unknown.
+            motion: where the ego will be; None where the model says that.
+        """
+        found = {self.section: self.expecting(expected)}
+        return found if motion is None else found | {self.prediction: self.predicting(motion.x_m, motion.y_m)}
 
     def picks(self, imagines: bool | None, camera: str | None) -> dict[str, str]:
         """The options that are decided, by choice.
@@ -221,6 +235,7 @@ class Lesson:
         thoughts: that lead to what the expert does; None where the scene's annotations do not tell.
         perceived: what there is to perceive; None where they do not tell.
         next_picture: None where there is none.
+        expected: 98 codes of what its camera would see if only the ego moved; None where that is not known.
         attempt: to be refined, for families that do.
     """
 
@@ -231,6 +246,7 @@ class Lesson:
     thoughts: Thoughts | None = None
     perceived: Perceived | None = None
     next_picture: NextPicture | None = None
+    expected: tuple[int, ...] | None = None
     attempt: JudgedAttempt | None = None
 
 

@@ -45,14 +45,12 @@ class Situation:
         route: float32 [20, 2]; None where the prompt has none.
         attempt: given exactly to families that refine one.
         camera: whose next picture is to be imagined, one of `CAMERAS`; None where nobody asks for one.
-        expected: 98 codes of what that camera would see if only the ego moved; None where that is not known.
     """
 
     history: FloatArray
     route: FloatArray | None = None
     attempt: Attempt | None = None
     camera: str | None = None
-    expected: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -242,8 +242,8 @@ class CompiledFormat:
         if key not in self._codes:
             books = self.codebooks(piece.alphabet)
             self._codes[key] = np.arange(books[place % len(books)].start, books[place % len(books)].stop)
-        known = self._codes[key]
-        return known if piece.only is None else known[piece.only[place]][None]
+        known, only = self._codes[key], None if piece.only is None else piece.only[place]
+        return known if only is None else known[only : only + 1]
 
     def spellings(self, piece: Codes, place: int) -> Texts:
         """The texts of the codes that may stand at a place."""
@@ -429,8 +429,11 @@ class Cursor:
 
     @property
     def codes_written(self) -> int | None:
-        """Before a code: how many of its piece are written; None elsewhere."""
-        return self.active.place if isinstance(self.active, AtCode) else None
+        """Before a code: how many of its piece are written, decided ones left out; None elsewhere."""
+        if not isinstance(self.active, AtCode):
+            return None
+        only, place = self.active.piece.only, self.active.place
+        return place if only is None else only[:place].count(None)
 
     @property
     def stop_characters(self) -> int:

@@ -218,7 +218,7 @@ class Codes:
     Attributes:
         size: codes that each codebook must have; None for any number.
         ordered: whether the codes are evenly spaced numbers, the least one first.
-        only: the codes that are written; None where any may be.
+        only: for each place the code that is written there, None where any may be; None for anywhere.
     """
 
     alphabet: str
@@ -226,7 +226,7 @@ class Codes:
     size: int | None = None
     name: str | None = None
     ordered: bool = False
-    only: tuple[int, ...] | None = None
+    only: tuple[int | None, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.count < 1:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 from looktwice.model.formats.pieces import (
     Choice,
@@ -19,10 +20,13 @@ from looktwice.model.formats.pieces import (
     Sequence,
     Shorthand,
     Value,
+    walk,
 )
 from looktwice.model.formats.writing import ByName, InOrder, Source
 
-Said: TypeAlias = Mapping[str, tuple[Value, ...]]
+Decided: TypeAlias = "Value | tuple[int | None, ...]"
+"""A value; of codes, some places may be left open."""
+Said: TypeAlias = Mapping[str, tuple[Decided, ...]]
 """By section its first values, in order; those behind them are left open."""
 
 
@@ -30,9 +34,15 @@ def with_said(body: Piece, said: Said) -> Piece:
     """``body`` with the first values of sections decided: nothing else can be written there.
 
     Raises:
-        FormatError: a section cannot say this, or is written only behind a choice that is not decided.
+        FormatError: there is no such section, or it stands in several places, or it cannot say this.
     """
-    sources = {name: InOrder(values, f"section {name!r}") for name, values in said.items()}
+    places = Counter(piece.name for piece in walk(body) if isinstance(piece, Section))
+    for name in said:
+        if places[name] > 1:
+            raise FormatError(f"section {name!r} stands in {places[name]} places")
+    # Codes that are left open are looked at nowhere but in `_decided`.
+    values = cast("Mapping[str, tuple[Value, ...]]", said)
+    sources = {name: InOrder(each, f"section {name!r}") for name, each in values.items()}
     found = _decided(body, sources.get(""), sources)
     for source in sources.values():
         source.finish()
@@ -48,6 +58,11 @@ def _decided(piece: Piece, values: Source | None, sources: Mapping[str, Source])
             return Sequence(tuple(_decided(part, values, sources) for part in parts))
         case Literal():
             return piece
+        case Choice(options) if values is None or not values.left:
+            then = (replace(each, then=_decided(each.then, values, sources)) for each in options)
+            return replace(piece, options=tuple(then))
+        case Maybe(inner, name) if values is None or not values.left:
+            return Maybe(_decided(inner, values, sources), name)
         case _ if values is None or not values.left:
             return piece
         case Choice(options, name):
@@ -62,7 +77,7 @@ def _decided(piece: Piece, values: Source | None, sources: Mapping[str, Source])
             codes = values.take(piece.name)
             if not isinstance(codes, tuple) or len(codes) != piece.count:
                 raise FormatError(f"{piece.count} codes are needed, not {codes!r}")
-            return replace(piece, only=tuple(code for code in codes if isinstance(code, int)))
+            return replace(piece, only=cast("tuple[int | None, ...]", codes))
         case Record(body, name):
             record = values.take(name)
             if not isinstance(record, Mapping):

@@ -128,7 +128,7 @@ class InputBuilder:
     ) -> Prompt:
         """The prompt alone of what `build` gives; raises `FamilyError` and `FormatError` as it does."""
         camera = None if view is None else view.camera
-        situation = Situation(scene.history, self.way(scene), attempt, camera, self.expected(scene, view))
+        situation = Situation(scene.history, self.way(scene), attempt, camera)
         tracks = self.settings.with_tracks and scene.tracks is not None
         return self.prompt(format, situation, tracks=tracks)
 

@@ -156,14 +156,19 @@ class ResponseDataset(Dataset[Sample]):
             reflections.append(Reflection(own, "", judged=False))
         tried = None if item.attempt is None else self._attempts[item.attempt]
         soft = [self._soft.draw(vector, self.random) for _ in reflections]
-        lessons = [
-            Lesson(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived, picture, tried)
-            for drawn, reflection in zip(soft, reflections, strict=True)
-        ]
         camera = picture.camera if picture is not None and item.asked else None
         attempt = None if tried is None else tried.attempt
         expected = self._expected_codes(item, camera, history) if camera is not None else None
-        situation = Situation(history, route if item.route else None, attempt, camera, expected)
+        lessons = [
+            Lesson(
+                *(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived),
+                next_picture=picture,
+                expected=expected,
+                attempt=tried,
+            )
+            for drawn, reflection in zip(soft, reflections, strict=True)
+        ]
+        situation = Situation(history, route if item.route else None, attempt, camera)
         return Sample(
             prompt=self._prompt(item, situation),
             responses=[self._target(item.task, lesson) for lesson in lessons],

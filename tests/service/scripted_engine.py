@@ -38,6 +38,7 @@ from looktwice.model.engines.engine import (
     TextWritten,
 )
 from looktwice.model.families.family import Foreseen, NextPicture
+from looktwice.model.families.picture_codes import beside
 from looktwice.model.formats.pieces import Value
 from looktwice.model.network.card import read_card
 from looktwice.model.network.model_card import ModelCard
@@ -237,7 +238,7 @@ def _imagining(index: int, foreseen: Foreseen) -> Iterator[Event]:
     for count in range(7, 98, 7):
         yield CodesWritten(index, "visual", count)
     camera = f"CAM_{foreseen.picture.camera.upper()}"
-    yield SectionFinished(index, "visual", "", (foreseen.picture.codes, camera))
+    yield SectionFinished(index, "visual", "", (beside(None, foreseen.picture.codes), camera))
 
 
 def _draft(request: PlanRequest, draw: Draw) -> Draw:

@@ -29,7 +29,6 @@ from looktwice.model.engines.requests import begin, read
 from looktwice.model.engines.torch.batch import Batch, Feed
 from looktwice.model.engines.torch.deadlines import LatencyModel, drafts_of
 from looktwice.model.engines.torch.drafter import Drafter
-from looktwice.model.engines.torch.expected_picture import expected_picture
 from looktwice.model.engines.torch.integrity import check
 from looktwice.model.engines.torch.request import Phase, Request, Tree
 from looktwice.model.engines.torch.rows import Row
@@ -120,7 +119,6 @@ class Decoder:
         plan_request: PlanRequest,
         submitted_s: float | None = None,
         binding: Binding | None = None,
-        picture: tuple[int, ...] | None = None,
     ) -> None:
         """Queue a request.
 
@@ -128,7 +126,6 @@ class Decoder:
             plan_request: what is asked.
             submitted_s: when, on the decoder's clock, its deadline counts from; now if it is not given.
             binding: of the request, see `binding_of`; made here if it is not given.
-            picture: likewise, see `expected_picture`.
 
         Raises:
             RequestError: it can never be served: unknown format, too many draws, a missing camera, a
@@ -137,13 +134,12 @@ class Decoder:
         if plan_request.request_id in self._scheduler:
             raise RequestError(f"request id {plan_request.request_id} is in use")
         loaded = self._runner.loaded
-        origin = begin(plan_request, loaded.card, self._runner.families, self._runner.formats)
+        expected = loaded.inputs.expected(plan_request.scene, plan_request.controls.view)
+        origin = begin(plan_request, loaded.card, self._runner.families, self._runner.formats, expected)
         arrived_s = self._clock() if submitted_s is None else submitted_s
         family = self._runner.families[plan_request.format]
         request = Request(plan_request, family, origin, arrived_s, self._least_error)
         request.binding = binding or binding_of(plan_request, loaded.codec, loaded.vocabulary)
-        if self._shortcuts.speculate:
-            request.picture = expected_picture(plan_request, loaded) if picture is None else picture
         request.draws_a_tree = self._scheduler.draws_a_tree(request)
         request.plant(share=self._shortcuts.shared_rows)
         if not self._scheduler.fits(request):

@@ -5,7 +5,7 @@ There are four sources, asked in this order:
 
 1. the last response to the same pictures, while the row agrees with it (`_Responses`);
 2. the first plan, while a revised plan repeats it;
-3. within a picture that is imagined: what its camera sees now, moved as the ego;
+3. within a picture that is imagined: the code that is expected there, which stands before it;
 4. what followed the same last tokens in any response (`_Ngrams`).
 """
 
@@ -83,7 +83,7 @@ class Drafter:
                 token = repeated[position]
             elif position < len(copied):
                 token = copied[position]
-            elif position < most and (expected := _code_expected(row, cursor)) is not None:
+            elif position < most and (expected := _code_expected(row, cursor, context)) is not None:
                 share *= self._codes_kept / self._codes
                 token = expected if share > least else None
             elif position < most and (len(ids) <= _MAX_OPTIONS or cursor.stop_id is not None):
@@ -110,7 +110,8 @@ class Drafter:
 
     def observe(self, row: Row, options: int, chosen: Sequence[tuple[int, tuple[int, ...]]]) -> None:
         """Draws of a row are about to write ``chosen`` tokens, each out of so many options."""
-        if (expected := _code_expected(row, row.cursor)) is not None:
+        before = [token.id for token in row.tokens[-1:]]
+        if (expected := _code_expected(row, row.cursor, before)) is not None:
             self._codes += sum(len(draws) for _, draws in chosen)
             self._codes_kept += sum(len(draws) for token, draws in chosen if token == expected)
         if options <= _MAX_OPTIONS or row.cursor.stop_id is not None:
@@ -129,12 +130,12 @@ class Drafter:
         return last[written:] if same else ()
 
 
-def _code_expected(row: Row, cursor: Cursor) -> int | None:
-    """Before a code of a picture of which something is expected: the code at its place there."""
-    imagination, picture = row.request.family.imagination, row.request.picture
-    if not picture or imagination is None or cursor.section != imagination.section:
+def _code_expected(row: Row, cursor: Cursor, written: Sequence[int]) -> int | None:
+    """At a code of a picture, the token before it: that of the code that is expected at its place."""
+    imagination = row.request.family.imagination
+    if imagination is None or cursor.section != imagination.section:
         return None
-    return picture[cursor.active.place] if isinstance(cursor.active, AtCode) else None
+    return written[-1] if isinstance(cursor.active, AtCode) else None
 
 
 def _first_plan(row: Row) -> Sequence[int]:

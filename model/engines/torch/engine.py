@@ -19,7 +19,6 @@ from looktwice.model.engines.gate import Gate
 from looktwice.model.engines.pictures import PictureThreads
 from looktwice.model.engines.requests import painted, prompt_tokens
 from looktwice.model.engines.torch.decoder import Counts, Decoder, Failed
-from looktwice.model.engines.torch.expected_picture import expected_picture
 from looktwice.model.engines.torch.frames import Frames
 from looktwice.model.engines.torch.graphs import CudaGraph
 from looktwice.model.engines.torch.runner import Runner
@@ -177,12 +176,10 @@ class TorchEngine:
         try:
             async with self._gate.request():
                 if events.empty():  # else it was cancelled before the gate
-                    binding, picture = await self._pictures.run(
+                    binding = await self._pictures.run(
                         lambda: self._prepared(request), request.scene.pictures
                     )
-                    self._commands.put(
-                        lambda decoder: self._add(decoder, request, submitted_s, binding, picture)
-                    )
+                    self._commands.put(lambda decoder: self._add(decoder, request, submitted_s, binding))
                 remaining = request.controls.n
                 while remaining:
                     event = await events.get()
@@ -207,13 +204,12 @@ class TorchEngine:
         self._tell(request_id, Failed(EngineError("the request was cancelled")))
         self._commands.put(lambda decoder: decoder.cancel(request_id))
 
-    def _prepared(self, request: PlanRequest) -> tuple[Binding | None, tuple[int, ...]]:
+    def _prepared(self, request: PlanRequest) -> Binding | None:
         """Do what would hold up the decoding thread."""
         self._frames.look_at(request.scene)
-        binding = binding_of(request, self._loaded.codec, self._loaded.vocabulary)
-        # The prompt holds it too, whether or not it is guessed from.
-        picture = expected_picture(request, self._loaded)
-        return binding, picture if self._settings.shortcuts.speculate else ()
+        # Kept there for the decoder, which asks again.
+        self._loaded.inputs.expected(request.scene, request.controls.view)
+        return binding_of(request, self._loaded.codec, self._loaded.vocabulary)
 
     def _take(self, decoder: Decoder, checkpoint: Path, taken: Future[None]) -> None:
         """Go on with the weights of a folder, in the decoding thread; ``taken`` says how that went."""
@@ -237,10 +233,9 @@ class TorchEngine:
         request: PlanRequest,
         submitted_s: float,
         binding: Binding | None,
-        picture: tuple[int, ...],
     ) -> None:
         try:
-            decoder.add(request, submitted_s, binding, picture)
+            decoder.add(request, submitted_s, binding)
         except RequestError as error:
             self._tell(request.request_id, Failed(error))
         except Exception as error:  # one request that cannot be read must not end the others

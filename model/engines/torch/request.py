@@ -112,7 +112,6 @@ class Request:
         started: whether it has left the queue once.
         binding: where the caller's control ``bind`` asks for it.
         reason_mask: what its reflections may name, known once its prompt is; None for anything.
-        picture: what the camera to be imagined may see, as tokens; see `expected_picture`.
     """
 
     plan_request: PlanRequest
@@ -128,7 +127,6 @@ class Request:
     started: bool = False
     binding: Binding | None = None
     reason_mask: ReasonMask | None = None
-    picture: tuple[int, ...] = ()
 
     @property
     def id(self) -> str:

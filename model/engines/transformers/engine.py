@@ -22,7 +22,15 @@ from looktwice.model.engines.engine import (
 )
 from looktwice.model.engines.gate import Gate
 from looktwice.model.engines.pictures import PictureThreads
-from looktwice.model.engines.requests import begin, inputs_of, painted, prompt_tokens, read, told
+from looktwice.model.engines.requests import (
+    PictureCodes,
+    begin,
+    inputs_of,
+    painted,
+    prompt_tokens,
+    read,
+    told,
+)
 from looktwice.model.engines.transformers.decoding import Decoding, Prepared
 from looktwice.model.engines.warm_up import warm_up
 from looktwice.model.families.registry import families_of
@@ -115,7 +123,7 @@ class TransformersEngine:
             raise EngineError("the engine is not running")
         if request.request_id in self._running:
             raise RequestError(f"request id {request.request_id} is in use")
-        start = begin(request, self._card, self._families, self._formats)
+        begin(request, self._card, self._families, self._formats)
         if request.controls.deadline_ms is not None:
             raise RequestError("deadline_ms needs the torch engine: this one makes no drafts")
         events: asyncio.Queue[Event | Exception] = asyncio.Queue()
@@ -123,7 +131,10 @@ class TransformersEngine:
         writing: Future[None] | None = None
         try:
             async with self._gate.request():
-                inputs = await self._pictures.run(partial(self._inputs, request), request.scene.pictures)
+                inputs, expected = await self._pictures.run(
+                    partial(self._inputs, request), request.scene.pictures
+                )
+                start = begin(request, self._card, self._families, self._formats, expected)
                 loop = asyncio.get_running_loop()
 
                 def tell(event: Event | Exception) -> bool:
@@ -163,9 +174,10 @@ class TransformersEngine:
         _, events = self._running.pop(request_id)
         events.put_nowait(error)
 
-    def _inputs(self, request: PlanRequest) -> ModelInputs:
+    def _inputs(self, request: PlanRequest) -> tuple[ModelInputs, PictureCodes]:
         scene, format, view = request.scene, request.format, request.controls.view
-        return inputs_of(self._loaded.inputs, scene, format, request.attempt, view)
+        inputs = inputs_of(self._loaded.inputs, scene, format, request.attempt, view)
+        return inputs, self._loaded.inputs.expected(scene, view)
 
     def _write(self, request: PlanRequest, start: Cursor, inputs: ModelInputs, tell: _Tell) -> None:
         """Write all draws, in the thread; ends where nobody waits for them any more."""

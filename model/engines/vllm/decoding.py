@@ -76,7 +76,6 @@ class Decoding:
         grammar: what may follow a cursor, for vLLM.
         request: what is asked.
         family: of the response.
-        start: where its response begins.
         least_error: tells how far apart numbers and codes lie.
         reason_mask: what reflections may name; None for anything.
     """
@@ -88,13 +87,12 @@ class Decoding:
         grammar: Callable[[Cursor], str],
         request: PlanRequest,
         family: Family,
-        start: Cursor,
         least_error: LeastError,
         reason_mask: ReasonMask | None = None,
     ) -> None:
         self._llm, self._parts, self._grammar = llm, parts, grammar
         self._request, self._family = request, family
-        self._start, self._least_error, self._reason_mask = start, least_error, reason_mask
+        self._least_error, self._reason_mask = least_error, reason_mask
         self._happened: asyncio.Queue[Event | Exception] = asyncio.Queue()
         self._tasks: set[asyncio.Task[None]] = set()
         self._requests = 0
@@ -104,10 +102,15 @@ class Decoding:
         """How many are asked for."""
         return self._request.controls.n
 
-    async def events(self, prompt: VllmPrompt) -> AsyncGenerator[Event]:
-        """What happens, up to the last `DrawFinished`; closing it early frees everything."""
+    async def events(self, prompt: VllmPrompt, start: Cursor) -> AsyncGenerator[Event]:
+        """What happens, up to the last `DrawFinished`; closing it early frees everything.
+
+        Args:
+            prompt: of the request.
+            start: where its responses begin.
+        """
         self._prompt = prompt
-        draws = [_Walk(self._start, index) for index in range(self._request.controls.n)]
+        draws = [_Walk(start, index) for index in range(self._request.controls.n)]
         try:
             # vLLM keeps its queue to itself.
             yield Started()

@@ -152,7 +152,7 @@ class VllmEngine:
         llm = self.llm
         if request.request_id in self._running:
             raise RequestError(f"request id {request.request_id} is in use")
-        start = begin(request, self._card, self._families, self._formats)
+        begin(request, self._card, self._families, self._formats)
         if request.controls.deadline_ms is not None:
             raise RequestError("deadline_ms needs the torch engine: vLLM cannot cut a text short and go on")
         if request.controls.bind:
@@ -161,16 +161,21 @@ class VllmEngine:
         # Facts that are read from pictures stay within vLLM's processes: only tracks tell what is in view.
         reason_mask = reason_mask_of(request, family, self._parts.vocabulary, None)
         decoding = Decoding(
-            llm, self._parts, self._grammar_of, request, family, start, self._least_error, reason_mask
+            llm, self._parts, self._grammar_of, request, family, self._least_error, reason_mask
         )
         self._running[request.request_id] = decoding
         try:
             scene, format, attempt = request.scene, request.format, request.attempt
             view = request.controls.view
-            prompt = await self._pictures.run(
-                lambda: self.prompt(scene, format, attempt, view), scene.pictures
+            prompt, expected = await self._pictures.run(
+                lambda: (
+                    self.prompt(scene, format, attempt, view),
+                    self._parts.inputs.expected(scene, view),
+                ),
+                scene.pictures,
             )
-            async with aclosing(decoding.events(prompt)) as events:
+            start = begin(request, self._card, self._families, self._formats, expected)
+            async with aclosing(decoding.events(prompt, start)) as events:
                 async for event in events:
                     yield event
         finally:

@@ -7,6 +7,7 @@ from looktwice.model.families.vla_world import format as its
 from looktwice.model.families.vla_world.actions import ACTIONS
 from looktwice.model.families.vla_world.inputs import INPUTS
 from looktwice.model.families.vla_world.read import (
+    expecting,
     perceived,
     pictured,
     predicted,
@@ -48,6 +49,7 @@ VLA_WORLD: Final = Family(
         predicted=predicted,
         pictured=pictured,
         predicting=predicting,
+        expecting=expecting,
     ),
     actions=ACTIONS,
     rewards=rewards,

@@ -141,7 +141,8 @@ _PICTURE: Final = Section(
     VISUAL,
     Sequence(
         (
-            Codes(PICTURE, PICTURE_CODES, PICTURE_CODEBOOK),
+            # Each behind the one that is expected at its place, see `beside`.
+            Codes(PICTURE, 2 * PICTURE_CODES, PICTURE_CODEBOOK),
             Literal(" These are the visual tokens of "),
             Choice(tuple(map(Option, CAMERA_OPTIONS.values())), name=CAMERA),
             Literal(f" image at the 0.5 second in the future.</{VISUAL}>"),

@@ -1,8 +1,7 @@
 """What VLA-World's prompts say of a scene (figure 5b), in words and numbers.
 
 Points are (lateral, forward), and left is negative. A turn to the left is positive, as in nuScenes. The
-paper's history is 2 s long, ours 1.5 s. What the camera would see if only the ego moved is not the paper's: a
-small tower keeps what plans need, and that is not how things look.
+paper's history is 2 s long, ours 1.5 s.
 """
 
 from __future__ import annotations
@@ -12,12 +11,10 @@ from typing import Final
 from looktwice.model.driving.short_term import mission_goal
 from looktwice.model.driving.trajectory import STEP_S, FloatArray, present_acceleration, present_speed
 from looktwice.model.families.family import Situation, TextInputs
-from looktwice.model.families.picture_codes import PICTURE, PICTURE_CODEBOOK, PICTURE_CODES
 from looktwice.model.families.vla_world.format import CAMERA_OPTIONS, points, told_points
 from looktwice.model.formats.compounds import Number
 from looktwice.model.formats.pieces import (
     Choice,
-    Codes,
     Format,
     Literal,
     Option,
@@ -32,9 +29,6 @@ GOALS: Final = ("LEFT", "FORWARD", "RIGHT", "UNKNOWN")
 
 ANY_CAMERA: Final = "ANY"
 """Where nobody asks for a camera: the model chooses whether it imagines, and which one."""
-_EXPECTED: Final = "<expected>"
-_NOT_EXPECTED: Final = "UNKNOWN"
-"""What a camera would see if only the ego moved: codes of a picture, or this where that is not known."""
 _SPEED_MS: Final = Number(-20.0, 60.0, 0.1)
 _YAW_RATE_RADS: Final = Number(-2.0, 2.0, 0.01)
 _ACCELERATION_MS2: Final = Number(-15.0, 15.0, 0.1)
@@ -53,8 +47,6 @@ def describe(situation: Situation) -> Values:
     half_a_second_ago = _PAST_STEPS[-1]
     turned_rad = float(history[-1, 3] - history[half_a_second_ago, 3])
     yaw_rate = turned_rad / (STEP_S * (len(history) - 1 - half_a_second_ago))
-    expected = situation.expected
-    known = {} if expected is None else {"expected_picture": expected}
     return Values.of(
         {
             "velocity": _SPEED_MS.nearest(present_speed(history)),
@@ -63,8 +55,6 @@ def describe(situation: Situation) -> Values:
             "past": told_points(history[list(_PAST_STEPS), :2]),
             "goal": goal_of(situation.route),
             "camera": ANY_CAMERA if situation.camera is None else CAMERA_OPTIONS[situation.camera],
-            "expected": _NOT_EXPECTED if expected is None else _EXPECTED,
-            **known,
         }
     )
 
@@ -74,10 +64,6 @@ def _line(name: str, start: str, piece: Piece, end: str) -> Section:
 
 
 _CAMERAS: Final = (*CAMERA_OPTIONS.values(), ANY_CAMERA)
-_PICTURE: Final = Section(
-    "expected_picture",
-    Sequence((Codes(PICTURE, PICTURE_CODES, PICTURE_CODEBOOK), Literal("</expected>"))),
-)
 INPUTS: Final = TextInputs(
     Format(
         "vla_world inputs",
@@ -89,12 +75,6 @@ INPUTS: Final = TextInputs(
                 _line("past", "Historical Trajectory: [", points(len(_PAST_STEPS)), "]\n"),
                 _line("goal", "Mission Goal: ", Choice(tuple(map(Option, GOALS))), "\n"),
                 _line("camera", "Camera: ", Choice(tuple(map(Option, _CAMERAS))), "\n"),
-                _line(
-                    "expected",
-                    "If only the car moves, it sees: ",
-                    Choice((Option(_EXPECTED, _PICTURE), Option(_NOT_EXPECTED))),
-                    "\n",
-                ),
             )
         ),
     ),

@@ -7,9 +7,11 @@ from typing import Any, cast
 
 from looktwice.model.driving.perceived import Perceived, PerceivedAgent
 from looktwice.model.families.family import Decode, Foreseen, NextPicture, Predicted, Reading
+from looktwice.model.families.picture_codes import PICTURE_CODES, beside
 from looktwice.model.families.vla_world import format as its
 from looktwice.model.families.vla_world.actions import Action, counted
 from looktwice.model.formats.pieces import Value, Values
+from looktwice.model.formats.said import Decided
 
 _CAMERAS = {written: camera for camera, written in its.CAMERA_OPTIONS.items()}
 
@@ -46,10 +48,15 @@ def predicting(x_m: float, y_m: float) -> tuple[Value, ...]:
     return (its.told_points([[x_m, y_m]])[0],)
 
 
+def expecting(expected: tuple[int, ...] | None) -> tuple[Decided, ...]:
+    """The first value of a picture: what is expected of it, and all else left open."""
+    return (beside(expected, (None,) * PICTURE_CODES),)
+
+
 def pictured(values: tuple[Value, ...]) -> NextPicture:
-    """The picture that is imagined."""
+    """The picture that is imagined: every second code, see `beside`."""
     codes, camera = cast("tuple[tuple[int, ...], str]", values)
-    return NextPicture(_CAMERAS[camera], tuple(codes))
+    return NextPicture(_CAMERAS[camera], tuple(codes[1::2]))
 
 
 def _foreseen(values: Values) -> Foreseen:

@@ -9,6 +9,7 @@ from typing import Final
 from looktwice.model.driving.perceived import PerceivedAgent
 from looktwice.model.driving.trajectory import TEN_HZ_S, at_times
 from looktwice.model.families.family import FamilyError, Lesson
+from looktwice.model.families.picture_codes import beside
 from looktwice.model.families.vla_world import format as its
 from looktwice.model.families.vla_world.actions import action_of
 from looktwice.model.formats.pieces import Value, Values
@@ -49,7 +50,7 @@ def teach(lesson: Lesson) -> Values:
     picture = lesson.next_picture
     if picture is not None:
         values[its.IMAGINE] = (its.IMAGINED,)
-        values[its.VISUAL] = (picture.codes, its.CAMERA_OPTIONS[picture.camera])
+        values[its.VISUAL] = (beside(lesson.expected, picture.codes), its.CAMERA_OPTIONS[picture.camera])
     return Values(values)
 
 

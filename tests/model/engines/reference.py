@@ -73,7 +73,10 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
     controls, decoding = request.controls, Decoding(loaded)
     inputs = loaded.inputs.build(request.scene, request.format, request.attempt, controls.view)
     compiled = CompiledFormat(family.format, loaded.vocabulary)
-    start = compiled.start(given_plans(request, family), decided(request, family), said(request, family))
+    expected = loaded.inputs.expected(request.scene, controls.view)
+    start = compiled.start(
+        given_plans(request, family), decided(request, family), said(request, family, expected)
+    )
     asked = decoding.begin(request, family, start, inputs)
     shares: Shares = {}
     for position, step in enumerate(decoding.write(asked, index)):

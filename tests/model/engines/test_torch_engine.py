@@ -186,10 +186,9 @@ def test_a_deadline_counts_from_submission(
         request: PlanRequest,
         stamp_s: float,
         binding: Binding | None,
-        picture: tuple[int, ...],
     ) -> None:
         submitted_s[request.request_id] = stamp_s
-        add(decoder, request, stamp_s, binding, picture)
+        add(decoder, request, stamp_s, binding)
 
     async def test() -> None:
         async with running(untrained_checkpoint) as engine:

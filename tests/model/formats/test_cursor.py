@@ -191,9 +191,9 @@ def test_only_options_that_there_are_can_be_picked(picks: dict[str, str], messag
     ("said", "message"),
     [
         ({"mood": ("glad",)}, "section 'mood' has more values than the format writes: 'glad'"),
-        ({"trajectory": ((0,) * 6,)}, "section 'trajectory' has more values"),
+        ({"trajectory": ((0,) * 6,)}, "section 'trajectory' stands in 2 places"),
         ({"branch": ("Sure,",)}, "'Sure,' is none of Action:, Thinking:"),
-        ({"thinking": ("Too fast.",)}, "section 'thinking' has more values"),
+        ({"thinking": ("Too fast.",)}, "what a FreeText says cannot be decided"),
         ({"plan": ("Keep Lane",)}, "a plan is needed, not 'Keep Lane'"),
     ],
 )

@@ -59,7 +59,7 @@ def test_what_is_decided_is_forced_and_the_rest_is_not(data: st.DataObject, comp
     try:
         cursor = compiled.start(said={section: values.all(section)[:count]})
     except FormatError:
-        # Behind a choice, and in words, nothing can be decided.
+        # In free words nothing can be decided, nor in sections that stand in several places.
         assume(False)
     plain = compiled.start()
     for token in compiled.render(values):

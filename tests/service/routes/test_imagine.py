@@ -31,6 +31,7 @@ from looktwice.model.driving.scene import CAMERAS
 from looktwice.model.engines.engine import EngineError
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.engines.torch.shortcuts import Shortcuts
+from looktwice.model.families.picture_codes import BLANK
 from looktwice.model.network.checkpoint import load, save
 from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes, load_visual_codes
@@ -217,7 +218,9 @@ def test_plans_imagine_as_the_caller_decides(served: Served[TorchEngine]) -> Non
                 if share:
                     codes, camera = draw.sections["visual"]
                     assert isinstance(codes, list)
-                    assert len(codes) == 98
+                    # Nobody asks for a camera, so each code stands behind that of a blank picture.
+                    assert codes[::2] == list(BLANK)
+                    assert len(codes) == 2 * 98
                     assert str(camera).startswith("CAM_")
         with pytest.raises(RequestRefused, match="camera has no meaning with imagine: never") as caught:
             planner.plan(scene(), wire.Controls(imagine="never", camera="back"), format="vla_world")
