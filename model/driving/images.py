@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Final
@@ -104,6 +104,18 @@ def encode_png(pixels: npt.NDArray[np.uint8]) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
+
+
+def tiled(rows: Sequence[Sequence[npt.NDArray[np.uint8]]], gap: int = 4) -> npt.NDArray[np.uint8]:
+    """Pictures uint8 [h, w, 3] of one size in rows, white between them; the last row may be shorter."""
+    height, width, _ = rows[0][0].shape
+    across, down = width + gap, height + gap
+    sheet = np.full((len(rows) * down - gap, len(rows[0]) * across - gap, 3), 255, np.uint8)
+    for row, pictures in enumerate(rows):
+        for column, picture in enumerate(pictures):
+            y, x = row * down, column * across
+            sheet[y : y + height, x : x + width] = picture
+    return sheet
 
 
 def _open(encoded: bytes) -> Image.Image:

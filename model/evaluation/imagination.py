@@ -22,6 +22,7 @@ from looktwice.model.evaluation.next_frames import (
     measure_pictures,
     through_codes,
     warped,
+    what_came,
 )
 from looktwice.model.evaluation.open_loop import BASELINES, SceneResult
 from looktwice.model.evaluation.protocols import Protocol
@@ -52,6 +53,8 @@ COPIED: Final = "the last frame"
 WARPED: Final = "the last frame, moved as the ego"
 CODED: Final = "what came, through its codes"
 
+_SHOWN: Final = 8
+"""Scenes whose pictures are shown."""
 _PICTURE_MEASURES: Final = ("psnr_db", "feature_distance")
 
 
@@ -115,6 +118,7 @@ class ImaginationReport:
         actions: scores by row.
         pictures: rows, and ``frechet`` among their measures.
         comparisons: what should differ, pair by pair.
+        shown: of a few scenes what the camera saw last, what was imagined, and what came.
     """
 
     extractor: str
@@ -123,6 +127,7 @@ class ImaginationReport:
     actions: Mapping[str, Sequence[ActionScore]]
     pictures: Sequence[FigureRow]
     comparisons: Sequence[Comparison]
+    shown: Sequence[tuple[Frame, Frame, Frame]] = ()
 
     def to_json(self) -> dict[str, Any]:
         """All of it as JSON's values."""
@@ -197,6 +202,11 @@ async def evaluate_imagination(
     painters |= {COPIED: copied, WARPED: warped, CODED: through_codes(loaded.visual_codes)}
     extractor = TowerFeatures(loaded)
     pictures = measure_pictures(scenes, cameras, painters, extractor)
+    shown = []
+    for labelled in scenes[:: -(-len(scenes) // _SHOWN)]:
+        camera = cameras[labelled.scene.scene_id]
+        imagined = painters[ASKED](labelled, camera)
+        shown.append((copied(labelled, camera), imagined, what_came(labelled, camera)))
     return ImaginationReport(
         extractor.name,
         {
@@ -207,6 +217,7 @@ async def evaluate_imagination(
         actions,
         [_picture_row(name, of) for name, of in pictures.items()],
         list(_comparisons(waypoints, responses, pictures)),
+        shown,
     )
 
 

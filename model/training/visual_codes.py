@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +15,7 @@ from PIL import Image
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
+from looktwice.model.driving.images import encode_png, tiled
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.whole_files import written_whole
@@ -41,7 +41,6 @@ _HELD_OUT_EVERY: Final = 10
 _GRADIENT_WEIGHT: Final = 0.25
 _SHEET_COLUMNS: Final = 4
 _SHEET_PICTURES: Final = 8
-_GAP: Final = 4
 
 
 @dataclass(frozen=True)
@@ -219,14 +218,10 @@ def patch_means(frame: Frame) -> Frame:
 
 def contact_sheet(codes: VisualCodes, images: Sequence[bytes], path: Path) -> None:
     """Write a PNG of encoded pictures, each above what its codes are painted as."""
-    columns = min(len(images), _SHEET_COLUMNS)
-    rows = math.ceil(len(images) / columns)
-    across, down = FRAME_WIDTH + _GAP, 2 * FRAME_HEIGHT + 3 * _GAP
-    sheet = Image.new("RGB", (columns * across - _GAP, rows * down - 2 * _GAP), (255, 255, 255))
-    for place, image in enumerate(images):
-        frame = frame_of(image)
-        x, y = place % columns * across, place // columns * down
-        sheet.paste(Image.fromarray(frame), (x, y))
-        sheet.paste(Image.fromarray(codes.decode(codes.encode(frame))), (x, y + FRAME_HEIGHT + _GAP))
+    frames = list(map(frame_of, images))
+    rows = []
+    for start in range(0, len(frames), _SHEET_COLUMNS):
+        row = frames[start : start + _SHEET_COLUMNS]
+        rows += [row, [codes.decode(codes.encode(frame)) for frame in row]]
     with written_whole(path) as temporary:
-        sheet.save(temporary, "PNG")
+        temporary.write_bytes(encode_png(tiled(rows)))

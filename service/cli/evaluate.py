@@ -90,7 +90,9 @@ def evaluate(
     sweep: Annotated[
         int, typer.Option(help="Scenes for the ladder's temperatures, evenly chosen.", min=1)
     ] = 240,
-    plots: Annotated[Path | None, typer.Option(help="Folder for the ladder's pictures.")] = None,
+    plots: Annotated[
+        Path | None, typer.Option(help="Folder for the ladder's or imagination's pictures.")
+    ] = None,
     per_scene: Annotated[
         Path | None, typer.Option(help="Parquet file for every scene's measures in every row of the ladder.")
     ] = None,
@@ -176,7 +178,9 @@ def evaluate(
                 quiet=as_json,
             )
         elif preset == "imagination":
-            report = _imagination(labelled, engine_of(checkpoint), checkpoint, controls, rows, quiet=as_json)
+            report = _imagination(
+                labelled, engine_of(checkpoint), checkpoint, controls, rows, plots, quiet=as_json
+            )
         elif preset == "failures":
             from looktwice.service.cli.evaluate_failures import evaluate_stages, stages_named
 
@@ -331,16 +335,23 @@ def _imagination(
     checkpoint: Path,
     controls: Controls,
     rows: int,
+    plots: Path | None,
     *,
     quiet: bool,
 ) -> ImaginationReport:
     """What a checkpoint plans with and without imagining, and what its pictures are worth."""
+    from looktwice.model.driving.images import encode_png, tiled
+    from looktwice.model.driving.whole_files import written_whole
     from looktwice.model.evaluation.imagination import evaluate_imagination, imagination_variants
     from looktwice.model.network.checkpoint import load
 
     variants = imagination_variants(engine.card, controls)
     evaluate = partial(evaluate_imagination, loaded=load(checkpoint))
-    return asyncio.run(run_started(evaluate, scenes, engine, variants, controls.n, rows, quiet=quiet))
+    report = asyncio.run(run_started(evaluate, scenes, engine, variants, controls.n, rows, quiet=quiet))
+    if plots is not None:
+        with written_whole(plots / "imagined.png") as temporary:
+            temporary.write_bytes(encode_png(tiled(report.shown)))
+    return report
 
 
 async def run_started(

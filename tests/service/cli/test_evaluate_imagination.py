@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from looktwice.model.driving.images import encode_png
+from looktwice.model.driving.images import decode_image, encode_png
 from looktwice.model.driving.scene import FRONT_WIDE, LabelledScene, NextFrame
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.network.checkpoint import load, save
@@ -51,7 +51,7 @@ def evaluated(checkpoint: Path, scenes: list[LabelledScene], folder: Path, *more
 def test_tables_with_and_without_pictures(checkpoint: Path, tmp_path: Path) -> None:
     scenes = [scene(number) for number in range(2)]
     kept = ["--keep", str(tmp_path / "draws.sqlite")]
-    result = evaluated(checkpoint, scenes, tmp_path, "--json", *kept)
+    result = evaluated(checkpoint, scenes, tmp_path, "--json", *kept, "--plots", str(tmp_path / "plots"))
     assert result.exit_code == 0, result.output
     told = json.loads(result.stdout.splitlines()[-1])
     rows = ["auto", "never", "always", ASKED, f"{ASKED}, shuffled images"]
@@ -61,6 +61,11 @@ def test_tables_with_and_without_pictures(checkpoint: Path, tmp_path: Path) -> N
         assert all(row["scenes"] == 2 and row.keys() >= MEASURES for row in named.values())
         assert named["constant velocity"]["l2_3s_m"] == pytest.approx(0, abs=1e-4)
         assert named["never"]["l2_m"] > 1
+    sheet = decode_image((tmp_path / "plots" / "imagined.png").read_bytes())
+    for row, labelled in enumerate(scenes):
+        [came] = labelled.next_frames
+        np.testing.assert_array_equal(sheet[row * 116 : row * 116 + 112, 456:], decode_image(came.image))
+    assert sheet.shape == (228, 680, 3)
     passes = {row["name"]: row for row in told["responses"]}
     assert (passes["never"]["imagine_rate"], passes["always"]["imagine_rate"]) == (0.0, 1.0)
     # Without a camera there is nothing to guess from: every code takes a pass.
