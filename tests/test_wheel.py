@@ -19,6 +19,7 @@ from tests.test_architecture import PACKAGES, ROOT
 DATA = (
     *("py.typed", "model/bundled/scenes.parquet", "model/bundled/looktwice-nano/model.safetensors"),
     *("model/bundled/looktwice-nano/README.md", "model/bundled/elf-nano/model.safetensors"),
+    "model/bundled/world-nano/visual_codes.safetensors",
     *("service/inspector/index.html", "loadtests/page.html"),
 )
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 _HERE: Final = Path(__file__).parent
-CHECKPOINTS: Final = {name: _HERE / name for name in ("looktwice-nano", "elf-nano")}
+CHECKPOINTS: Final = {name: _HERE / name for name in ("looktwice-nano", "elf-nano", "world-nano")}
 """Their folders, by the names that commands take; the first one is the default."""
 CHECKPOINT: Final = CHECKPOINTS["looktwice-nano"]
 SCENES: Final = _HERE / "scenes.parquet"

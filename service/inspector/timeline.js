@@ -3,6 +3,7 @@
 import { byId, element } from "./dom.js";
 
 const HORIZON_S = 6.4;
+const MOST_NUMBERS = 20;
 const GROUPS = ["longitudinal", "lateral", "lane"];
 const LOOK = {
   "Accelerate": "go", "Decelerate": "slow", "Wait": "stop", "Reverse": "back",
@@ -21,10 +22,13 @@ export function showDraw(draw) {
     parts.push(element("h3", { textContent: "Revised plan" }), tracks(draw.revised_plan, draw.plan));
   }
   for (const section of draw.sections ?? []) {
-    parts.push(
-      element("h3", { textContent: section.name.replaceAll("_", " ") }),
-      element("p", { textContent: said(section.values) }),
-    );
+    const text = said(section.values).trim();
+    if (text) {
+      parts.push(
+        element("h3", { textContent: section.name.replaceAll("_", " ") }),
+        element("p", { className: "said", textContent: text }),
+      );
+    }
   }
   if (!parts.length) {
     parts.push(element("p", { className: "empty", textContent: "This response format says nothing but its trajectory." }));
@@ -43,11 +47,19 @@ export function showDraw(draw) {
   byId("timeline").replaceChildren(...parts);
 }
 
-// A value by its kind: words and numbers as they are, several after each other, a record's with their names.
+// A value by its kind: words and numbers as they are, several after each other, records in a line each, with the
+// names of their values. Long rows of numbers, such as codes, are only counted.
 function said(value) {
-  if (Array.isArray(value)) return value.map(said).join(" ");
+  if (Array.isArray(value)) {
+    if (value.length > MOST_NUMBERS && value.every(Number.isFinite)) return `${value.length} numbers`;
+    return value.map((each) => `${said(each)}${ofRecords(each) ? "\n" : " "}`).join("").trimEnd();
+  }
   if (value === null || typeof value !== "object") return String(value);
   return Object.entries(value).map(([name, inner]) => `${name.replaceAll("_", " ")} ${said(inner)}`).join(", ");
+}
+
+function ofRecords(value) {
+  return Array.isArray(value) ? value.some(ofRecords) : value !== null && typeof value === "object";
 }
 
 // Segments that differ from the plan before are marked.

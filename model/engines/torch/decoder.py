@@ -139,6 +139,7 @@ class Decoder:
         arrived_s = self._clock() if submitted_s is None else submitted_s
         family = self._runner.families[plan_request.format]
         request = Request(plan_request, family, origin, arrived_s, self._least_error)
+        request.expects = expected is not None
         request.binding = binding or binding_of(plan_request, loaded.codec, loaded.vocabulary)
         request.draws_a_tree = self._scheduler.draws_a_tree(request)
         request.plant(share=self._shortcuts.shared_rows)

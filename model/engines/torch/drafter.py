@@ -131,9 +131,9 @@ class Drafter:
 
 
 def _code_expected(row: Row, cursor: Cursor, written: Sequence[int]) -> int | None:
-    """At a code of a picture, the token before it: that of the code that is expected at its place."""
+    """At a code of a picture of which something is expected, the token before it: that of the expected code."""
     imagination = row.request.family.imagination
-    if imagination is None or cursor.section != imagination.section:
+    if imagination is None or cursor.section != imagination.section or not row.request.expects:
         return None
     return written[-1] if isinstance(cursor.active, AtCode) else None
 

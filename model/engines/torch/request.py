@@ -112,6 +112,7 @@ class Request:
         started: whether it has left the queue once.
         binding: where the caller's control ``bind`` asks for it.
         reason_mask: what its reflections may name, known once its prompt is; None for anything.
+        expects: whether something is known of the picture that is asked for.
     """
 
     plan_request: PlanRequest
