@@ -277,7 +277,10 @@ class OutcomeLearner(nn.Module):
 
     def _drawn(self, draw: Draw) -> list[Decision]:
         """The decisions of a draw that were drawn: all but trajectory codes of least expected error."""
-        found = decisions(self._data.formats[self._task].start(), draw.ids)
+        imagination = self._family.imagination
+        # Nobody asks for a camera, so nothing is expected of its picture.
+        said = {} if imagination is None else imagination.said(None)
+        found = decisions(self._data.formats[self._task].start(said=said), draw.ids)
         if self._settings.codes == "drawn":
             return found
         codes = self._loaded.vocabulary.alphabets[TRAJECTORY]

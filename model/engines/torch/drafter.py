@@ -131,7 +131,7 @@ class Drafter:
 
 
 def _code_expected(row: Row, cursor: Cursor, written: Sequence[int]) -> int | None:
-    """At a code of a picture of which something is expected, the token before it: that of the expected code."""
+    """The token before a code of a picture: that of the code that is expected there; None elsewhere."""
     imagination = row.request.family.imagination
     if imagination is None or cursor.section != imagination.section or not row.request.expects:
         return None

@@ -128,6 +128,7 @@ class Request:
     started: bool = False
     binding: Binding | None = None
     reason_mask: ReasonMask | None = None
+    expects: bool = False
 
     @property
     def id(self) -> str:

@@ -23,12 +23,12 @@ OFF_MS: Final = 2.0
 UNSTEADY_MS2: Final = 4.0
 """So are waypoints whose acceleration changes by so much more than the expert's, from one to the next."""
 STEADY_SHARE: Final = 0.25
-"""Of the trajectory's reward; the rest is how near its waypoints are."""
+"""Of the waypoints' reward; the rest is how near they are."""
 
 PREDICTION: Final = "prediction"
 ACTION: Final = "action"
-TRAJECTORY: Final = "trajectory"
-REWARDS: Final = (PREDICTION, ACTION, TRAJECTORY)
+WAYPOINTS: Final = "waypoints"
+REWARDS: Final = (PREDICTION, ACTION, WAYPOINTS)
 
 
 def rewards(future: FloatArray, reading: Reading) -> Mapping[str, float]:
@@ -57,7 +57,7 @@ def rewards(future: FloatArray, reading: Reading) -> Mapping[str, float]:
         PREDICTION: float(np.mean(prediction)),
         # F1 of two sets of words, one of each group: as many are right as are missing.
         ACTION: float(np.mean([mine == right for mine, right in zip(said, done, strict=True)])),
-        TRAJECTORY: (1 - STEADY_SHARE) * _near(told, expert)
+        WAYPOINTS: (1 - STEADY_SHARE) * _near(told, expert)
         + STEADY_SHARE * max(0.0, 1 - unsteady / UNSTEADY_MS2),
     }
 

@@ -379,7 +379,7 @@ def test_the_experts_own_response_is_worth_everything() -> None:
     found = rewards(FUTURE, reading_of(EXPERT))
     assert tuple(found) == REWARDS
     # Waypoints are rounded to 0.1 m, which is 0.4 m/s² in an acceleration.
-    assert found == pytest.approx({"prediction": 1, "action": 1, "trajectory": 1}, abs=0.1)
+    assert found == pytest.approx({"prediction": 1, "action": 1, "waypoints": 1}, abs=0.1)
 
 
 def test_each_reward_is_lost_by_its_own_fault() -> None:
@@ -397,7 +397,7 @@ def test_each_reward_is_lost_by_its_own_fault() -> None:
 
 def test_a_trajectory_loses_by_distance_and_by_jerks() -> None:
     def worth(waypoints: list[list[float]]) -> float:
-        return rewards(FUTURE, reading_of(waypoints))["trajectory"]
+        return rewards(FUTURE, reading_of(waypoints))["waypoints"]
 
     ever_farther = [
         worth([[x + off * time_s, y] for (x, y), time_s in zip(EXPERT, TIMES_S, strict=True)])

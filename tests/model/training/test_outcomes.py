@@ -319,7 +319,7 @@ def test_imagining_responses_are_learned_from_their_own_rewards(two_scenes: Path
     assert apart[0] == pytest.approx(0, abs=1e-6)
     assert apart[1] > 1e-4
     [stage] = load(tmp_path / "rl").card.details["stages"]
-    assert stage["outcome"]["rewards"] == {"prediction": 1.0, "action": 1.0, "trajectory": 1.0}
+    assert stage["outcome"]["rewards"] == {"prediction": 1.0, "action": 1.0, "waypoints": 1.0}
     torch.testing.assert_close(
         load(tmp_path / "rl").model.lm_head.weight, load(tmp_path / "again" / "rl").model.lm_head.weight
     )
@@ -331,9 +331,9 @@ def test_rewards_that_a_family_does_not_have_are_refused() -> None:
         family_rewards(family_named("elf_vla"), BRAKES.future, [draw], {"action": 1.0})
     seen = Foreseen(Perceived((), 1.0, 1.0), 5.0, 0.0, "Forward", None)
     draw = replace(draw, trajectory=draw.trajectory[4:30:5], foreseen=seen, action=("forward", "keep"))
-    with pytest.raises(ValueError, match="rewards are prediction, action, trajectory, and action are"):
+    with pytest.raises(ValueError, match="rewards are prediction, action, waypoints, and action are"):
         family_rewards(family_named("vla_world"), BRAKES.future, [draw], {"action": 1.0})
-    weights = {"prediction": 0.0, "action": 2.0, "trajectory": 0.0}
+    weights = {"prediction": 0.0, "action": 2.0, "waypoints": 0.0}
     found = family_rewards(family_named("vla_world"), BRAKES.future, [draw], weights)
     # It stops, and says that it keeps its speed.
     assert found.total == pytest.approx([1.0])
