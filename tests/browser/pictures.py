@@ -3,6 +3,9 @@
 They show the bundled scene and the seed, of a few, whose second look helps most, in draws whose parts agree:
 the trajectory scores better by NAVSIM's rules than behind the first plan alone or, where both score the same,
 comes nearer to the expert's. None fails. Draws to drive by come first. Without any, the first scene.
+
+Its argument may be the sheet that `looktwice evaluate --preset imagination --checkpoint world-nano --plots`
+wrote: then it keeps that one instead, with the name and revision inside.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ from playwright.sync_api import expect, sync_playwright
 from looktwice.clients.answers import PlannedDraw
 from looktwice.clients.planner import PlannerClient, RetryPolicy
 from looktwice.clients.wire import Controls
-from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.bundled import CHECKPOINT, CHECKPOINTS, SCENES
 from looktwice.model.driving.facts import LANE_WIDTH_M
 from looktwice.model.driving.pdm.judging import SceneJudge
 from looktwice.model.driving.pdm.labelled import plans_of
@@ -37,23 +40,24 @@ from tests.browser.conftest import ARGUMENTS, CHROMIUM
 from tests.service.serving import serve
 
 FOLDER: Final = Path(__file__).parents[2] / "docs" / "pictures"
-PLAN, INSPECTOR = FOLDER / "plan.png", FOLDER / "inspector.png"
+PLAN, INSPECTOR, IMAGINED = (FOLDER / f"{name}.png" for name in ("plan", "inspector", "imagined"))
+IMAGINING: Final = CHECKPOINTS["world-nano"]
 KEY: Final = "looktwice-checkpoint"
 DRAWS, SEEDS = 6, range(8)
 _PATIENCE_MS: Final = 180_000
 """For a busy machine; a screenshot of the whole page takes seconds on one that rests."""
 
 
-def revision() -> str:
-    """What stands in the pictures of the bundled checkpoint."""
-    card = read_card(CHECKPOINT)
+def revision(checkpoint: Path = CHECKPOINT) -> str:
+    """What stands in the pictures of a bundled checkpoint."""
+    card = read_card(checkpoint)
     return f"{card['name']} {card['revision']}"
 
 
-def stamped(source: Path, target: Path) -> None:
+def stamped(source: Path, target: Path, checkpoint: Path = CHECKPOINT) -> None:
     """Write a PNG again, with the checkpoint that it shows."""
     told = PngInfo()
-    told.add_text(KEY, revision())
+    told.add_text(KEY, revision(checkpoint))
     with Image.open(source) as picture:
         picture.save(target, pnginfo=told, optimize=True)
 
@@ -118,6 +122,9 @@ def show_inspector(url: str, scene_id: str, seed: int, draw: int, path: Path) ->
 
 
 def main() -> None:
+    if sheet := sys.argv[1:]:
+        stamped(Path(sheet[0]), IMAGINED, IMAGINING)
+        return
     scenes = list(read_scenes(SCENES))
     with tempfile.TemporaryDirectory() as kept:
         folder = Path(kept)
