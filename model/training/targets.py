@@ -6,14 +6,14 @@ first plan of a counterfactual example weighs 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from looktwice.model.driving.direction import wanted_changes
 from looktwice.model.driving.plan import Plan
 from looktwice.model.families.family import Family, Lesson
-from looktwice.model.formats.cursor import CompiledFormat, Token
-from looktwice.model.formats.said import Said
+from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.replay import decisions
 
 SectionWeights = Mapping[str, float]
 
@@ -66,20 +66,10 @@ def make_target(
         if reflection.revised_plan is not None and wanted_changes(reflection.revised_plan, lesson.plan):
             untaught.add(family.trajectory)
     taught = {section: 0.0 if section in untaught else weight for section, weight in weights.items()}
-    each = [taught[token.section] for token in tokens]
+    ids, given = tuple(token.id for token in tokens), set[int]()
     if family.imagination is not None and family.imagination.section in values:
-        for place in _decided(compiled, tokens, plans, family.imagination.said(lesson.expected)):
-            each[place] = 0.0
-    return Target(tuple(token.id for token in tokens), tuple(each))
-
-
-def _decided(
-    compiled: CompiledFormat, tokens: Sequence[Token], plans: Mapping[str, Plan], said: Said
-) -> list[int]:
-    """Places of tokens in sections of which something is decided that nothing but them can be written at."""
-    cursor, found = compiled.start(plans, said=said), list[int]()
-    for place, token in enumerate(tokens):
-        if token.section in said and len(cursor.allowed().ids) == 1:
-            found.append(place)
-        cursor = cursor.advance(token.id)
-    return found
+        said = family.imagination.said(lesson.expected)
+        made = {decision.position for decision in decisions(compiled.start(plans, said=said), ids)}
+        given = {place for place, token in enumerate(tokens) if token.section in said and place not in made}
+    weighed = (0.0 if place in given else taught[token.section] for place, token in enumerate(tokens))
+    return Target(ids, tuple(weighed))

@@ -99,7 +99,7 @@ def engine_request(
         _check_imagining(asked.controls, format)
         given = asked.controls.prefill
         prefill = None if given is None else plan_of(given, "/controls/prefill")
-        controls = _controls(asked.controls, prefill, asked.controls)
+        controls = _controls(asked.controls, prefill)
         attempt = _attempt(asked.attempt, format)
     scene = scene_of(asked.scene, geometry)
     return PlanRequest(engine_id, scene, format, controls, attempt, live=asked.stream)
@@ -224,11 +224,8 @@ def _limit(values: np.ndarray[tuple[int, ...], np.dtype[np.floating]], largest: 
         raise at(INVALID_HISTORY, f"/scene/history/{worst + 1}", f"the ego {problem}")
 
 
-def _controls(
-    asked: wire.ReflectControls,
-    prefill: Plan | None,
-    imagining: wire.Controls = wire.Controls(),
-) -> Controls:
+def _controls(asked: wire.ReflectControls, prefill: Plan | None) -> Controls:
+    imagining = asked if isinstance(asked, wire.Controls) else wire.Controls()
     motion = imagining.motion
     try:
         return Controls(

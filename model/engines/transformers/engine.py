@@ -123,7 +123,7 @@ class TransformersEngine:
             raise EngineError("the engine is not running")
         if request.request_id in self._running:
             raise RequestError(f"request id {request.request_id} is in use")
-        begin(request, self._card, self._families, self._formats)
+        start = begin(request, self._card, self._families, self._formats)
         if request.controls.deadline_ms is not None:
             raise RequestError("deadline_ms needs the torch engine: this one makes no drafts")
         events: asyncio.Queue[Event | Exception] = asyncio.Queue()
@@ -134,7 +134,8 @@ class TransformersEngine:
                 inputs, expected = await self._pictures.run(
                     partial(self._inputs, request), request.scene.pictures
                 )
-                start = begin(request, self._card, self._families, self._formats, expected)
+                if expected is not None:
+                    start = begin(request, self._card, self._families, self._formats, expected)
                 loop = asyncio.get_running_loop()
 
                 def tell(event: Event | Exception) -> bool:

@@ -152,7 +152,7 @@ class VllmEngine:
         llm = self.llm
         if request.request_id in self._running:
             raise RequestError(f"request id {request.request_id} is in use")
-        begin(request, self._card, self._families, self._formats)
+        start = begin(request, self._card, self._families, self._formats)
         if request.controls.deadline_ms is not None:
             raise RequestError("deadline_ms needs the torch engine: vLLM cannot cut a text short and go on")
         if request.controls.bind:
@@ -174,7 +174,8 @@ class VllmEngine:
                 ),
                 scene.pictures,
             )
-            start = begin(request, self._card, self._families, self._formats, expected)
+            if expected is not None:
+                start = begin(request, self._card, self._families, self._formats, expected)
             async with aclosing(decoding.events(prompt, start)) as events:
                 async for event in events:
                     yield event
