@@ -369,8 +369,13 @@ class Engine(Protocol):
         """
         ...
 
-    def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
-        """An imagined picture, uint8 RGB [112, 224, 3], of its 98 codes; takes ms of the caller's thread.
+    def paint(self, request: PlanRequest, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
+        """An imagined picture, uint8 RGB [112, 224, 3]; takes ms of the caller's thread.
+
+        Args:
+            request: that it answers. Where it asks for a camera that its scene shows, what did not change is
+                taken from there, if the checkpoint learned that.
+            codes: 98 of the picture.
 
         Raises:
             RequestError: the checkpoint has no codes of pictures (`ModelCard.paints`).

@@ -27,6 +27,7 @@ from looktwice.model.formats.pieces import NOTHING, FormatError
 from looktwice.model.formats.said import Said
 from looktwice.model.formats.text import parse
 from looktwice.model.network.codec import TrajectoryCodec
+from looktwice.model.network.inputs import moved_picture
 from looktwice.model.network.model_card import ModelCard
 from looktwice.model.network.vocabulary import Vocabulary
 
@@ -227,8 +228,9 @@ def _by_section(response: Response) -> dict[str, float]:
     return sums
 
 
-def painted(visual_codes: VisualCodes | None, codes: Sequence[int]) -> Frame:
-    """The picture uint8 [112, 224, 3] of 98 codes; raises `RequestError` without codes of pictures."""
+def painted(visual_codes: VisualCodes | None, request: PlanRequest, codes: Sequence[int]) -> Frame:
+    """See `Engine.paint`; raises `RequestError` without codes of pictures."""
     if visual_codes is None:
         raise RequestError("this checkpoint has no codes of pictures to paint with")
-    return visual_codes.decode(codes)
+    view = request.controls.view
+    return visual_codes.decode(codes, None if view is None else moved_picture(request.scene, view))

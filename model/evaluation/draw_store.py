@@ -91,9 +91,9 @@ class DrawStore:
         """The engine's."""
         return self._engine.prompt_tokens(request)
 
-    def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
+    def paint(self, request: PlanRequest, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
         """The engine's."""
-        return self._engine.paint(codes)
+        return self._engine.paint(request, codes)
 
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """See `Engine.submit`."""

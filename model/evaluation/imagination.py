@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -28,7 +29,7 @@ from looktwice.model.evaluation.open_loop import BASELINES, SceneResult
 from looktwice.model.evaluation.protocols import Protocol
 from looktwice.model.evaluation.report import evaluate_variants
 from looktwice.model.evaluation.table import comparison_cells
-from looktwice.model.evaluation.variants import Variant, next_camera
+from looktwice.model.evaluation.variants import Variant, next_camera, request_for
 from looktwice.model.evaluation.waypoints import (
     PROTOCOLS,
     WAYPOINT_MEASURES,
@@ -51,6 +52,7 @@ ASKED: Final = "always, camera asked for"
 SHUFFLED: Final = f"{ASKED}, shuffled images"
 COPIED: Final = "the last frame"
 WARPED: Final = "the last frame, moved as the ego"
+UNCHANGED: Final = f"{WARPED}, through its codes"
 CODED: Final = "what came, through its codes"
 
 _SHOWN: Final = 8
@@ -182,8 +184,14 @@ async def evaluate_imagination(
     cameras = {labelled.scene.scene_id: next_camera(labelled) for labelled in scenes}
     draws: dict[str, dict[str, Sequence[Draw]]] = {variant.name: {} for variant in variants}
 
+    foreseen: dict[str, dict[str, Frame]] = {}
+
     def keep(variant: Variant, labelled: LabelledScene, of: Sequence[Draw]) -> None:
-        draws[variant.name][labelled.scene.scene_id] = of
+        scene_id = labelled.scene.scene_id
+        draws[variant.name][scene_id] = of
+        if variant.next_camera:
+            request = request_for(labelled, variant)
+            foreseen.setdefault(variant.name, {})[scene_id] = engine.paint(request, _codes(of[0]))
 
     await evaluate_variants(
         engine, scenes, variants, concurrency=concurrency, on_result=on_result, on_draws=keep
@@ -197,9 +205,11 @@ async def evaluate_imagination(
         for name, of in draws.items():
             said = {scene_id: [draw.action for draw in each] for scene_id, each in of.items()}
             actions[name] = action_scores(family.actions, scenes, said)
-    painters = {name: _imagined(engine, draws[name]) for name in (ASKED, SHUFFLED) if name in draws}
-    assert loaded.visual_codes is not None, "a checkpoint that paints has them"
-    painters |= {COPIED: copied, WARPED: warped, CODED: through_codes(loaded.visual_codes)}
+    painters: dict[str, Painter] = {name: partial(_kept, of) for name, of in foreseen.items()}
+    codes = loaded.visual_codes
+    assert codes is not None, "a checkpoint that paints has them"
+    painters |= {COPIED: copied, WARPED: warped}
+    painters |= {UNCHANGED: through_codes(codes, warped), CODED: through_codes(codes, what_came)}
     extractor = TowerFeatures(loaded)
     pictures = measure_pictures(scenes, cameras, painters, extractor)
     shown = []
@@ -250,16 +260,15 @@ def _response(labelled: LabelledScene, draws: Sequence[Draw]) -> ResponseResult:
     return ResponseResult(*about, float(np.mean(imagined)), float(np.mean(passes)))
 
 
-def _imagined(engine: Engine, draws: Mapping[str, Sequence[Draw]]) -> Painter:
-    """The picture of each scene's first draw."""
+def _codes(draw: Draw) -> Sequence[int]:
+    foreseen = draw.foreseen
+    assert foreseen is not None
+    assert foreseen.picture is not None, "a picture was asked for"
+    return foreseen.picture.codes
 
-    def paint(labelled: LabelledScene, camera: str) -> Frame:
-        foreseen = draws[labelled.scene.scene_id][0].foreseen
-        assert foreseen is not None
-        assert foreseen.picture is not None, "a picture was asked for"
-        return engine.paint(foreseen.picture.codes)
 
-    return paint
+def _kept(pictures: Mapping[str, Frame], labelled: LabelledScene, camera: str) -> Frame:
+    return pictures[labelled.scene.scene_id]
 
 
 def _picture_row(name: str, pictures: Pictures) -> FigureRow:
@@ -283,7 +292,7 @@ def _comparisons(
                 yield compare(f"{one} : {other} ({protocol})", of[one], of[other], measure)
     for one in (ALWAYS, ASKED):
         yield compare(f"{one} : {NEVER}", responses[one], responses[NEVER], "passes")
-    for one, other in ((ASKED, COPIED), (ASKED, WARPED), (SHUFFLED, ASKED)):
+    for one, other in ((ASKED, COPIED), (ASKED, WARPED), (ASKED, UNCHANGED), (SHUFFLED, ASKED)):
         for measure in _PICTURE_MEASURES:
             yield compare(f"{one} : {other}", pictures[one].results, pictures[other].results, measure)
 

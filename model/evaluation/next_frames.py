@@ -14,11 +14,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from looktwice.model.driving.cameras import CAMERA_SPECS
 from looktwice.model.driving.intervals import Interval
-from looktwice.model.driving.next_view import moved_view
+from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.scene import LabelledScene
-from looktwice.model.driving.short_term import INERTIA
 from looktwice.model.network.checkpoint import Loaded
 from looktwice.model.network.patches import resize
 from looktwice.model.network.visual_codes import Frame, VisualCodes, frame_of, psnr
@@ -134,15 +132,18 @@ def copied(labelled: LabelledScene, camera: str) -> Frame:
 
 def warped(labelled: LabelledScene, camera: str) -> Frame:
     """The camera's latest picture as seen from where the ego will be if it moves on as it does."""
-    pose = INERTIA.ego(labelled.scene.history, None)
-    return moved_view(copied(labelled, camera), CAMERA_SPECS[camera], pose)
+    return expected_view(copied(labelled, camera), camera, labelled.scene.history)
 
 
-def through_codes(visual_codes: VisualCodes) -> Painter:
-    """What came, written in codes and painted: a picture that is imagined without any error."""
+def through_codes(visual_codes: VisualCodes, shown: Painter) -> Painter:
+    """A picture written in codes and painted as imagined ones are, with what was seen last.
+
+    Of what came it is a picture that is imagined without any error; of the last frame, moved, one that is
+    imagined as if nothing else changed.
+    """
 
     def paint(labelled: LabelledScene, camera: str) -> Frame:
-        return visual_codes.decode(visual_codes.encode(what_came(labelled, camera)))
+        return visual_codes.decode(visual_codes.encode(shown(labelled, camera)), warped(labelled, camera))
 
     return paint
 

@@ -15,7 +15,7 @@ from cachetools import LRUCache
 from looktwice.model.driving.hashing import hash_of
 from looktwice.model.driving.images import ImageError, decode_image
 from looktwice.model.driving.next_view import expected_view
-from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.scene import Clip, Scene
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.families.family import Attempt, Situation, TextInputs, View
 from looktwice.model.families.registry import family_named
@@ -24,7 +24,7 @@ from looktwice.model.network.patches import normalise, patchify, resize
 from looktwice.model.network.prompts import prompt_text
 from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.track_features import track_features
-from looktwice.model.network.visual_codes import VisualCodes, frame_of
+from looktwice.model.network.visual_codes import Frame, VisualCodes, frame_of
 from looktwice.model.network.vocabulary import VIDEO_PAD, Vocabulary
 
 IntArray = npt.NDArray[np.int64]
@@ -73,6 +73,23 @@ class ModelInputs:
     def pixel_values_videos(self) -> npt.NDArray[np.float32]:
         """The patches normalised, as Qwen2.5-VL's processor gives them: float32 [p, 1176]."""
         return normalise(self.patches)
+
+
+def moved_picture(scene: Scene, view: View) -> Frame | None:
+    """What a view would show if only the ego moved, uint8 [112, 224, 3]; takes some ms.
+
+    None where the scene has no clip of its camera, or its picture is damaged.
+    """
+    shown = _shown(scene, view)
+    # A picture that the tower does not look at must not decide whether the model answers.
+    with suppress(ImageError):
+        if shown is not None:
+            return expected_view(frame_of(shown.images[-1]), view.camera, scene.history, view.motion)
+    return None
+
+
+def _shown(scene: Scene, view: View) -> Clip | None:
+    return next((clip for clip in scene.clips if clip.camera == view.camera), None)
 
 
 class InputBuilder:
@@ -139,18 +156,15 @@ class InputBuilder:
         """
         if view is None or self._visual_codes is None:
             return None
-        shown = [clip.images[-1] for clip in scene.clips if clip.camera == view.camera]
-        if not shown:
+        shown = _shown(scene, view)
+        if shown is None:
             return None
-        key = hash_of(shown[0], repr(view), scene.history.tobytes())
+        key = hash_of(shown.images[-1], repr(view), scene.history.tobytes())
         with self._lock:
             if key in self._expected:
                 return self._expected[key]
-        codes: tuple[int, ...] | None = None
-        # A picture that the tower does not look at must not decide whether the model answers.
-        with suppress(ImageError):
-            moved = expected_view(frame_of(shown[0]), view.camera, scene.history, view.motion)
-            codes = tuple(self._visual_codes.encode(moved).tolist())
+        moved = moved_picture(scene, view)
+        codes = None if moved is None else tuple(self._visual_codes.encode(moved).tolist())
         with self._lock:
             self._expected[key] = codes
         return codes

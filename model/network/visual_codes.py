@@ -3,7 +3,8 @@
 An encoder of small convolutions writes four numbers for each patch of 16 x 16 pixels. Finite scalar
 quantisation (https://arxiv.org/abs/2309.15505) rounds them to 8, 5, 5 and 5 levels, which together are one
 code. There is no codebook to learn or to collapse. A decoder paints the picture again. It has no adversary to
-please, so that pictures are soft where the codes do not say enough.
+please, so that pictures are soft where the codes do not say enough. Where it is known what the camera saw
+half a second before, a `Composer` takes from that what did not change.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import torch
-import torch.nn.functional as F
 from PIL import Image
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
@@ -25,6 +25,8 @@ from torch import Tensor, nn
 
 from looktwice.model.driving.images import decode_image
 from looktwice.model.driving.whole_files import written_whole
+from looktwice.model.network.blocks import ConvBlock
+from looktwice.model.network.composer import Composer
 
 FRAME_WIDTH: Final = 224
 FRAME_HEIGHT: Final = 112
@@ -34,7 +36,7 @@ CODE_ROWS, CODE_COLUMNS = FRAME_HEIGHT // 16, FRAME_WIDTH // 16
 CODES: Final = CODE_ROWS * CODE_COLUMNS
 """Codes of a picture, row by row from the upper left."""
 WEIGHTS_FILE: Final = "visual_codes.safetensors"
-_VERSION: Final = 1
+_VERSION: Final = 2
 _WEIGHTS: Final = np.cumprod((1, *LEVELS[:-1])).astype(np.int64)
 """What a level counts in a code: the first changes fastest."""
 _INSIDE: Final = 1e-3
@@ -96,23 +98,26 @@ class VisualCodes(nn.Module):
 
     Args:
         width: channels in the middle; half as many at twice the resolution.
+        composes: whether it has a composer.
 
     Attributes:
         details: how it was made, as its file tells.
+        composer: of pictures half a second later.
     """
 
-    def __init__(self, width: int = 192) -> None:
+    def __init__(self, width: int = 192, *, composes: bool = False) -> None:
         super().__init__()
         self.details: dict[str, object] = {}
+        self.composer = Composer(len(LEVELS)) if composes else None
         half, fine = width // 2, width // 6
         self.width = width
         self.encoder = nn.Sequential(
             nn.PixelUnshuffle(8),
             nn.Conv2d(3 * 64, half, 1),
-            _Block(half),
+            ConvBlock(half),
             nn.Conv2d(half, width, 2, stride=2),
-            _Block(width),
-            _Block(width),
+            ConvBlock(width),
+            ConvBlock(width),
         )
         self.settled = nn.LayerNorm(width)
         self.exit = nn.Linear(width, len(LEVELS))
@@ -122,14 +127,14 @@ class VisualCodes(nn.Module):
         self.place = nn.Parameter(torch.zeros(1, width, CODE_ROWS, CODE_COLUMNS))
         """What is usually where: the sky above, the bonnet below."""
         self.decoder = nn.Sequential(
-            *(_Block(width) for _ in range(4)),
+            *(ConvBlock(width) for _ in range(4)),
             nn.Conv2d(width, 4 * half, 1),
             nn.PixelShuffle(2),
-            _Block(half),
-            _Block(half),
+            ConvBlock(half),
+            ConvBlock(half),
             nn.Conv2d(half, 4 * fine, 3, padding=1),
             nn.PixelShuffle(2),
-            _Block(fine),
+            ConvBlock(fine),
             nn.Conv2d(fine, 3 * 16, 3, padding=1),
             nn.PixelShuffle(4),
         )
@@ -144,11 +149,26 @@ class VisualCodes(nn.Module):
         free: Tensor = self.exit(self.settled(self.encoder(pictures - 0.5).movedim(1, -1)))
         return free
 
+    def levels(self, pictures: Tensor) -> Tensor:
+        """The levels [b, 4, 7, 14] of pictures float [b, 3, 112, 224] in 0..1; without gradients."""
+        return bounded(self.free(pictures)).round().movedim(-1, 1)
+
     def paint(self, levels: Tensor) -> Tensor:
         """The pictures [b, 3, 112, 224] of levels [b, 4, 7, 14]; about 0..1, not clipped."""
-        middle = (torch.tensor(LEVELS, dtype=levels.dtype, device=levels.device) - 1)[:, None, None] / 2
-        painted: Tensor = self.decoder(self.entry(levels / middle - 1) + self.place) + 0.5
+        painted: Tensor = self.decoder(self.entry(_scaled(levels)) + self.place) + 0.5
         return painted
+
+    def compose(self, levels: Tensor, moved: Tensor, before: Tensor) -> Tensor:
+        """The same, with what was seen half a second before; for those that have a composer.
+
+        Args:
+            levels: [b, 4, 7, 14].
+            moved: [b, 3, 112, 224] in 0..1, as the camera would see it if only the ego had moved since.
+            before: [b, 4, 7, 14], the levels of ``moved``.
+        """
+        assert self.composer is not None, "these codes compose no pictures"
+        composed: Tensor = self.composer(self.paint(levels), moved, _scaled(levels), _scaled(before))
+        return composed
 
     @torch.inference_mode()
     def encode(self, frame: Frame) -> IntArray:
@@ -159,27 +179,42 @@ class VisualCodes(nn.Module):
         Raises:
             VisualCodesError: a picture of another size or type; see `frame_of`.
         """
-        if frame.shape != (FRAME_HEIGHT, FRAME_WIDTH, 3) or frame.dtype != np.uint8:
-            shape = [FRAME_HEIGHT, FRAME_WIDTH, 3]
-            raise VisualCodesError(f"a picture must be uint8 {shape}, got {frame.dtype} {list(frame.shape)}")
-        squeezed = bounded(self.free(batch_of([frame]).to(self.place.device))[0])
-        levels = squeezed.round().to(torch.int64).cpu().numpy()
-        return codes_of(levels).ravel()
+        [levels] = self.levels(_checked(frame).to(self.place.device))
+        return codes_of(levels.movedim(0, -1).to(torch.int64).cpu().numpy()).ravel()
 
     @torch.inference_mode()
-    def decode(self, codes: npt.ArrayLike) -> Frame:
-        """The picture uint8 [112, 224, 3] of codes [98]; raises `VisualCodesError` for any others."""
+    def decode(self, codes: npt.ArrayLike, moved: Frame | None = None) -> Frame:
+        """The picture uint8 [112, 224, 3] of codes [98].
+
+        Args:
+            codes: of the picture.
+            moved: what the camera saw half a second before, see `looktwice.model.driving.next_view`. Codes
+                without a composer paint without it.
+
+        Raises:
+            VisualCodesError: other codes, or a picture of another size or type.
+        """
         numbers = np.asarray(codes)
         if numbers.shape != (CODES,):
             raise VisualCodesError(f"a picture has {CODES} codes, got {list(numbers.shape)}")
         grid = levels_of(numbers).reshape(CODE_ROWS, CODE_COLUMNS, len(LEVELS))
         levels = torch.from_numpy(grid).movedim(-1, 0)[None].to(self.place)
-        painted = (self.paint(levels)[0].clamp(0, 1) * 255).round().to(torch.uint8)
-        return painted.movedim(0, -1).cpu().numpy()
+        if self.composer is None or moved is None:
+            painted = self.paint(levels)
+        else:
+            pictures = _checked(moved).to(self.place.device)
+            painted = self.compose(levels, pictures, self.levels(pictures))
+        return (painted[0].clamp(0, 1) * 255).round().to(torch.uint8).movedim(0, -1).cpu().numpy()
 
     def save(self, folder: Path, details: Mapping[str, object]) -> None:
         """Write ``visual_codes.safetensors`` into ``folder``; ``details`` tell how it was made."""
-        about = {"version": _VERSION, "width": self.width, "levels": LEVELS, "details": dict(details)}
+        about = {
+            "version": _VERSION,
+            "width": self.width,
+            "levels": LEVELS,
+            "composes": self.composer is not None,
+            "details": dict(details),
+        }
         state = {name: value.contiguous() for name, value in self.state_dict().items()}
         with written_whole(folder / WEIGHTS_FILE) as temporary:
             save_file(state, temporary, metadata={"looktwice": json.dumps(about)})
@@ -198,7 +233,7 @@ def load_visual_codes(folder: Path) -> VisualCodes:
                 f"{path} has version {about.get('version')} and levels {about.get('levels')}; "
                 f"this LookTwice reads {_VERSION} with {list(LEVELS)}"
             )
-        codes = VisualCodes(about["width"])
+        codes = VisualCodes(about["width"], composes=about["composes"])
         codes.details = dict(about["details"])
         codes.load_state_dict(load_file(path))
     except (SafetensorError, json.JSONDecodeError, KeyError, RuntimeError) as error:
@@ -211,24 +246,21 @@ def batch_of(frames: list[Frame]) -> Tensor:
     return torch.from_numpy(np.stack(frames)).movedim(-1, 1).float() / 255
 
 
+def _scaled(levels: Tensor) -> Tensor:
+    """Levels [b, 4, 7, 14] in -1..1."""
+    most = torch.tensor(LEVELS, dtype=levels.dtype, device=levels.device) - 1
+    return 2 * levels / most[:, None, None] - 1
+
+
+def _checked(frame: Frame) -> Tensor:
+    """A picture as a batch; raises `VisualCodesError`."""
+    if frame.shape != (FRAME_HEIGHT, FRAME_WIDTH, 3) or frame.dtype != np.uint8:
+        shape = [FRAME_HEIGHT, FRAME_WIDTH, 3]
+        raise VisualCodesError(f"a picture must be uint8 {shape}, got {frame.dtype} {list(frame.shape)}")
+    return batch_of([frame])
+
+
 def psnr(picture: Frame, other: Frame) -> float:
     """Peak signal-to-noise ratio in dB of two pictures; at most that of half a grey level everywhere."""
     error = float(((picture.astype(np.float64) - other) ** 2).mean())
     return 10 * math.log10(255**2 / max(error, 0.25))
-
-
-class _Block(nn.Module):
-    """Looks around in each channel, then mixes the channels of each place; added to what came in."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.around = nn.Conv2d(width, width, 5, padding=2, groups=width)
-        self.norm = nn.LayerNorm(width)
-        self.wide = nn.Linear(width, 2 * width)
-        self.narrow = nn.Linear(2 * width, width)
-
-    def forward(self, grid: Tensor) -> Tensor:
-        """[b, width, h, w] to the same."""
-        seen = self.norm(self.around(grid).movedim(1, -1))
-        mixed: Tensor = self.narrow(F.gelu(self.wide(seen), approximate="tanh"))
-        return grid + mixed.movedim(-1, 1)

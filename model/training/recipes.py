@@ -171,6 +171,9 @@ VISUAL_CODES: Final = Recipe(
 )
 """Of the codes of pictures, which start from nothing; see `looktwice.model.training.visual_codes`."""
 
+COMPOSER: Final = Recipe("composer", "code", steps=4000, batch_size=16, learning_rate=1e-3, warmup_steps=200)
+"""Of what composes pictures of codes and of what was seen; see `looktwice.model.training.composer`."""
+
 _READ: Final = Recipe(
     "read",
     "read",

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -43,6 +43,14 @@ _SHEET_COLUMNS: Final = 4
 _SHEET_PICTURES: Final = 8
 
 
+class _OfEpisode(Protocol):
+    @property
+    def episode(self) -> int: ...
+
+
+_Filmed = TypeVar("_Filmed", bound=_OfEpisode)
+
+
 @dataclass(frozen=True)
 class FilmedClip:
     """The encoded pictures of one clip, oldest first, and the episode that they are of."""
@@ -56,7 +64,7 @@ def clips_of(scenes: Iterable[LabelledScene]) -> list[FilmedClip]:
     return [FilmedClip(labelled.seed, clip.images) for labelled in scenes for clip in labelled.scene.clips]
 
 
-def held_out(clips: Sequence[FilmedClip]) -> tuple[list[FilmedClip], list[FilmedClip]]:
+def held_out(clips: Sequence[_Filmed]) -> tuple[list[_Filmed], list[_Filmed]]:
     """Clips to learn from, and those of every tenth episode; raises ValueError for a single episode."""
     episodes = sorted({clip.episode for clip in clips})
     if len(episodes) < 2:
@@ -91,14 +99,19 @@ class VisualCodesLearner(nn.Module):
         self.codes = codes
 
     def forward(self, pictures: Tensor) -> dict[str, Tensor]:
-        """Loss of float pictures [b, 3, 112, 224] in 0..1: absolute errors, of colours and of edges."""
+        """Losses of `painting_losses`, of float pictures [b, 3, 112, 224] in 0..1."""
         painted, _ = self.codes(pictures)
-        colours = F.l1_loss(painted, pictures)
-        edges = sum(
-            (F.l1_loss(painted.diff(dim=side), pictures.diff(dim=side)) for side in (2, 3)),
-            torch.zeros((), device=pictures.device),
-        )
-        return {"loss": colours + _GRADIENT_WEIGHT * edges, "colour_loss": colours, "edge_loss": edges}
+        return painting_losses(painted, pictures)
+
+
+def painting_losses(painted: Tensor, pictures: Tensor) -> dict[str, Tensor]:
+    """Loss of painted pictures [b, 3, h, w] against real ones: absolute errors, of colours and of edges."""
+    colours = F.l1_loss(painted, pictures)
+    edges = sum(
+        (F.l1_loss(painted.diff(dim=side), pictures.diff(dim=side)) for side in (2, 3)),
+        torch.zeros((), device=pictures.device),
+    )
+    return {"loss": colours + _GRADIENT_WEIGHT * edges, "colour_loss": colours, "edge_loss": edges}
 
 
 def train_visual_codes(
@@ -173,7 +186,7 @@ def train_visual_codes(
     return figures
 
 
-def spread(clips: Sequence[FilmedClip], count: int) -> list[FilmedClip]:
+def spread(clips: Sequence[_Filmed], count: int) -> list[_Filmed]:
     """At most ``count`` clips, evenly out of all."""
     places = np.linspace(0, len(clips) - 1, min(count, len(clips))).round().astype(int)
     return [clips[place] for place in places]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
@@ -21,7 +21,8 @@ def train(
             help="create, language, ground, traj-only, meta-act, counterfactual, multi-round; "
             "ladder: all of it, then rollouts, labels and training round by round, and the table; "
             "blind, teacher: the small planners of the tables, without pictures; "
-            "visual-codes: pictures as codes, for models that imagine."
+            "visual-codes: pictures as codes, for models that imagine; "
+            "composer: gives these codes what was seen half a second before."
         ),
     ],
     scenes: Annotated[Path, typer.Option(help="Training scenes: a file or a folder.")],
@@ -29,7 +30,9 @@ def train(
     source: Annotated[
         Path | None,
         typer.Option(
-            "--from", help="Checkpoint folder to start from; of a ladder one that writes meta-actions."
+            "--from",
+            help="Checkpoint folder to start from; of a ladder one that writes meta-actions, for composer "
+            "the codes.",
         ),
     ] = None,
     vision_from: Annotated[Path | None, typer.Option(help="Checkpoint whose vision tower is taken.")] = None,
@@ -106,7 +109,8 @@ def train(
     from looktwice.model.network.card import LOG_FILE
     from looktwice.model.network.precision import bfloat16_is_fast
     from looktwice.model.network.small_planner import DRIVING_KINDS
-    from looktwice.model.training.recipes import NANO, PAPER, VISUAL_CODES, refining_with
+    from looktwice.model.training.composer import train_composer
+    from looktwice.model.training.recipes import COMPOSER, NANO, PAPER, VISUAL_CODES, refining_with
     from looktwice.model.training.run import RunSettings, create, run
     from looktwice.model.training.small import SmallSettings
     from looktwice.model.training.visual_codes import train_visual_codes
@@ -117,8 +121,8 @@ def train(
         torch.set_num_threads(threads)
     with reported_errors():
         if recipe == "create":
-            for name, value in create(scenes, cache, target, seed=seed).items():
-                typer.echo(f"codec {name} {value:.3f}")
+            figures = create(scenes, cache, target, seed=seed)
+            _tell({f"codec {name}": value for name, value in figures.items()})
             return
         if recipe in DRIVING_KINDS:
             codec_from = source or BUNDLED_CHECKPOINT
@@ -126,24 +130,6 @@ def train(
             train_small_in_rounds(
                 recipe, scenes, codec_from, target, settings, validation, rounds, round_episodes
             )
-            return
-        if recipe == VISUAL_CODES.name:
-            if source is not None:
-                raise ValueError("codes of pictures start from nothing: leave --from out")
-            learned = replace(
-                VISUAL_CODES,
-                steps=steps or VISUAL_CODES.steps,
-                batch_size=batch_size or VISUAL_CODES.batch_size,
-                learning_rate=learning_rate or VISUAL_CODES.learning_rate,
-                seed=seed,
-            )
-            # Convolutions are faster in float32 on CPUs, even where matrices are not.
-            figures = train_visual_codes(
-                learned, scenes, target, validation, bf16=bf16 or False, use_cpu=not gpu
-            )
-            for name, value in figures.items():
-                typer.echo(f"{name} {value:.3f}")
-            training_curves(target / LOG_FILE, target / "curves.png")
             return
         if recipe == "ladder":
             if test is None:
@@ -157,12 +143,10 @@ def train(
             )
             climb(target, scenes, test, source, options, every=every, processes=processes)
             return
-        recipes = PAPER if paper else NANO
+        recipes = {each.name: each for each in (VISUAL_CODES, COMPOSER)} | dict(PAPER if paper else NANO)
         if recipe not in recipes:
-            known = ", ".join(["create", "ladder", *DRIVING_KINDS, VISUAL_CODES.name, *recipes])
+            known = ", ".join(["create", "ladder", *DRIVING_KINDS, *recipes])
             raise ValueError(f"unknown recipe {recipe!r}; known are {known}")
-        if source is None:
-            raise ValueError("give the checkpoint to start from: --from FOLDER")
         chosen = recipes[recipe]
         chosen = replace(
             chosen,
@@ -172,6 +156,23 @@ def train(
             vision_rate=chosen.vision_rate if vision_rate is None else vision_rate,
             seed=seed,
         )
+        if recipe == VISUAL_CODES.name:
+            if source is not None:
+                raise ValueError("codes of pictures start from nothing: leave --from out")
+            # Convolutions are faster in float32 on CPUs, even where matrices are not.
+            _tell(train_visual_codes(chosen, scenes, target, validation, bf16=bf16 or False, use_cpu=not gpu))
+            training_curves(target / LOG_FILE, target / "curves.png")
+            return
+        if source is None:
+            raise ValueError("give the checkpoint to start from: --from FOLDER")
+        if recipe == COMPOSER.name:
+            _tell(
+                train_composer(
+                    chosen, scenes, source, target, validation, bf16=bf16 or False, use_cpu=not gpu
+                )
+            )
+            training_curves(target / LOG_FILE, target / "curves.png")
+            return
         if refine_below is not None:
             chosen = refining_with(chosen, threshold=refine_below)
         if refine_by is not None:
@@ -195,6 +196,11 @@ def train(
             failures,
         )
         training_curves(target / LOG_FILE, target / "curves.png")
+
+
+def _tell(figures: Mapping[str, float]) -> None:
+    for name, value in figures.items():
+        typer.echo(f"{name} {value:.3f}")
 
 
 def _options(context: typer.Context, but: Sequence[str]) -> list[str]:

@@ -67,7 +67,7 @@ class NoModel:
         """Nothing is read."""
         raise RequestError("this service runs without a model")
 
-    def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
+    def paint(self, request: PlanRequest, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
         """Nothing is imagined."""
         raise RequestError("this service runs without a model")
 

@@ -140,7 +140,7 @@ class Planning:
                             if isinstance(event, Started):
                                 place.began()
                                 began_s = time.monotonic()
-                                yield Begun(engine.paint)
+                                yield Begun(partial(engine.paint, request))
                                 continue
                             if isinstance(event, DraftFinished):
                                 drafts[event.draw.index] = event.draw
@@ -177,7 +177,15 @@ class Planning:
                 cut = [draw.index for draw in draws if draw.cut is not None]
                 deadline = wire.Deadline(met=deadline_met, cut=cut)
             yield Planned(
-                *(tuple(draws), agreements, drafts, engine.card, timing, deadline, engine.paint),
+                *(
+                    tuple(draws),
+                    agreements,
+                    drafts,
+                    engine.card,
+                    timing,
+                    deadline,
+                    partial(engine.paint, request),
+                ),
                 prompt_tokens=partial(engine.prompt_tokens, request),
             )
 

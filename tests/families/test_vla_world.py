@@ -23,7 +23,7 @@ from looktwice.model.driving.perceived import perceived_of
 from looktwice.model.driving.scene import Clip, LabelledScene, NextFrame, mirrored_camera
 from looktwice.model.driving.short_term import INERTIA
 from looktwice.model.engines.engine import Controls, Draw, PlanRequest, RequestError
-from looktwice.model.engines.requests import begin
+from looktwice.model.engines.requests import begin, painted
 from looktwice.model.engines.torch.decoder import Decoder
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.engines.torch.runner import Runner
@@ -38,6 +38,7 @@ from looktwice.model.families.vla_world.targets import WEIGHTS
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.grammar_export import to_lark
 from looktwice.model.network.checkpoint import Loaded, load, save, with_visual_codes
+from looktwice.model.network.inputs import moved_picture
 from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes, frame_of
 from looktwice.model.network.vocabulary import END_OF_TEXT, Vocabulary
@@ -249,6 +250,24 @@ def test_the_expected_picture_is_what_the_asked_camera_shows_last_moved_as_the_e
             assert [int(code[9:13]) for code in CODE.findall(draw.text)][::2] == expected
             [exact] = reference_draws(painting, asked)
             assert draw.text == exact.text
+
+
+def test_pictures_are_painted_with_what_the_asked_camera_shows() -> None:
+    torch.manual_seed(0)
+    codes = VisualCodes(24, composes=True).eval()
+    scene, written = noisy_scene(1), range(98)
+    [camera, *_] = (clip.camera for clip in scene.clips)
+
+    def paint(camera: str | None, motion: Motion | None = None) -> bytes:
+        controls = Controls(imagine="always", camera=camera, motion=motion)
+        return painted(codes, PlanRequest("a", scene, "vla_world", controls), written).tobytes()
+
+    moved = moved_picture(scene, View(camera))
+    assert moved is not None
+    assert paint(camera) == codes.decode(written, moved).tobytes()
+    assert paint(camera) != paint(camera, Motion(20.0, 0.0, 0.0))
+    # Without a camera that is known, or a picture of it, there are the codes alone.
+    assert paint("back") == paint(None) == codes.decode(written).tobytes()
 
 
 def test_the_camera_that_is_asked_for_stands_in_the_prompt(world: Loaded) -> None:

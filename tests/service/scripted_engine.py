@@ -165,7 +165,7 @@ class ScriptedEngine:
     def prompt_tokens(self, request: PlanRequest) -> int:
         return 100 - 5 * (request.scene.route is None) - 20 * (request.format == "traj_only")
 
-    def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
+    def paint(self, request: PlanRequest, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
         if not self.card_shown.paints:
             raise RequestError("it paints nothing")
         grey = np.resize(np.array(codes) // 4, (7, 14)).astype(np.uint8)

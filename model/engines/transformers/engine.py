@@ -162,9 +162,9 @@ class TransformersEngine:
         """See `Engine.prompt_tokens`."""
         return prompt_tokens(self._loaded.inputs, request)
 
-    def paint(self, codes: Sequence[int]) -> Frame:
+    def paint(self, request: PlanRequest, codes: Sequence[int]) -> Frame:
         """An imagined picture; see `Engine.paint`."""
-        return painted(self._loaded.visual_codes, codes)
+        return painted(self._loaded.visual_codes, request, codes)
 
     def cancel(self, request_id: str) -> None:
         """Drop a request; unknown ids are ignored."""

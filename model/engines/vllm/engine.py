@@ -186,9 +186,9 @@ class VllmEngine:
         """See `Engine.prompt_tokens`."""
         return prompt_tokens(self._parts.inputs, request)
 
-    def paint(self, codes: Sequence[int]) -> Frame:
+    def paint(self, request: PlanRequest, codes: Sequence[int]) -> Frame:
         """An imagined picture; see `Engine.paint`."""
-        return painted(self._parts.visual_codes, codes)
+        return painted(self._parts.visual_codes, request, codes)
 
     def cancel(self, request_id: str) -> None:
         """Drop a request; unknown ids are ignored."""

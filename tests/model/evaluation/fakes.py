@@ -89,7 +89,7 @@ class FakeEngine:
     def prompt_tokens(self, request: PlanRequest) -> int:
         raise RequestError("a fake reads nothing")
 
-    def paint(self, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
+    def paint(self, request: PlanRequest, codes: Sequence[int]) -> npt.NDArray[np.uint8]:
         raise RequestError("a fake paints nothing")
 
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:

@@ -78,6 +78,7 @@ def test_tables_with_and_without_pictures(checkpoint: Path, tmp_path: Path) -> N
         *rows[3:],
         "the last frame",
         "the last frame, moved as the ego",
+        "the last frame, moved as the ego, through its codes",
         "what came, through its codes",
     }
     assert all(row["frechet"] > 0 and len(row["intervals"]["psnr_db"]) == 2 for row in pictures.values())

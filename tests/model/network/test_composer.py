@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from looktwice.model.network.composer import Composer
+from looktwice.model.network.visual_codes import VisualCodes, VisualCodesError, load_visual_codes
+from tests.model.network.test_visual_codes import picture
+
+CODES = list(range(98))
+
+
+@pytest.fixture
+def composing() -> VisualCodes:
+    torch.manual_seed(0)
+    return VisualCodes(24, composes=True).eval()
+
+
+def composer_of(codes: VisualCodes) -> Composer:
+    assert codes.composer is not None
+    return codes.composer
+
+
+def taking(codes: VisualCodes, share: float) -> None:
+    """Have the composer take all of the moved picture, or nothing, and leave the painted one as it is."""
+    finish = composer_of(codes).finish[0]
+    with torch.no_grad():
+        finish.weight.zero_()
+        finish.bias.zero_()
+        finish.bias[:16] = share
+
+
+def test_codes_without_a_composer_paint_without_what_was_seen() -> None:
+    torch.manual_seed(0)
+    plain = VisualCodes(24).eval()
+    np.testing.assert_array_equal(plain.decode(CODES, picture(1)), plain.decode(CODES))
+
+
+def test_a_picture_is_taken_from_the_moved_one_or_painted(composing: VisualCodes) -> None:
+    taking(composing, 50.0)
+    np.testing.assert_array_equal(composing.decode(CODES, picture(1)), picture(1))
+    taking(composing, -50.0)
+    np.testing.assert_array_equal(composing.decode(CODES, picture(1)), composing.decode(CODES))
+
+
+def test_it_looks_elsewhere_in_the_moved_picture(composing: VisualCodes) -> None:
+    taking(composing, 50.0)
+    look = composer_of(composing).look
+    with torch.no_grad():
+        # A tenth of half a picture each: 11.2 pixels to the right.
+        look.bias[0] = 1.0
+    moved = np.zeros((112, 224, 3), np.uint8)
+    moved[:, 100:] = 200
+    seen = composing.decode(CODES, moved)[50, :, 0]
+    assert (seen[:88] == 0).all()
+    assert (seen[90:] == 200).all()
+
+
+def test_what_was_seen_and_both_codes_count(composing: VisualCodes) -> None:
+    composed = composing.decode(CODES, picture(1))
+    assert composed.shape == (112, 224, 3)
+    assert (composed != composing.decode(CODES)).any()
+    assert (composed != composing.decode(CODES, picture(2))).any()
+    assert (composed != composing.decode(CODES[::-1], picture(1))).any()
+
+
+def test_a_composer_is_kept_with_its_codes(composing: VisualCodes, tmp_path: Path) -> None:
+    composing.save(tmp_path, {})
+    again = load_visual_codes(tmp_path)
+    np.testing.assert_array_equal(again.decode(CODES, picture(1)), composing.decode(CODES, picture(1)))
+
+
+def test_moved_pictures_of_other_sizes_are_refused(composing: VisualCodes) -> None:
+    with pytest.raises(VisualCodesError, match="uint8"):
+        composing.decode(CODES, picture(1, 56, 112))

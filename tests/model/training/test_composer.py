@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from typer.testing import CliRunner
+
+from looktwice.model.driving.scene import LabelledScene, NextFrame
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.network.visual_codes import (
+    LEVELS,
+    VisualCodes,
+    VisualCodesError,
+    frame_of,
+    load_visual_codes,
+)
+from looktwice.model.training.composer import (
+    ComposerLearner,
+    PairDataset,
+    collate_pairs,
+    composed_figures,
+    pairs_of,
+    train_composer,
+)
+from looktwice.model.training.recipes import COMPOSER
+from looktwice.model.training.visual_codes import SHEET_FILE
+from looktwice.service.cli.commands import app
+from tests.model.training.test_visual_codes import filmed_scene, road
+
+SHORT = replace(COMPOSER, steps=40, batch_size=4, warmup_steps=5, learning_rate=3e-3)
+
+
+def foreseen_scene(index: int) -> LabelledScene:
+    """Half a second later its first camera sees the same but for the car, its second brings nothing."""
+    made = filmed_scene(index)
+    return replace(made, next_frames=(NextFrame(made.scene.clips[0].camera, road(7000 + index)),))
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes")
+    write_scenes(folder / "a.parquet", [foreseen_scene(index) for index in range(12)])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def codes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("codes")
+    torch.manual_seed(0)
+    VisualCodes(24).save(folder, {"steps": 7})
+    return folder
+
+
+def test_composing_is_learned_and_the_codes_stay(scenes: Path, codes: Path, tmp_path: Path) -> None:
+    figures = train_composer(SHORT, scenes, codes, tmp_path, measured_pairs=2, validate_every=20)
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    measured = [row for row in rows if "composed_psnr_db" in row]
+    assert [row["step"] for row in measured] == [20, 40]
+    assert figures["composed_psnr_db"] == pytest.approx(measured[-1]["composed_psnr_db"])
+    # Codes that say nothing paint nothing; most of the picture is the one of half a second before.
+    assert figures["composed_psnr_db"] > figures["painted_psnr_db"] + 5
+    before, after = load_visual_codes(codes), load_visual_codes(tmp_path)
+    learned = after.state_dict()
+    for name, value in before.state_dict().items():
+        assert torch.equal(value, learned[name]), name
+    composer = after.details["composer"]
+    assert isinstance(composer, dict)
+    assert (after.details["steps"], composer["steps"], composer["pairs"]) == (7, 40, 10)
+    # Two rows of what was seen, what came, and what was made of it.
+    with Image.open(tmp_path / SHEET_FILE) as sheet:
+        assert sheet.size == (3 * 228 - 4, 2 * 116 - 4)
+
+
+def test_pairs_are_of_cameras_that_show_both_moments() -> None:
+    [pair] = pairs_of([foreseen_scene(3)])
+    scene = foreseen_scene(3).scene
+    assert (pair.camera, pair.seen) == (scene.clips[0].camera, scene.clips[0].images[-1])
+    moved, came = pair.frames()
+    np.testing.assert_array_equal(came, frame_of(road(7003)))
+    assert (moved != frame_of(pair.seen)).any()
+
+
+def test_pairs_are_mirrored_together() -> None:
+    pairs = pairs_of([foreseen_scene(0)])
+    moved, came = pairs[0].frames()
+    dataset = PairDataset(pairs)
+    seen = [dataset[0] for _ in range(40)]
+    plain = [(one == moved).all() and (other == came).all() for one, other in seen]
+    mirrored = [(one == moved[:, ::-1]).all() and (other == came[:, ::-1]).all() for one, other in seen]
+    assert any(plain)
+    assert any(mirrored)
+    assert all(one or other for one, other in zip(plain, mirrored, strict=True))
+
+
+def test_spoilt_levels_are_levels() -> None:
+    random = torch.Generator().manual_seed(0)
+    most = torch.tensor(LEVELS)[:, None, None]
+    levels, before = ((torch.rand(64, 4, 7, 14, generator=random) * most).floor() for _ in range(2))
+    torch.manual_seed(0)
+    spoilt = ComposerLearner._spoilt(levels, before)
+    assert torch.equal(spoilt, spoilt.round())
+    assert ((spoilt >= 0) & (spoilt < most)).all()
+    wrong = (spoilt != levels).any(dim=1).float().mean(dim=(1, 2))
+    assert wrong.min() < 0.1
+    assert wrong.max() > 0.5
+
+
+def test_composed_figures(codes: Path) -> None:
+    composing = VisualCodes(24, composes=True)
+    figures = composed_figures(composing, pairs_of([foreseen_scene(0), foreseen_scene(1)]))
+    assert figures["measured_pairs"] == 2
+    assert set(figures) == {"moved_psnr_db", "painted_psnr_db", "composed_psnr_db", "measured_pairs"}
+    batch = collate_pairs([pair.frames() for pair in pairs_of([foreseen_scene(0)])])
+    losses = ComposerLearner(composing)(**batch)
+    losses["loss"].backward()
+    learned = {name for name, value in composing.named_parameters() if value.grad is not None}
+    assert {name.split(".")[0] for name in learned} == {"composer"}
+
+
+def test_what_cannot_be_learned_from_is_refused(scenes: Path, codes: Path, tmp_path: Path) -> None:
+    write_scenes(tmp_path / "plain.parquet", [filmed_scene(0)])
+    with pytest.raises(ValueError, match="--next-frames"):
+        train_composer(SHORT, tmp_path / "plain.parquet", codes, tmp_path / "to", scenes)
+    VisualCodes(24, composes=True).save(tmp_path, {})
+    with pytest.raises(VisualCodesError, match="composer already"):
+        train_composer(SHORT, scenes, tmp_path, tmp_path / "to")
+
+
+def test_the_command(scenes: Path, codes: Path, tmp_path: Path) -> None:
+    asked = ["train", "composer", "--scenes", str(scenes), "--to", str(tmp_path / "codes")]
+    refused = CliRunner().invoke(app, asked)
+    assert refused.exit_code == 2
+    assert "--from" in refused.output
+    done = CliRunner().invoke(
+        app, [*asked, "--from", str(codes), "--steps", "2", "--batch-size", "2"], catch_exceptions=False
+    )
+    assert done.exit_code == 0, done.output
+    assert "composed_psnr_db " in done.output
+    assert {path.name for path in (tmp_path / "codes").iterdir()} >= {
+        "visual_codes.safetensors",
+        "log.jsonl",
+        "pictures.png",
+        "curves.png",
+    }
