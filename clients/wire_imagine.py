@@ -53,6 +53,11 @@ class ImagineControls(RequestModel):
         description="How metres are chosen: least_error takes the ones of least expected error, drawn draws "
         "them as words are.",
     )
+    codes: Decision = Field(
+        default="least_error",
+        description="How the picture's codes are chosen, in the same two ways. Drawn ones show what else may "
+        "be seen, and are noisier.",
+    )
 
 
 class ImagineRequest(RequestModel):

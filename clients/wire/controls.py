@@ -81,7 +81,8 @@ class ReflectControls(RequestModel):
         "of least expected error, drawn draws them as words are.",
     )
     codes: Decision = Field(
-        default="least_error", description="How trajectory codes are chosen, in the same two ways."
+        default="least_error",
+        description="How trajectory codes and those of pictures are chosen, in the same two ways.",
     )
     bind: bool = Field(
         default=False,

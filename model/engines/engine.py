@@ -66,7 +66,7 @@ class Controls:
         numbers: how numbers in the text are chosen, such as the times of a plan: ``least_error`` takes the
             one that is expected to be off the least (`looktwice.model.engines.least_error`), ``drawn`` draws
             them as words are.
-        codes: how trajectory codes are chosen, likewise.
+        codes: how trajectory codes and those of pictures are chosen, likewise.
         bind: only trajectories may be begun that do what the plan says (`looktwice.model.engines.binding`).
         reasons: what a reflection in phrases may state: only what has a reason ``in_view``, as far as the
             model can know, or ``any`` statement (`looktwice.model.engines.reason_mask`).

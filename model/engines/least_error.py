@@ -1,14 +1,14 @@
-"""Numbers and trajectory codes of least expected error: the controls ``numbers`` and ``codes``. No torch.
+"""Numbers and codes of least expected error: the controls ``numbers`` and ``codes``. No torch.
 
 A network that is unsure spreads its probability over codes, or over end times, that lie far apart. What is
 drawn from them, or the likeliest, may be a mode that few others support; the one whose expected distance to
 what the network believes is least costs the fewest metres (minimum Bayes risk, https://aclanthology.org/N04-1022).
-Of evenly spaced numbers that is the median.
+Of evenly spaced numbers that is the median, and of a picture's code the median of each of its levels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final, Protocol
 
@@ -17,11 +17,22 @@ import numpy.typing as npt
 
 from looktwice.model.engines.engine import Controls
 from looktwice.model.engines.sampling import Array, probabilities
+from looktwice.model.families.picture_codes import LEVELS, PICTURE, PICTURE_CODEBOOK, levels_of
 from looktwice.model.formats.cursor import Allowed
 from looktwice.model.network.codec import TrajectoryCodec
 
+_NUMBER: Final = np.repeat(np.arange(len(LEVELS)), LEVELS)
+_LEVEL: Final = np.concatenate([np.arange(count) for count in LEVELS])
+"""int64 [23], of all levels of a picture code's four numbers: which number, and which level of it."""
+_PLACE: Final = _LEVEL / (np.array(LEVELS) - 1)[_NUMBER]
+_LEVELS_APART: Final = np.abs(_PLACE[:, None] - _PLACE) * (_NUMBER[:, None] == _NUMBER)
+"""float64 [23, 23]; levels of different numbers have nothing to do with each other."""
+_HAS_LEVEL: Final = (levels_of(range(PICTURE_CODEBOOK)).T[_NUMBER] == _LEVEL[:, None]).astype(np.float64)
+"""float64 [23, 1000]: 1.0 where a code has a level."""
+
 Expected = Callable[[Array], Array]
-"""From probabilities [k] to the expected error [k] of each choice, in metres or in steps between numbers."""
+"""From probabilities [k] to the expected error [k] of each choice: in metres, in steps between numbers, or in
+shares of the way between a picture's outermost levels."""
 
 
 class CodeIds(Protocol):
@@ -29,6 +40,11 @@ class CodeIds(Protocol):
 
     def code_ids(self, stage: int) -> range:
         """Ids of the trajectory codes of one stage."""
+        ...
+
+    @property
+    def alphabets(self) -> Mapping[str, tuple[range, ...]]:
+        """Ids of named alphabets, of picture codes among them."""
         ...
 
 
@@ -40,14 +56,21 @@ class LeastError:
         self._stages: Final = {
             vocabulary.code_ids(stage).start: stage for stage in range(len(self._codes_apart_m))
         }
+        pictures = vocabulary.alphabets.get(PICTURE)
+        self._picture_ids: Final = pictures[0] if pictures else None
 
     def expected(self, allowed: Allowed, controls: Controls) -> Expected | None:
         """The expected error of choosing each allowed id; None where the next token is drawn."""
         if allowed.ranks is not None:
             return partial(_steps_off, allowed.ranks) if controls.numbers == "least_error" else None
-        if controls.codes == "drawn" or len(allowed.ids) != self._codes_apart_m.shape[1]:
+        if controls.codes == "drawn":
             return None
-        stage = self._stages.get(int(allowed.ids[0]))
+        first, count = int(allowed.ids[0]), len(allowed.ids)
+        if self._picture_ids is not None and (first, count) == (self._picture_ids.start, PICTURE_CODEBOOK):
+            return _levels_off
+        if count != self._codes_apart_m.shape[1]:
+            return None
+        stage = self._stages.get(first)
         return None if stage is None else partial(_metres_off, self._codes_apart_m[stage])
 
 
@@ -68,6 +91,12 @@ def least_error(logits: Array, expected: Expected, left: npt.NDArray[np.bool_] |
 def _metres_off(apart_m: Array, believed: Array) -> Array:
     errors_m: Array = believed @ apart_m
     return errors_m
+
+
+def _levels_off(believed: Array) -> Array:
+    """float64 [1000]: the mean distance of each picture code to the others, summed over its levels."""
+    errors: Array = _LEVELS_APART @ (_HAS_LEVEL @ believed) @ _HAS_LEVEL
+    return errors
 
 
 def _steps_off(ranks: npt.NDArray[np.int64], believed: Array) -> Array:

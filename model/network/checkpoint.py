@@ -20,6 +20,7 @@ from safetensors import SafetensorError
 from transformers import AutoTokenizer, Qwen2_5_VLConfig
 from transformers.utils import logging as transformers_logging
 
+from looktwice.model.families.picture_codes import VisualCodesError
 from looktwice.model.network.card import (
     CheckpointError,
     read_card,
@@ -34,7 +35,7 @@ from looktwice.model.network.numbers import needed_numbers, write_number_embeddi
 from looktwice.model.network.repository import write_repository
 from looktwice.model.network.settings import SettingsError, VlaSettings
 from looktwice.model.network.visual_codes import WEIGHTS_FILE as VISUAL_CODES_FILE
-from looktwice.model.network.visual_codes import VisualCodes, VisualCodesError, load_visual_codes
+from looktwice.model.network.visual_codes import VisualCodes, load_visual_codes
 from looktwice.model.network.vla import (
     LookTwiceVla,
     VlaConfig,

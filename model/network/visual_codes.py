@@ -25,29 +25,26 @@ from torch import Tensor, nn
 
 from looktwice.model.driving.images import decode_image
 from looktwice.model.driving.whole_files import written_whole
+from looktwice.model.families.picture_codes import (
+    LEVELS,
+    PICTURE_CODES,
+    IntArray,
+    VisualCodesError,
+    codes_of,
+    levels_of,
+)
 from looktwice.model.network.blocks import ConvBlock
 from looktwice.model.network.composer import Composer
 
 FRAME_WIDTH: Final = 224
 FRAME_HEIGHT: Final = 112
-LEVELS: Final = (8, 5, 5, 5)
-CODEBOOK_SIZE: Final = math.prod(LEVELS)
 CODE_ROWS, CODE_COLUMNS = FRAME_HEIGHT // 16, FRAME_WIDTH // 16
-CODES: Final = CODE_ROWS * CODE_COLUMNS
-"""Codes of a picture, row by row from the upper left."""
 WEIGHTS_FILE: Final = "visual_codes.safetensors"
 _VERSION: Final = 2
-_WEIGHTS: Final = np.cumprod((1, *LEVELS[:-1])).astype(np.int64)
-"""What a level counts in a code: the first changes fastest."""
 _INSIDE: Final = 1e-3
 """Keeps the outermost levels reachable: tanh itself reaches its bounds nowhere."""
 
-IntArray = npt.NDArray[np.int64]
 Frame = npt.NDArray[np.uint8]
-
-
-class VisualCodesError(ValueError):
-    """Codes, a picture or a file that cannot be used; the text says why."""
 
 
 def frame_of(encoded: bytes) -> Frame:
@@ -57,28 +54,6 @@ def frame_of(encoded: bytes) -> Frame:
     if picture.shape[1::-1] == size:
         return picture
     return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX), np.uint8)
-
-
-def levels_of(codes: npt.ArrayLike) -> IntArray:
-    """The levels int64 [..., 4] of codes [...]; raises `VisualCodesError` for a number that is no code."""
-    numbers = np.asarray(codes)
-    if not np.issubdtype(numbers.dtype, np.integer):
-        raise VisualCodesError(f"codes are whole numbers, not {numbers.dtype}")
-    if ((numbers < 0) | (numbers >= CODEBOOK_SIZE)).any():
-        raise VisualCodesError(f"codes lie in 0..{CODEBOOK_SIZE - 1}, got {numbers.min()}..{numbers.max()}")
-    levels: IntArray = numbers.astype(np.int64)[..., None] // _WEIGHTS % np.array(LEVELS)
-    return levels
-
-
-def codes_of(levels: npt.ArrayLike) -> IntArray:
-    """The codes int64 [...] of levels [..., 4]: `levels_of` undone; raises `VisualCodesError`."""
-    numbers = np.asarray(levels)
-    if numbers.shape[-1:] != (len(LEVELS),) or not np.issubdtype(numbers.dtype, np.integer):
-        raise VisualCodesError(f"levels are whole numbers [..., {len(LEVELS)}]")
-    if ((numbers < 0) | (numbers >= np.array(LEVELS))).any():
-        raise VisualCodesError(f"levels lie below {', '.join(map(str, LEVELS))}, and from 0 on")
-    codes: IntArray = (numbers.astype(np.int64) * _WEIGHTS).sum(axis=-1)
-    return codes
 
 
 def bounded(free: Tensor) -> Tensor:
@@ -195,8 +170,8 @@ class VisualCodes(nn.Module):
             VisualCodesError: other codes, or a picture of another size or type.
         """
         numbers = np.asarray(codes)
-        if numbers.shape != (CODES,):
-            raise VisualCodesError(f"a picture has {CODES} codes, got {list(numbers.shape)}")
+        if numbers.shape != (PICTURE_CODES,):
+            raise VisualCodesError(f"a picture has {PICTURE_CODES} codes, got {list(numbers.shape)}")
         grid = levels_of(numbers).reshape(CODE_ROWS, CODE_COLUMNS, len(LEVELS))
         levels = torch.from_numpy(grid).movedim(-1, 0)[None].to(self.place)
         if self.composer is None or moved is None:

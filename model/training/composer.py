@@ -1,7 +1,8 @@
 """Training of the composer of pictures: what to take from half a second before, and what to paint from codes.
 
 The codes stay as they are, so models that write them need not learn anything anew. A model writes some codes
-wrong, most of them as if nothing had changed. So the composer learns with some codes spoilt in that way.
+wrong, most of them as if nothing had changed. So the composer learns with any share of them spoilt in that
+way, and learns how far to trust them.
 """
 
 from __future__ import annotations
@@ -23,12 +24,11 @@ from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.driving.whole_files import written_whole
+from looktwice.model.families.picture_codes import LEVELS, VisualCodesError
 from looktwice.model.network.composer import Composer
 from looktwice.model.network.visual_codes import (
-    LEVELS,
     Frame,
     VisualCodes,
-    VisualCodesError,
     batch_of,
     frame_of,
     load_visual_codes,
@@ -40,8 +40,6 @@ from looktwice.model.training.trainer import LearnerTrainer
 from looktwice.model.training.visual_codes import SHEET_FILE, held_out, painting_losses, spread
 
 _SHEET_PICTURES: Final = 6
-_UNCHANGED_SHARE: Final = 0.6
-"""The most codes that are spoilt to what is expected."""
 _STEPPED_SHARE: Final = 0.25
 """The most levels that are spoilt by one up or down."""
 
@@ -126,7 +124,7 @@ class ComposerLearner(nn.Module):
     def _spoilt(levels: Tensor, before: Tensor) -> Tensor:
         """Levels [b, 4, 7, 14] with mistakes as models make them, more in some pictures than in others."""
         each = levels.new_empty(len(levels), 1, 1, 1)
-        unchanged = torch.rand_like(levels[:, :1]) < _UNCHANGED_SHARE * each.uniform_() ** 2
+        unchanged = torch.rand_like(levels) < each.uniform_()
         mixed = torch.where(unchanged, before, levels)
         stepped = torch.rand_like(levels) < _STEPPED_SHARE * each.uniform_()
         most = torch.tensor(LEVELS, dtype=levels.dtype, device=levels.device)[:, None, None] - 1

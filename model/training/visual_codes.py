@@ -19,10 +19,10 @@ from looktwice.model.driving.images import encode_png, tiled
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.whole_files import written_whole
+from looktwice.model.families.picture_codes import PICTURE_CODEBOOK
 from looktwice.model.network.visual_codes import (
     CODE_COLUMNS,
     CODE_ROWS,
-    CODEBOOK_SIZE,
     FRAME_HEIGHT,
     FRAME_WIDTH,
     Frame,
@@ -217,7 +217,7 @@ def picture_figures(codes: VisualCodes, clips: Sequence[FilmedClip]) -> dict[str
     return {
         "psnr_db": float(np.mean(psnr_db)),
         "patch_psnr_db": float(np.mean(patch_db)),
-        "codes_used": len(used) / CODEBOOK_SIZE,
+        "codes_used": len(used) / PICTURE_CODEBOOK,
         "codes_kept": float(np.mean(kept)),
         "pictures": float(len(psnr_db)),
     }

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from looktwice.model.engines.least_error import Expected, LeastError, least_erro
 from looktwice.model.engines.sampling import probabilities
 from looktwice.model.engines.torch.decoder import Decoder
 from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.families.picture_codes import levels_of
 from looktwice.model.formats.cursor import Allowed
 from looktwice.model.network.checkpoint import Loaded, load
 from tests.checkpoints import noisy_scene
@@ -62,6 +64,40 @@ def codes_expected(loaded: Loaded, least: LeastError, stage: int) -> Expected:
     expected = least.expected(allowed, Controls(numbers="drawn"))
     assert expected is not None
     return expected
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 20.0))
+def test_no_other_picture_is_expected_to_be_off_less(painting: LeastError, seed: int, sharp: float) -> None:
+    random = np.random.default_rng(seed)
+    logits, left = sharp * random.normal(size=1000), random.random(1000) < 0.5
+    left[0] = True
+    allowed = Allowed(np.arange(5000, 6000), "visual")
+    assert painting.expected(allowed, Controls(codes="drawn")) is None
+    expected = painting.expected(allowed, Controls())
+    assert expected is not None
+    place = least_error(logits, expected, left)
+    assert left[place]
+    levels = levels_of(np.arange(1000))
+    placed = levels / np.array([7, 4, 4, 4])
+    believed = probabilities(logits[left])
+    off = np.abs(placed[:, None] - placed[left]).sum(axis=-1) @ believed
+    assert off[place] == pytest.approx(off[left].min())
+    # Where all may be chosen, that is each level's median.
+    for number, chosen in enumerate(levels[least_error(logits, expected)]):
+        share = np.bincount(levels[:, number], probabilities(logits))
+        assert share[:chosen].sum() <= 0.5 + 1e-9
+        assert share[: chosen + 1].sum() >= 0.5 - 1e-9
+
+
+@pytest.fixture(scope="module")
+def painting(loaded: Loaded) -> LeastError:
+    """Of a tokenizer that has codes of pictures, too."""
+
+    class Painting:
+        alphabets: Final = {"visual": (range(5000, 6000),)}
+        code_ids = staticmethod(loaded.vocabulary.code_ids)
+
+    return LeastError(loaded.codec, Painting())
 
 
 def test_words_are_drawn(loaded: Loaded, least: LeastError) -> None:

@@ -40,7 +40,6 @@ from looktwice.model.families.vla_world.rewards import REWARDS, STEADY_SHARE, re
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.pieces import FormatError, Values
 from looktwice.model.formats.text import parse
-from looktwice.model.network.visual_codes import CODEBOOK_SIZE, CODES
 from tests.model.driving.drives import MIDDLES_S, drive, labelled_scene
 from tests.model.driving.test_perceived import PERCEIVED
 from tests.model.formats.strategies import values_of
@@ -163,7 +162,6 @@ def test_what_is_rendered_can_be_written_by_the_cursor(data: st.DataObject) -> N
 def test_a_picture_is_98_codes_and_nothing_else() -> None:
     sections = [token.section for token in compiled().render(SAMPLE)]
     assert list(dict.fromkeys(sections)) == list(VLA_WORLD_FORMAT.sections())
-    assert (PICTURE_CODES, PICTURE_CODEBOOK) == (CODES, CODEBOOK_SIZE)
     text = written(SAMPLE)
     for wrong in (
         text.replace("<|visual_97|>", ""),

@@ -19,6 +19,7 @@ from transformers import (
 )
 
 from looktwice.model.families.family import Situation
+from looktwice.model.families.picture_codes import levels_of
 from looktwice.model.network.card import CARD_FILE, CheckpointError, read_card, weights_revision
 from looktwice.model.network.checkpoint import Loaded, create_nano, expand_stock, load, save, with_formats
 from looktwice.model.network.codec import CODEC_FILE, TrajectoryCodec
@@ -27,7 +28,7 @@ from looktwice.model.network.repository import write_repository
 from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.small_planner import SmallPlanner, small_revision
 from looktwice.model.network.visual_codes import WEIGHTS_FILE as VISUAL_CODES_FILE
-from looktwice.model.network.visual_codes import VisualCodes, levels_of
+from looktwice.model.network.visual_codes import VisualCodes
 from looktwice.model.network.vocabulary import QWEN_TOKENS, Vocabulary, build_nano_tokenizer
 from tests.model.network.conftest import made_up_scene
 

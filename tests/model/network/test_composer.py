@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from looktwice.model.families.picture_codes import VisualCodesError
 from looktwice.model.network.composer import Composer
-from looktwice.model.network.visual_codes import VisualCodes, VisualCodesError, load_visual_codes
+from looktwice.model.network.visual_codes import VisualCodes, load_visual_codes
 from tests.model.network.test_visual_codes import picture
 
 CODES = list(range(98))

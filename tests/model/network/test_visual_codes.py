@@ -10,24 +10,26 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
 from looktwice.model.driving.images import encode_png
-from looktwice.model.network.visual_codes import (
-    CODEBOOK_SIZE,
-    CODES,
+from looktwice.model.families.picture_codes import (
     LEVELS,
+    PICTURE_CODEBOOK,
+    PICTURE_CODES,
+    VisualCodesError,
+    codes_of,
+    levels_of,
+)
+from looktwice.model.network.visual_codes import (
     WEIGHTS_FILE,
     Frame,
     VisualCodes,
-    VisualCodesError,
     batch_of,
     bounded,
-    codes_of,
     frame_of,
-    levels_of,
     load_visual_codes,
     quantised,
 )
 
-codes = st.integers(0, CODEBOOK_SIZE - 1)
+codes = st.integers(0, PICTURE_CODEBOOK - 1)
 
 
 def picture(seed: int, height: int = 112, width: int = 224) -> Frame:
@@ -53,10 +55,10 @@ def test_levels_are_their_code(levels: tuple[int, ...]) -> None:
 
 
 def test_there_are_a_thousand_codes_and_each_has_levels_of_its_own() -> None:
-    assert (CODEBOOK_SIZE, CODES) == (1000, 98)
-    every = levels_of(np.arange(CODEBOOK_SIZE).reshape(10, 100))
+    assert (PICTURE_CODEBOOK, PICTURE_CODES) == (1000, 98)
+    every = levels_of(np.arange(PICTURE_CODEBOOK).reshape(10, 100))
     assert every.shape == (10, 100, 4)
-    assert len(np.unique(every.reshape(-1, 4), axis=0)) == CODEBOOK_SIZE
+    assert len(np.unique(every.reshape(-1, 4), axis=0)) == PICTURE_CODEBOOK
 
 
 @pytest.mark.parametrize("wrong", [[-1], [1000], [0.5]])
@@ -91,7 +93,7 @@ def test_gradients_pass_the_rounding_as_if_it_were_not_there() -> None:
 def test_a_picture_becomes_codes_and_codes_a_picture(small: VisualCodes) -> None:
     frame = picture(0)
     written = small.encode(frame)
-    assert written.shape == (CODES,)
+    assert written.shape == (PICTURE_CODES,)
     assert written.dtype == np.int64
     painted = small.decode(written)
     assert painted.shape == frame.shape
@@ -117,7 +119,7 @@ def test_a_code_paints_around_its_patch(small: VisualCodes) -> None:
     """The order of codes is that of the patches: row by row from the upper left."""
     written = small.encode(picture(1))
     changed = written.copy()
-    changed[2 * 14 + 3] = (changed[2 * 14 + 3] + 500) % CODEBOOK_SIZE
+    changed[2 * 14 + 3] = (changed[2 * 14 + 3] + 500) % PICTURE_CODEBOOK
     apart = np.abs(small.decode(written).astype(int) - small.decode(changed)).sum(axis=2)
     row, column = (
         float(np.average(np.arange(side.size), weights=side)) for side in (apart.sum(1), apart.sum(0))

@@ -12,13 +12,8 @@ from typer.testing import CliRunner
 
 from looktwice.model.driving.scene import LabelledScene, NextFrame
 from looktwice.model.driving.scene_store import write_scenes
-from looktwice.model.network.visual_codes import (
-    LEVELS,
-    VisualCodes,
-    VisualCodesError,
-    frame_of,
-    load_visual_codes,
-)
+from looktwice.model.families.picture_codes import LEVELS, VisualCodesError
+from looktwice.model.network.visual_codes import VisualCodes, frame_of, load_visual_codes
 from looktwice.model.training.composer import (
     ComposerLearner,
     PairDataset,
@@ -106,8 +101,8 @@ def test_spoilt_levels_are_levels() -> None:
     assert torch.equal(spoilt, spoilt.round())
     assert ((spoilt >= 0) & (spoilt < most)).all()
     wrong = (spoilt != levels).any(dim=1).float().mean(dim=(1, 2))
-    assert wrong.min() < 0.1
-    assert wrong.max() > 0.5
+    assert wrong.min() < 0.2
+    assert wrong.max() > 0.8
 
 
 def test_composed_figures(codes: Path) -> None:
