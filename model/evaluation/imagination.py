@@ -14,12 +14,14 @@ from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.trajectory import TEN_HZ_S
 from looktwice.model.engines.engine import Controls, Draw, Engine
 from looktwice.model.evaluation.bootstrap import Comparison, compare
+from looktwice.model.evaluation.entering import EnteringResult, evaluate_entering
 from looktwice.model.evaluation.figures import FigureRow, figure_table
 from looktwice.model.evaluation.next_frames import (
     Painter,
     Pictures,
     TowerFeatures,
     copied,
+    imagined_codes,
     measure_pictures,
     through_codes,
     warped,
@@ -119,6 +121,8 @@ class ImaginationReport:
         responses: what responses took.
         actions: scores by row.
         pictures: rows, and ``frechet`` among their measures.
+        entering: how many of those who enter a view the pictures of all such cameras show; no rows where
+            nobody does.
         comparisons: what should differ, pair by pair.
         shown: of a few scenes what the camera saw last, what was imagined, and what came.
     """
@@ -128,6 +132,7 @@ class ImaginationReport:
     responses: Sequence[FigureRow]
     actions: Mapping[str, Sequence[ActionScore]]
     pictures: Sequence[FigureRow]
+    entering: Sequence[FigureRow]
     comparisons: Sequence[Comparison]
     shown: Sequence[tuple[Frame, Frame, Frame]] = ()
 
@@ -139,6 +144,7 @@ class ImaginationReport:
             "responses": [row.to_json() for row in self.responses],
             "actions": {name: [asdict(score) for score in of] for name, of in self.actions.items()},
             "pictures": [row.to_json() for row in self.pictures],
+            "entering": [row.to_json() for row in self.entering],
             "comparisons": [asdict(comparison) for comparison in self.comparisons],
         }
 
@@ -154,6 +160,8 @@ class ImaginationReport:
             [name, *(cell(score.f1, "{:.1%}") for score in of)] for name, of in self.actions.items()
         ]
         yield figure_table(f"pictures, by the {self.extractor}", self.pictures, _PICTURE_COLUMNS, _INTERVALS)
+        if self.entering:
+            yield figure_table("entering a view", self.entering, _ENTERING_COLUMNS, _INTERVALS)
         yield [comparison_cells(comparison) for comparison in self.comparisons]
 
 
@@ -191,7 +199,7 @@ async def evaluate_imagination(
         draws[variant.name][scene_id] = of
         if variant.next_camera:
             request = request_for(labelled, variant)
-            foreseen.setdefault(variant.name, {})[scene_id] = engine.paint(request, _codes(of[0]))
+            foreseen.setdefault(variant.name, {})[scene_id] = engine.paint(request, imagined_codes(of[0]))
 
     await evaluate_variants(
         engine, scenes, variants, concurrency=concurrency, on_result=on_result, on_draws=keep
@@ -210,6 +218,12 @@ async def evaluate_imagination(
     assert codes is not None, "a checkpoint that paints has them"
     painters |= {COPIED: copied, WARPED: warped}
     painters |= {UNCHANGED: through_codes(codes, warped), CODED: through_codes(codes, what_came)}
+    entered: dict[str, list[EnteringResult]] = {}
+    for variant in variants:
+        if variant.name == ASKED:
+            entered = await evaluate_entering(
+                engine, scenes, variant, {CODED: painters[CODED]}, concurrency=concurrency
+            )
     extractor = TowerFeatures(loaded)
     pictures = measure_pictures(scenes, cameras, painters, extractor)
     shown = []
@@ -226,6 +240,7 @@ async def evaluate_imagination(
         [FigureRow.of(name, of, ("imagine_rate", "passes")) for name, of in responses.items()],
         actions,
         [_picture_row(name, of) for name, of in pictures.items()],
+        [FigureRow.of(name, of, ("shown",)) for name, of in entered.items()],
         list(_comparisons(waypoints, responses, pictures)),
         shown,
     )
@@ -260,13 +275,6 @@ def _response(labelled: LabelledScene, draws: Sequence[Draw]) -> ResponseResult:
     return ResponseResult(*about, float(np.mean(imagined)), float(np.mean(passes)))
 
 
-def _codes(draw: Draw) -> Sequence[int]:
-    foreseen = draw.foreseen
-    assert foreseen is not None
-    assert foreseen.picture is not None, "a picture was asked for"
-    return foreseen.picture.codes
-
-
 def _kept(pictures: Mapping[str, Frame], labelled: LabelledScene, camera: str) -> Frame:
     return pictures[labelled.scene.scene_id]
 
@@ -297,7 +305,7 @@ def _comparisons(
             yield compare(f"{one} : {other}", pictures[one].results, pictures[other].results, measure)
 
 
-_INTERVALS: Final = frozenset({"l2_m", "collision_rate", "passes", *_PICTURE_MEASURES, "frechet"})
+_INTERVALS: Final = frozenset({"l2_m", "collision_rate", "passes", *_PICTURE_MEASURES, "frechet", "shown"})
 """Measures whose intervals the text shows; JSON has all."""
 _TIMES: Final = ("1 s", "2 s", "3 s", "mean")
 _WAYPOINT_COLUMNS: Final[Columns] = dict(
@@ -314,6 +322,7 @@ _RESPONSE_COLUMNS: Final[Columns] = {
     "imagine_rate": ("imagines", "{:.1%}"),
     "passes": ("passes", "{:.1f}"),
 }
+_ENTERING_COLUMNS: Final[Columns] = {"shown": ("shown", "{:.1%}")}
 _PICTURE_COLUMNS: Final[Columns] = {
     "psnr_db": ("PSNR, dB", "{:.2f}"),
     "feature_distance": ("features apart", "{:.3f}"),

@@ -17,6 +17,7 @@ import torch
 from looktwice.model.driving.intervals import Interval
 from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.engines.engine import Draw
 from looktwice.model.network.checkpoint import Loaded
 from looktwice.model.network.patches import resize
 from looktwice.model.network.visual_codes import Frame, VisualCodes, frame_of, psnr
@@ -123,6 +124,14 @@ def what_came(labelled: LabelledScene, camera: str) -> Frame:
         if frame.camera == camera:
             return frame_of(frame.image)
     raise ValueError(f"scene {labelled.scene.scene_id} does not bring what {camera} saw half a second later")
+
+
+def imagined_codes(draw: Draw) -> tuple[int, ...]:
+    """The codes of the picture that a draw imagines, which was asked to."""
+    foreseen = draw.foreseen
+    assert foreseen is not None
+    assert foreseen.picture is not None, "a picture was asked for"
+    return foreseen.picture.codes
 
 
 def copied(labelled: LabelledScene, camera: str) -> Frame:

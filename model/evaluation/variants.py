@@ -220,15 +220,19 @@ def next_camera(labelled: LabelledScene) -> str:
 
     Which one follows from the scene's name. Raises ValueError where there is none.
     """
-    scene = labelled.scene
-    shown = {clip.camera for clip in scene.clips}
-    cameras = [frame.camera for frame in labelled.next_frames if frame.camera in shown]
+    scene_id, cameras = labelled.scene.scene_id, cameras_ahead(labelled)
     if not cameras:
         raise ValueError(
-            f"scene {scene.scene_id} brings no picture half a second ahead: "
+            f"scene {scene_id} brings no picture half a second ahead: "
             "`looktwice scenes generate --next-frames` makes such scenes"
         )
-    return cameras[zlib.crc32(f"camera of {scene.scene_id}".encode()) % len(cameras)]
+    return cameras[zlib.crc32(f"camera of {scene_id}".encode()) % len(cameras)]
+
+
+def cameras_ahead(labelled: LabelledScene) -> list[str]:
+    """The cameras that a scene shows now and half a second later."""
+    shown = {clip.camera for clip in labelled.scene.clips}
+    return [frame.camera for frame in labelled.next_frames if frame.camera in shown]
 
 
 def greedy_request(labelled: LabelledScene, variant: Variant) -> PlanRequest:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from looktwice.model.families.picture_codes import VisualCodesError
 from looktwice.model.network.composer import Composer
@@ -28,6 +29,8 @@ def composer_of(codes: VisualCodes) -> Composer:
 def taking(codes: VisualCodes, share: float) -> None:
     """Have the composer take all of the moved picture, or nothing, and leave the painted one as it is."""
     finish = composer_of(codes).finish[0]
+    assert isinstance(finish, nn.Conv2d)
+    assert finish.bias is not None
     with torch.no_grad():
         finish.weight.zero_()
         finish.bias.zero_()
@@ -49,10 +52,11 @@ def test_a_picture_is_taken_from_the_moved_one_or_painted(composing: VisualCodes
 
 def test_it_looks_elsewhere_in_the_moved_picture(composing: VisualCodes) -> None:
     taking(composing, 50.0)
-    look = composer_of(composing).look
+    to_the_right = composer_of(composing).look.bias
+    assert to_the_right is not None
     with torch.no_grad():
-        # A tenth of half a picture each: 11.2 pixels to the right.
-        look.bias[0] = 1.0
+        # A tenth of half a picture: 11.2 pixels.
+        to_the_right[0] = 1.0
     moved = np.zeros((112, 224, 3), np.uint8)
     moved[:, 100:] = 200
     seen = composing.decode(CODES, moved)[50, :, 0]

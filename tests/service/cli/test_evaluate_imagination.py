@@ -18,7 +18,7 @@ from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes
 from looktwice.service.cli.commands import app
 from tests.checkpoints import write_untrained
-from tests.model.driving.drives import labelled_scene
+from tests.model.driving.drives import agent, labelled_scene
 
 MEASURES = {"l2_1s_m", "l2_2s_m", "l2_3s_m", "l2_m"}
 ASKED = "always, camera asked for"
@@ -35,7 +35,11 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def scene(number: int, next_frames: int = 1) -> LabelledScene:
     labelled = labelled_scene(
-        5.0 + number, scene_id=f"scene-{number}", episode_id=f"episode-{number}", pictures=number
+        5.0 + number,
+        scene_id=f"scene-{number}",
+        episode_id=f"episode-{number}",
+        agents=(agent(-2.0, 3.5, speed=25.0 + number),),
+        pictures=number,
     )
     frame = np.random.default_rng(number).integers(0, 256, (112, 224, 3), np.uint8)
     came = (NextFrame(FRONT_WIDE, encode_png(frame)),) * next_frames
@@ -82,6 +86,9 @@ def test_tables_with_and_without_pictures(checkpoint: Path, tmp_path: Path) -> N
         "what came, through its codes",
     }
     assert all(row["frechet"] > 0 and len(row["intervals"]["psnr_db"]) == 2 for row in pictures.values())
+    entered = {row["name"]: row["shown"] for row in told["entering"]}
+    assert list(entered) == [ASKED, "what came, through its codes"]
+    assert all(0 <= shown <= 1 for shown in entered.values())
     assert told["extractor"] == "vision tower of world"
     compared = {(each["name"], each["measure"]) for each in told["comparisons"]}
     assert ("always : never (ST-P3)", "l2_m") in compared
