@@ -77,10 +77,9 @@ class Row:
 
 
 def can_do(contender: str, workload: Workload) -> bool:
-    """Without a grammar nothing decides the branch but the model."""
-    return workload.thinking == "adaptive" or not (
-        contender == "vllm" or contender.startswith("transformers")
-    )
+    """Without a grammar nothing decides the branch, or whether there is a picture, but the model."""
+    free = workload.thinking == "adaptive" and workload.camera is None
+    return free or not (contender == "vllm" or contender.startswith("transformers"))
 
 
 def run(job: Job, tell: Callable[[str], None]) -> list[Row]:
@@ -129,9 +128,8 @@ class Planner:
         return self.next_p50_s / self.cold_p50_s
 
 
-def run_planner(job: Job, n: int, steps: int = 4) -> Planner:
+def run_planner(job: Job, load: Workload, steps: int = 4) -> Planner:
     """Ask the torch engine as a 10 Hz planner does, whose pictures change twice a second."""
-    load = Workload(1, n, "adaptive")
     cold: list[float] = []
     next_: list[float] = []
     with _process(job, ["torch"]) as process:
@@ -140,7 +138,7 @@ def run_planner(job: Job, n: int, steps: int = 4) -> Planner:
                 [answer] = process.ask("torch", load, number, step=step)["answers"]
                 if number >= job.repeats:  # those before warm it up
                     (next_ if step else cold).append(answer["latency_s"])
-    return Planner(n, statistics.median(cold), statistics.median(next_))
+    return Planner(load.n, statistics.median(cold), statistics.median(next_))
 
 
 @dataclass(frozen=True)
@@ -159,18 +157,20 @@ class Deadlines:
     latency_p99_s: float
 
 
-def run_deadlines(job: Job, n: int, deadline_ms: int, requests: int = 500) -> Deadlines:
-    """Ask the torch engine at the knee of its load curve, by a Poisson process.
+def run_deadlines(job: Job, alone: Workload, deadline_ms: int, requests: int = 500) -> Deadlines:
+    """Ask the torch engine by a Poisson process, at the knee of its load curve.
+
+    ``alone`` is what each request asks for.
 
     The knee is the largest load that is kept up with, at a median latency of at most twice that of a scene
     alone; found by a hundred such requests at each of a few loads. Where none is, it is the smallest.
     """
-    load = Workload(requests, n, "adaptive", deadline_ms=deadline_ms)
-    tried = replace(load, scenes=100)
+    load = replace(alone, scenes=requests, deadline_ms=deadline_ms)
+    tried, n = replace(load, scenes=100), load.n
     with _process(job, ["torch"]) as process:
         for number in range(3):
-            process.ask("torch", Workload(16, n, "adaptive"), number)
-        alone_s = _median([process.ask("torch", Workload(1, n, "adaptive"), 3 + k) for k in range(20)])
+            process.ask("torch", replace(alone, scenes=16), number)
+        alone_s = _median([process.ask("torch", alone, 3 + k) for k in range(20)])
         per_s = _SHARES[0] / alone_s
         for number, share in enumerate(_SHARES, start=23):
             arrivals_s = _arrivals(share / alone_s, tried.scenes)

@@ -39,7 +39,15 @@ def engine(
     engines: Annotated[str, typer.Option(help="Which, by commas.")] = _ENGINES,
     at_once: Annotated[str, typer.Option(help="Scenes at once, by commas.")] = "1,4,16",
     draws: Annotated[str, typer.Option(help="Draws a scene, by commas.")] = "1,6",
-    thinking: Annotated[str, typer.Option(help="Modes, by commas.")] = "adaptive,always,never",
+    thinking: Annotated[
+        str | None, typer.Option(help="Modes, by commas; without it all that the format has.")
+    ] = None,
+    format: Annotated[
+        str | None, typer.Option(help="Of the responses; the checkpoint's first without it.")
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Whose picture each response imagines, in a format that imagines.")
+    ] = None,
     temperature: Annotated[float, typer.Option(help="Of all draws.", min=0.0, max=2.0)] = 1.0,
     repeats: Annotated[int, typer.Option(help="Measured rounds.", min=1)] = 5,
     shortcuts: Annotated[bool, typer.Option(help="Also our shortcuts, one after the other.")] = True,
@@ -59,20 +67,27 @@ def engine(
         from looktwice.model.bench.report import BenchReport
         from looktwice.model.bench.run import Job, run, run_deadlines, run_planner
         from looktwice.model.bench.workload import Workload
-        from looktwice.model.engines.engine import Controls
+        from looktwice.model.families.registry import family_named
+        from looktwice.model.network.checkpoint import read_parts
 
         if preset:
             checkpoint = _random_checkpoint(preset, checkpoint, Path(folder), device, random_weights)
-        modes: list[Any] = thinking.split(",")
+        written = format or read_parts(checkpoint).card.formats[0]
+        family = family_named(written)
+        if camera is not None and family.imagination is None:
+            raise ValueError(f"responses in format {written} imagine no pictures: leave --camera out")
+        modes: list[Any] = ["adaptive", "always", "never"] if family.branch else ["adaptive"]
+        if thinking is not None:
+            modes = thinking.split(",")
         loads = tuple(
-            Workload(_whole(count), _whole(n), mode, temperature)
+            Workload(_whole(count), _whole(n), mode, written, temperature, camera=camera)
             for count in at_once.split(",")
             for n in draws.split(",")
             for mode in modes
         )
         for load in loads:
             # Refused before the work begins.
-            Controls(thinking=load.thinking, n=load.n, temperature=load.temperature)
+            load.controls()
         names = tuple(engines.split(","))
         if unknown := set(names) - set(_ENGINES.split(",")):
             raise ValueError(f"unknown engine {', '.join(sorted(unknown))}; known are {_ENGINES}")
@@ -91,11 +106,13 @@ def engine(
             # On a GPU one after the other: large models do not fit side by side.
             for together in [entries] if device == "cpu" else [(each,) for each in entries]:
                 steps += run(Job(together, ladder, checkpoint, scenes, repeats, device), tell)
-        planners = [run_planner(job, _whole(n)) for n in draws.split(",") if "torch" in names]
-        rooflines = _rooflines(rows, checkpoint, device)
+        alone = [Workload(1, _whole(n), "adaptive", written, camera=camera) for n in draws.split(",")]
+        planners = [run_planner(job, load) for load in alone if "torch" in names]
+        rooflines = _rooflines(rows, checkpoint, written, device)
         deadlines = []
         if deadline_ms and "torch" in names:
-            deadlines.append(run_deadlines(job, max(map(_whole, draws.split(","))), deadline_ms))
+            most = max(alone, key=lambda load: load.n)
+            deadlines.append(run_deadlines(job, most, deadline_ms))
         report = BenchReport(tuple(rows), tuple(steps), tuple(rooflines), tuple(planners), tuple(deadlines))
         typer.echo(json.dumps(report.to_json()) if as_json else str(report))
 
@@ -275,7 +292,7 @@ def _random_checkpoint(preset: str, words_of: Path, folder: Path, device: str, a
     return folder / preset
 
 
-def _rooflines(rows: list[Row], checkpoint: Path, device: str) -> list[Roofline]:
+def _rooflines(rows: list[Row], checkpoint: Path, format: str, device: str) -> list[Roofline]:
     from looktwice.model.bench.report import Roofline
     from looktwice.model.bench.roofline import measure, work_of_plan
     from looktwice.model.network.checkpoint import read_config, read_parts
@@ -283,7 +300,7 @@ def _rooflines(rows: list[Row], checkpoint: Path, device: str) -> list[Roofline]
 
     dtype = fast_dtype(device)
     machine, parts, config = measure(device, dtype), read_parts(checkpoint), read_config(checkpoint)
-    prompt = parts.inputs.longest_prompt("cf_vla")
+    prompt = parts.inputs.longest_prompt(format)
     slices, grid_rows, columns = parts.settings.grid
     patches = len(parts.settings.cameras) * slices * grid_rows * columns
     found = []

@@ -26,7 +26,7 @@ def job(checkpoint: Path, *contenders: str, loads: tuple[Workload, ...]) -> Job:
 
 
 def test_engines_run_side_by_side(untrained_checkpoint: Path) -> None:
-    loads = (Workload(2, 2, "adaptive"), Workload(1, 1, "never"))
+    loads = (Workload(2, 2, "adaptive", "cf_vla"), Workload(1, 1, "never", "cf_vla"))
     told: list[str] = []
     names = ("torch", "transformers", "transformers-static")
     rows = run(job(untrained_checkpoint, *names, loads=loads), told.append)
@@ -51,24 +51,25 @@ def test_engines_run_side_by_side(untrained_checkpoint: Path) -> None:
 def test_shortcuts_are_switched_by_name(untrained_checkpoint: Path) -> None:
     assert set(SHORTCUTS) == {field.name for field in fields(Shortcuts)}
     names = ("torch+none", "torch+jump")
-    none, jump = run(job(untrained_checkpoint, *names, loads=(Workload(1, 2, "never"),)), lambda _: None)
+    none, jump = run(
+        job(untrained_checkpoint, *names, loads=(Workload(1, 2, "never", "cf_vla"),)), lambda _: None
+    )
     assert none.passes_per_response > 0.95 * none.tokens_per_response
     assert jump.passes_per_response < 0.5 * jump.tokens_per_response
 
 
 def test_a_contender_that_cannot_start_says_so(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="torch ended early"):
-        run(job(tmp_path, "torch", loads=(Workload(1, 1, "never"),)), lambda _: None)
+        run(job(tmp_path, "torch", loads=(Workload(1, 1, "never", "cf_vla"),)), lambda _: None)
 
 
-def test_only_engines_that_know_the_format_are_told_what_to_think() -> None:
-    always = Workload(1, 1, "always")
-    assert [can_do(name, always) for name in ("torch", "vllm-grammar", "vllm", "transformers")] == [
-        True,
-        True,
-        False,
-        False,
-    ]
+def test_only_engines_that_know_the_format_are_told_what_to_write() -> None:
+    names = ("torch", "vllm-grammar", "vllm", "transformers")
+    thinks = Workload(1, 1, "always", "cf_vla")
+    imagines = Workload(1, 1, "adaptive", "vla_world", camera="front")
+    for told in (thinks, imagines):
+        assert [can_do(name, told) for name in names] == [True, True, False, False]
+    assert all(can_do(name, Workload(1, 1, "adaptive", "vla_world")) for name in names)
 
 
 def test_memory_of_this_process_is_known() -> None:

@@ -5,7 +5,7 @@ from tests.checkpoints import noisy_scene
 
 
 def test_all_contenders_are_asked_the_same() -> None:
-    load = Workload(3, 2, "always", temperature=0.5)
+    load = Workload(3, 2, "always", "cf_vla", temperature=0.5)
     scenes = [noisy_scene(0), noisy_scene(1)]
     first, again, next_round = (load.requests(scenes, number) for number in (4, 4, 5))
     assert [each.request_id for each in first] == [each.request_id for each in again]
