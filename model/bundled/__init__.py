@@ -1,4 +1,4 @@
-"""What comes with the package: trained checkpoints, trained codes of pictures, and a few test scenes."""
+"""What comes with the package: trained checkpoints and a few test scenes."""
 
 from __future__ import annotations
 
