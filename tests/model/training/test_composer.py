@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from looktwice.model.driving.scene import LabelledScene, NextFrame
 from looktwice.model.driving.scene_store import write_scenes
-from looktwice.model.families.picture_codes import LEVELS, VisualCodesError
+from looktwice.model.families.picture_codes import LEVELS
 from looktwice.model.network.visual_codes import VisualCodes, frame_of, load_visual_codes
 from looktwice.model.training.composer import (
     ComposerLearner,
@@ -63,12 +63,27 @@ def test_composing_is_learned_and_the_codes_stay(scenes: Path, codes: Path, tmp_
     learned = after.state_dict()
     for name, value in before.state_dict().items():
         assert torch.equal(value, learned[name]), name
-    composer = after.details["composer"]
-    assert isinstance(composer, dict)
-    assert (after.details["steps"], composer["steps"], composer["pairs"]) == (7, 40, 10)
+    assert after.details["steps"] == 7
+    assert stages_of(after) == [(40, 10)]
     # Two rows of what was seen, what came, and what was made of it.
     with Image.open(tmp_path / SHEET_FILE) as sheet:
         assert sheet.size == (3 * 228 - 4, 2 * 116 - 4)
+
+
+def stages_of(codes: VisualCodes) -> list[tuple[int, int]]:
+    stages = codes.details["composer"]
+    assert isinstance(stages, list)
+    return [(stage["steps"], stage["pairs"]) for stage in stages]
+
+
+def test_a_composer_learns_on(scenes: Path, codes: Path, tmp_path: Path) -> None:
+    two_steps = replace(SHORT, steps=2, learning_rate=1e-9)
+    for source, target in ((codes, "first"), (tmp_path / "first", "second")):
+        train_composer(two_steps, scenes, source, tmp_path / target, measured_pairs=1)
+    first, second = (load_visual_codes(tmp_path / name) for name in ("first", "second"))
+    for name, value in first.state_dict().items():
+        assert torch.allclose(value, second.state_dict()[name], atol=1e-6), name
+    assert stages_of(second) == [(2, 10), (2, 10)]
 
 
 def test_pairs_are_of_cameras_that_show_both_moments() -> None:
@@ -101,7 +116,7 @@ def test_spoilt_levels_are_levels() -> None:
     assert torch.equal(spoilt, spoilt.round())
     assert ((spoilt >= 0) & (spoilt < most)).all()
     wrong = (spoilt != levels).float().mean(dim=(1, 2, 3))
-    assert wrong.min() < 0.1
+    assert 0.2 < wrong.min() < 0.5
     assert wrong.max() > 0.6
 
 
@@ -121,9 +136,6 @@ def test_what_cannot_be_learned_from_is_refused(scenes: Path, codes: Path, tmp_p
     write_scenes(tmp_path / "plain.parquet", [filmed_scene(0)])
     with pytest.raises(ValueError, match="--next-frames"):
         train_composer(SHORT, tmp_path / "plain.parquet", codes, tmp_path / "to", scenes)
-    VisualCodes(24, composes=True).save(tmp_path, {})
-    with pytest.raises(VisualCodesError, match="composer already"):
-        train_composer(SHORT, scenes, tmp_path, tmp_path / "to")
 
 
 def test_the_command(scenes: Path, codes: Path, tmp_path: Path) -> None:
