@@ -1,8 +1,8 @@
 """Training of the composer of pictures: what to take from half a second before, and what to paint from codes.
 
 The codes stay as they are, so models that write them need not learn anything anew. A model writes some codes
-wrong, most of them as if nothing had changed. So the composer learns with codes that are spoilt in that way,
-and learns how far to trust them.
+wrong, most of them as if nothing had changed. So the composer learns with any share of them spoilt in that
+way, and learns how far to trust them.
 """
 
 from __future__ import annotations
@@ -40,9 +40,6 @@ from looktwice.model.training.trainer import LearnerTrainer
 from looktwice.model.training.visual_codes import SHEET_FILE, held_out, painting_losses, spread
 
 _SHEET_PICTURES: Final = 6
-_UNCHANGED_SHARE: Final = 0.5
-"""The least share of levels that are spoilt to what is expected. The bundled checkpoint writes 72 % of the
-levels that change as if they did not, and 9 % of all others otherwise."""
 _STEPPED_SHARE: Final = 0.25
 """The most levels that are spoilt by one up or down."""
 
@@ -127,7 +124,7 @@ class ComposerLearner(nn.Module):
     def _spoilt(levels: Tensor, before: Tensor) -> Tensor:
         """Levels [b, 4, 7, 14] with mistakes as models make them, more in some pictures than in others."""
         each = levels.new_empty(len(levels), 1, 1, 1)
-        unchanged = torch.rand_like(levels) < each.uniform_(_UNCHANGED_SHARE, 1.0)
+        unchanged = torch.rand_like(levels) < each.uniform_()
         mixed = torch.where(unchanged, before, levels)
         stepped = torch.rand_like(levels) < _STEPPED_SHARE * each.uniform_()
         most = torch.tensor(LEVELS, dtype=levels.dtype, device=levels.device)[:, None, None] - 1

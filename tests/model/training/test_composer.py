@@ -116,7 +116,7 @@ def test_spoilt_levels_are_levels() -> None:
     assert torch.equal(spoilt, spoilt.round())
     assert ((spoilt >= 0) & (spoilt < most)).all()
     wrong = (spoilt != levels).float().mean(dim=(1, 2, 3))
-    assert 0.2 < wrong.min() < 0.5
+    assert wrong.min() < 0.1
     assert wrong.max() > 0.6
 
 
