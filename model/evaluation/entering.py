@@ -125,6 +125,7 @@ async def evaluate_entering(
             return []
         controls = replace(variant.controls, n=1, camera=camera)
         request = request_for(labelled, replace(variant, next_camera=False, controls=controls))
+        request = replace(request, request_id=f"{request.request_id}/{camera}")
         [draw] = await planned(engine, request)
         pictures = {variant.name: engine.paint(request, imagined_codes(draw))}
         pictures |= {name: painter(labelled, camera) for name, painter in painters.items()}

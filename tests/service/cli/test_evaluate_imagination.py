@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from looktwice.model.driving.images import decode_image, encode_png
-from looktwice.model.driving.scene import FRONT_WIDE, LabelledScene, NextFrame
+from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, LabelledScene, NextFrame
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.network.checkpoint import load, save
 from looktwice.model.network.settings import VlaSettings
@@ -33,16 +33,20 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def scene(number: int, next_frames: int = 1) -> LabelledScene:
+def scene(number: int, next_frames: int = 2) -> LabelledScene:
     labelled = labelled_scene(
         5.0 + number,
         scene_id=f"scene-{number}",
         episode_id=f"episode-{number}",
-        agents=(agent(-2.0, 3.5, speed=25.0 + number),),
+        # One overtakes into the wide view, and one crosses into the narrow one.
+        agents=(
+            agent(-2.0, 3.5, speed=25.0 + number),
+            agent(30.0, 12.0, speed=20.0, heading=-np.pi / 2, agent_id=2),
+        ),
         pictures=number,
     )
     frame = np.random.default_rng(number).integers(0, 256, (112, 224, 3), np.uint8)
-    came = (NextFrame(FRONT_WIDE, encode_png(frame)),) * next_frames
+    came = tuple(NextFrame(camera, encode_png(frame)) for camera in (FRONT_WIDE, FRONT_TELE)[:next_frames])
     return replace(labelled, next_frames=came, seed=number)
 
 
@@ -67,7 +71,8 @@ def test_tables_with_and_without_pictures(checkpoint: Path, tmp_path: Path) -> N
         assert named["never"]["l2_m"] > 1
     sheet = decode_image((tmp_path / "plots" / "imagined.png").read_bytes())
     for row, labelled in enumerate(scenes):
-        [came] = labelled.next_frames
+        # Both cameras bring the same.
+        came, _ = labelled.next_frames
         np.testing.assert_array_equal(sheet[row * 116 : row * 116 + 112, 456:], decode_image(came.image))
     assert sheet.shape == (228, 680, 3)
     passes = {row["name"]: row for row in told["responses"]}
@@ -86,6 +91,8 @@ def test_tables_with_and_without_pictures(checkpoint: Path, tmp_path: Path) -> N
         "what came, through its codes",
     }
     assert all(row["frechet"] > 0 and len(row["intervals"]["psnr_db"]) == 2 for row in pictures.values())
+    # Both of them in both scenes.
+    assert [row["scenes"] for row in told["entering"]] == [4, 4]
     entered = {row["name"]: row["shown"] for row in told["entering"]}
     assert list(entered) == [ASKED, "what came, through its codes"]
     assert all(0 <= shown <= 1 for shown in entered.values())
