@@ -27,7 +27,6 @@ from looktwice.model.formats.pieces import NOTHING, FormatError
 from looktwice.model.formats.said import Said
 from looktwice.model.formats.text import parse
 from looktwice.model.network.codec import TrajectoryCodec
-from looktwice.model.network.inputs import moved_picture
 from looktwice.model.network.model_card import ModelCard
 from looktwice.model.network.vocabulary import Vocabulary
 
@@ -232,5 +231,8 @@ def painted(visual_codes: VisualCodes | None, request: PlanRequest, codes: Seque
     """See `Engine.paint`; raises `RequestError` without codes of pictures."""
     if visual_codes is None:
         raise RequestError("this checkpoint has no codes of pictures to paint with")
+    # Scheduling, which reads requests too, needs no torch.
+    from looktwice.model.network.inputs import moved_picture
+
     view = request.controls.view
     return visual_codes.decode(codes, None if view is None else moved_picture(request.scene, view))

@@ -29,6 +29,7 @@ from looktwice.model.engines.engine import Controls, Draw, PlanRequest
 from looktwice.model.engines.torch.offline import draws_of
 from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.families.family import Attempt
+from looktwice.model.families.picture_codes import PICTURE
 from looktwice.model.families.registry import family_named
 from looktwice.model.families.trajectory_codes import TRAJECTORY
 from looktwice.model.formats.replay import Decision, decisions
@@ -276,12 +277,13 @@ class OutcomeLearner(nn.Module):
         return loss, found.ratio, apart.detach()
 
     def _drawn(self, draw: Draw) -> list[Decision]:
-        """The decisions of a draw that were drawn: all but trajectory codes of least expected error."""
+        """The decisions of a draw that were drawn: all but codes of least expected error."""
         imagination = self._family.imagination
         # Nobody asks for a camera, so nothing is expected of its picture.
         said = {} if imagination is None else imagination.said(None)
         found = decisions(self._data.formats[self._task].start(said=said), draw.ids)
         if self._settings.codes == "drawn":
             return found
-        codes = self._loaded.vocabulary.alphabets[TRAJECTORY]
-        return [each for each in found if not any(int(each.ids[0]) in stage for stage in codes)]
+        alphabets = self._loaded.vocabulary.alphabets
+        codes = [*alphabets[TRAJECTORY], *alphabets.get(PICTURE, ())]
+        return [each for each in found if not any(int(each.ids[0]) in book for book in codes)]

@@ -54,7 +54,7 @@ class OutcomeSettings:
         draws: of each scene, compared with each other.
         temperature: that they are drawn at.
         clip: see `policy_loss`.
-        codes: how trajectory codes are chosen; those of least expected error are no draws, and nothing is
+        codes: how codes are chosen; those of least expected error are no draws, and nothing is
             learned from how they turned out.
         imitation: weight of the loss on the expert's responses, beside that of the draws.
         rewards: what counts: what comes of draws, or the rewards of their family by name, with weights.
@@ -268,7 +268,10 @@ NANO: Final[Mapping[str, Recipe]] = (
             weights=vla_world.WEIGHTS,
             error_weight=0.0,
             outcome=OutcomeSettings(
-                rewards=dict.fromkeys(VLA_WORLD_REWARDS, 1.0), normalised=True, divergence=0.01
+                codes="drawn",
+                rewards=dict.fromkeys(VLA_WORLD_REWARDS, 1.0),
+                normalised=True,
+                divergence=0.01,
             ),
         ),
     }

@@ -22,7 +22,7 @@ from looktwice.model.driving.next_view import Motion, moved_view
 from looktwice.model.driving.perceived import perceived_of
 from looktwice.model.driving.scene import Clip, LabelledScene, NextFrame, mirrored_camera
 from looktwice.model.driving.short_term import INERTIA
-from looktwice.model.engines.engine import Controls, Draw, PlanRequest, RequestError
+from looktwice.model.engines.engine import Controls, Decision, Draw, PlanRequest, RequestError
 from looktwice.model.engines.requests import begin, painted
 from looktwice.model.engines.torch.decoder import Decoder
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
@@ -157,11 +157,11 @@ def copying(checkpoint: Path) -> Loaded:
     return found
 
 
-@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize(("n", "codes"), [(1, "drawn"), (3, "drawn"), (3, "least_error")])
 def test_what_is_expected_saves_passes_and_changes_nothing(
-    world: Loaded, copying: Loaded, monkeypatch: pytest.MonkeyPatch, n: int
+    world: Loaded, copying: Loaded, monkeypatch: pytest.MonkeyPatch, n: int, codes: Decision
 ) -> None:
-    controls = Controls(n=n, imagine="always", camera="front_left", numbers="drawn", seed=4)
+    controls = Controls(n=n, imagine="always", camera="front_left", numbers="drawn", codes=codes, seed=4)
     asked = PlanRequest("a", noisy_scene(1, route=True), "vla_world", controls)
 
     def drawn(world: Loaded, expected: tuple[int, ...], shortcuts: Shortcuts) -> tuple[list[Draw], int]:
@@ -186,8 +186,8 @@ def test_what_is_expected_saves_passes_and_changes_nothing(
             assert (one.text, one.ids) == (other.text, other.ids)
             assert other.text == exact.text
             np.testing.assert_array_equal(one.trajectory, other.trajectory)
-            codes = [int(code[9:13]) for code in CODE.findall(one.text)]
-            assert (codes[::2], codes[1::2]) == (list(expected), list(written(one)))
+            told = [int(code[9:13]) for code in CODE.findall(one.text)]
+            assert (told[::2], told[1::2]) == (list(expected), list(written(one)))
         right = sum(code == guess for code, guess in zip(written(plain[0]), expected, strict=True))
         return right, passes - took
 
@@ -196,7 +196,7 @@ def test_what_is_expected_saves_passes_and_changes_nothing(
     assert right < 5
     assert saved >= 0
     right, saved = compared(copying, expected)
-    assert 30 < right < 70
+    assert 30 < right < 70 or codes == "least_error"
     assert saved > (right / 2 if n == 1 else 0)
 
 

@@ -31,7 +31,7 @@ from looktwice.model.driving.scene import CAMERAS
 from looktwice.model.engines.engine import EngineError
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.engines.torch.shortcuts import Shortcuts
-from looktwice.model.families.picture_codes import BLANK
+from looktwice.model.families.picture_codes import BLANK, LEVELS, levels_of
 from looktwice.model.network.checkpoint import load, save
 from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes, load_visual_codes
@@ -87,7 +87,7 @@ def test_pictures_are_painted_of_the_codes_that_were_drawn(
     served: Served[TorchEngine], checkpoint: Path
 ) -> None:
     codec = load_visual_codes(checkpoint)
-    told = imagined(served, asked(camera="back_left", controls={"n": 3, "seed": 1}))
+    told = imagined(served, asked(camera="back_left", controls={"n": 3, "seed": 1, "codes": "drawn"}))
     assert (told.format, told.camera, told.seconds) == ("vla_world", "back_left", 0.5)
     assert [each.index for each in told.pictures] == [0, 1, 2]
     for each in told.pictures:
@@ -98,6 +98,15 @@ def test_pictures_are_painted_of_the_codes_that_were_drawn(
         assert each.prediction.direction in ("Left", "Forward", "Right")
     assert len({tuple(each.codes) for each in told.pictures}) == 3
     assert told.timing.total_ms >= told.timing.engine_ms > 0
+
+
+def test_codes_of_least_expected_error_are_taken_unless_they_are_to_be_drawn(
+    served: Served[TorchEngine],
+) -> None:
+    told = imagined(served, asked(camera="back_left", controls={"n": 2}))
+    # An untrained model finds all levels about as likely, and the middle ones are the least off.
+    levels = levels_of([each.codes for each in told.pictures]) / (np.array(LEVELS) - 1)
+    assert (np.abs(levels - 0.5) < 0.3).all()
 
 
 def test_the_same_seed_imagines_the_same_and_another_camera_something_else(
@@ -301,7 +310,11 @@ def test_a_checkpoint_without_codes_imagines_but_does_not_paint(checkpoint: Path
 def test_pictures_take_places_and_are_counted_as_draws_are(served: Served[TorchEngine]) -> None:
     before = served.metric("looktwice_requests_total", endpoint=PATH, status="200")
     with ThreadPoolExecutor(4) as pool:
-        told = list(pool.map(lambda seed: imagined(served, asked(controls={"seed": seed})), range(4)))
+        told = list(
+            pool.map(
+                lambda seed: imagined(served, asked(controls={"seed": seed, "codes": "drawn"})), range(4)
+            )
+        )
     assert len({each.pictures[0].codes[0] for each in told}) > 1
     assert served.metric("looktwice_requests_total", endpoint=PATH, status="200") == before + 4
 
