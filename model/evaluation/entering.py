@@ -26,7 +26,7 @@ Array = npt.NDArray[np.float64]
 _STEP: Final = round(AHEAD_S / STEP_S) - 1
 """The row of a future that is half a second ahead."""
 _NEAREST_M: Final = 0.5
-"""Corners that are nearer to the camera's plane, or behind it, are taken for so far away."""
+"""Corners that are nearer to the camera's plane, or behind it, are left out."""
 _MOST_NOW: Final = 0.25
 """Who enters is seen now by at most this share of its columns."""
 _LEAST_PX: Final = 12
@@ -119,8 +119,11 @@ async def evaluate_entering(
 
     async def work(asked: tuple[LabelledScene, str]) -> list[tuple[str, EnteringResult]]:
         labelled, camera = asked
+        who = entering(labelled, camera)
+        if not who:
+            return []
         came, moved = what_came(labelled, camera), warped(labelled, camera)
-        who = [each for each in entering(labelled, camera) if shows(each, came, came, moved)]
+        who = [each for each in who if shows(each, came, came, moved)]
         if not who:
             return []
         controls = replace(variant.controls, n=1, camera=camera)

@@ -35,9 +35,7 @@ from looktwice.model.network.visual_codes import (
     psnr,
 )
 from looktwice.model.training.recipes import Recipe
-from looktwice.model.training.run import last_whole_state
-from looktwice.model.training.trainer import LearnerTrainer
-from looktwice.model.training.visual_codes import SHEET_FILE, held_out, painting_losses, spread
+from looktwice.model.training.visual_codes import SHEET_FILE, held_out, learn, painting_losses, spread
 
 _SHEET_PICTURES: Final = 6
 _STEPPED_SHARE: Final = 0.25
@@ -177,32 +175,19 @@ def train_composer(
     if codes.composer is None:
         codes.composer = Composer(len(LEVELS))
     measured = spread(others, measured_pairs)
-    trainer = LearnerTrainer(
+    about, figures = learn(
         ComposerLearner(codes),
         recipe,
-        recipe.name,
         PairDataset(pairs, recipe.seed),
         collate_pairs,
         target,
-        sampler=None,
-        validate=partial(composed_figures, codes, measured),
+        partial(composed_figures, codes, measured),
         validate_every=validate_every,
         save_every=save_every,
         bf16=bf16,
         use_cpu=use_cpu,
-        workers=0,
     )
-    trainer.train(resume_from_checkpoint=last_whole_state(target / "state"))
-    codes.eval().cpu()
-    figures = composed_figures(codes, measured)
-    about: dict[str, object] = {
-        "steps": recipe.steps,
-        "batch_size": recipe.batch_size,
-        "learning_rate": recipe.learning_rate,
-        "seed": recipe.seed,
-        "pairs": len(pairs),
-        "episodes": len({pair.episode for pair in pairs}),
-    }
+    about |= {"pairs": len(pairs), "episodes": len({pair.episode for pair in pairs})}
     rows = [[*pair.frames(), _composed(codes, *pair.frames())] for pair in spread(measured, _SHEET_PICTURES)]
     with written_whole(target / SHEET_FILE) as temporary:
         temporary.write_bytes(encode_png(tiled(rows)))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -155,15 +155,51 @@ def train_visual_codes(
     torch.manual_seed(recipe.seed)
     codes = VisualCodes() if width is None else VisualCodes(width)
     measured = spread(others, measured_clips)
-    trainer = LearnerTrainer(
+    about, figures = learn(
         VisualCodesLearner(codes),
         recipe,
-        recipe.name,
         FrameDataset(clips, recipe.seed),
         lambda frames: {"pictures": batch_of(frames)},
         target,
+        partial(picture_figures, codes, measured),
+        validate_every=validate_every,
+        save_every=save_every,
+        bf16=bf16,
+        use_cpu=use_cpu,
+    )
+    about |= {"clips": len(clips), "episodes": len({clip.episode for clip in clips})}
+    contact_sheet(codes, [clip.images[-1] for clip in spread(measured, _SHEET_PICTURES)], target / SHEET_FILE)
+    codes.save(target, about | figures)
+    return figures
+
+
+def learn(
+    learner: nn.Module,
+    recipe: Recipe,
+    dataset: Dataset[Any],
+    collate: Callable[[list[Any]], dict[str, Tensor]],
+    target: Path,
+    figures: Callable[[], dict[str, float]],
+    *,
+    validate_every: int,
+    save_every: int,
+    bf16: bool,
+    use_cpu: bool,
+) -> tuple[dict[str, object], dict[str, float]]:
+    """Train codes of pictures, or a part of them; see `train_visual_codes` for the arguments.
+
+    Returns:
+        What the recipe was, and the last figures. The learner is in evaluation mode, on the CPU.
+    """
+    trainer = LearnerTrainer(
+        learner,
+        recipe,
+        recipe.name,
+        dataset,
+        collate,
+        target,
         sampler=None,
-        validate=partial(picture_figures, codes, measured),
+        validate=figures,
         validate_every=validate_every,
         save_every=save_every,
         bf16=bf16,
@@ -171,19 +207,14 @@ def train_visual_codes(
         workers=0,
     )
     trainer.train(resume_from_checkpoint=last_whole_state(target / "state"))
-    codes.eval().cpu()
-    figures = picture_figures(codes, measured)
+    learner.eval().cpu()
     about: dict[str, object] = {
         "steps": recipe.steps,
         "batch_size": recipe.batch_size,
         "learning_rate": recipe.learning_rate,
         "seed": recipe.seed,
-        "clips": len(clips),
-        "episodes": len({clip.episode for clip in clips}),
     }
-    contact_sheet(codes, [clip.images[-1] for clip in spread(measured, _SHEET_PICTURES)], target / SHEET_FILE)
-    codes.save(target, about | figures)
-    return figures
+    return about, figures()
 
 
 def spread(clips: Sequence[_Filmed], count: int) -> list[_Filmed]:

@@ -132,6 +132,7 @@ class Planning:
         with self._lifecycle.engine() as engine, self._traces.planning(asked, engine.card) as span:
             checking_s = time.monotonic()
             request = await self._checked(asked, engine.card, arrival, geometry)
+            paint = partial(engine.paint, request)
             submitted_s = began_s = time.monotonic()
             try:
                 with self._metrics.plans_in_flight.track_inprogress():
@@ -140,7 +141,7 @@ class Planning:
                             if isinstance(event, Started):
                                 place.began()
                                 began_s = time.monotonic()
-                                yield Begun(partial(engine.paint, request))
+                                yield Begun(paint)
                                 continue
                             if isinstance(event, DraftFinished):
                                 drafts[event.draw.index] = event.draw
@@ -177,15 +178,7 @@ class Planning:
                 cut = [draw.index for draw in draws if draw.cut is not None]
                 deadline = wire.Deadline(met=deadline_met, cut=cut)
             yield Planned(
-                *(
-                    tuple(draws),
-                    agreements,
-                    drafts,
-                    engine.card,
-                    timing,
-                    deadline,
-                    partial(engine.paint, request),
-                ),
+                *(tuple(draws), agreements, drafts, engine.card, timing, deadline, paint),
                 prompt_tokens=partial(engine.prompt_tokens, request),
             )
 
