@@ -30,6 +30,12 @@ _GAINS: Final[dict[Change, dict[str, int]]] = {
         for change in words.values()
     },
 }
+KEEP_LANE: Final = "Keep Lane"
+OTHER_LANE: Final[dict[Change, str]] = {
+    "lane_left": "Right Lane Change",
+    "lane_right": "Left Lane Change",
+}
+"""What nobody does first who is to move to the lane on one side."""
 _PACE: Final[dict[Change, tuple[str, ...]]] = {"slower": ("Decelerate", "Wait"), "faster": ("Accelerate",)}
 MIN_TICKS: Final = 5
 """Half a second, the shortest that the labeller calls an action of its own."""
@@ -133,7 +139,7 @@ def track_changes(before: Plan, after: Plan, group: Group) -> frozenset[Change]:
     return frozenset(
         change
         for change in CHANGES
-        if group_of(change) == group and done(after, change) >= needed(before, change)
+        if group_of(change) == group and does(after, change, needed(before, change))
     )
 
 
@@ -151,6 +157,19 @@ def done(plan: Plan, change: Change) -> int:
     """How much a plan does of what a change asks for more of, in ticks."""
     track = plan.track(group_of(change)) or ()
     return sum((action.end - action.start) * gain(change, action.word) for action in track)
+
+
+def does(plan: Plan, change: Change, ticks: int) -> bool:
+    """Whether a plan does at least ``ticks`` of a change, as `done` counts, and does not contradict it.
+
+    Who stays in the lane leaves it nowhere, and who moves to one side does not move to the other first.
+    """
+    if done(plan, change) < ticks:
+        return False
+    moves = [action.word for action in plan.lane or () if action.word != KEEP_LANE]
+    if change == "keep_lane":
+        return not moves
+    return change not in OTHER_LANE or moves[0] != OTHER_LANE[change]
 
 
 def needed(before: Plan, change: Change) -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final
 
-from looktwice.model.driving.direction import Change, done, gain, group_of, needed
+from looktwice.model.driving.direction import KEEP_LANE, OTHER_LANE, Change, does, gain, group_of, needed
 from looktwice.model.driving.phrases import Facts, PhraseError, agrees, read_facts
 from looktwice.model.driving.plan import (
     GROUPS,
@@ -103,7 +103,7 @@ class PlanTracks(Compound):
             if kept.get(group, track) != track:
                 raise FormatError(f"track {group} is to stay as it is: {kept[group]}")
         for aim in self.aims:
-            if done(value, aim.change) < aim.ticks:
+            if not does(value, aim.change, aim.ticks):
                 raise FormatError(f"track {group_of(aim.change)} does too little {aim.change}")
         return tuple(
             text
@@ -125,14 +125,21 @@ class PlanTracks(Compound):
 
 @dataclass(frozen=True)
 class Aim:
-    """What a track has to do more of: at least ``ticks`` of it, counted as in `direction.done`."""
+    """What a track has to do more of, as `direction.does` tells.
+
+    Attributes:
+        change, ticks: at least so many of it.
+        barred: a word that is not to be written before the change is begun.
+    """
 
     change: Change
     ticks: int
+    barred: str | None = None
 
     def behind(self, word: str, ticks: int, left: int) -> Aim | None:
         """What is left to do behind some ticks of a word; None where nothing can go wrong any more."""
-        rest = Aim(self.change, self.ticks - ticks * gain(self.change, word))
+        gained = gain(self.change, word)
+        rest = Aim(self.change, self.ticks - ticks * gained, None if gained > 0 else self.barred)
         worst = min(gain(self.change, each) for each in WORDS[group_of(self.change)])
         return rest if rest.ticks > worst * left else None
 
@@ -206,8 +213,12 @@ class TrackWord(Shorthand):
             if word != self.previous
             and (
                 aim is None
-                or self.ticks * gain(aim.change, word) + _most(aim.change, word, left, self.segments_left)
-                >= aim.ticks
+                or (
+                    word != aim.barred
+                    and self.ticks * gain(aim.change, word)
+                    + _most(aim.change, word, left, self.segments_left)
+                    >= aim.ticks
+                )
             )
         ]
 
@@ -245,7 +256,8 @@ class GivenPlan(Compound):
 class RevisedPlan(Narrowing):
     """A plan behind a reflection in phrases: it changes in the directions that are stated, and in no other.
 
-    Tracks that nothing is stated of are those of the first plan.
+    Tracks that nothing is stated of are those of the first plan, and who is to stay in the lane leaves it
+    nowhere.
 
     Attributes:
         first_plan, reflection: the sections that these are in.
@@ -273,10 +285,15 @@ class RevisedPlan(Narrowing):
                 raise FormatError(f"the plan behind {str(facts)!r} changes otherwise: {self.given}")
             return GivenPlan(self.given)
         stated = {group_of(change) for change in facts.changes}
-        kept = tuple((group, track) for group, track in first.tracks() if group not in stated)
-        return PlanTracks(
-            kept=kept, aims=tuple(Aim(change, needed(first, change)) for change in facts.changes)
-        )
+        kept = [(group, track) for group, track in first.tracks() if group not in stated]
+        aims = [
+            Aim(change, needed(first, change), OTHER_LANE.get(change))
+            for change in facts.changes
+            if change != "keep_lane"
+        ]
+        if "keep_lane" in facts.changes:
+            kept.append(("lane", (MetaAction(0, TICKS, KEEP_LANE),)))
+        return PlanTracks(kept=tuple(kept), aims=tuple(aims))
 
 
 def written_plan(text: str) -> Plan:

@@ -24,7 +24,7 @@ class RuleTeacher:
     """`looktwice.clients.labelling.teachers.teacher.Teacher` by rule; nothing is asked of anybody."""
 
     name: Final = "rules"
-    revision: Final = "6"
+    revision: Final = "7"
 
     async def reflect(self, question: Question, complaints: Sequence[FailedCheck] = ()) -> Answer:
         """Facts in phrases; the same for the same question.

@@ -27,7 +27,12 @@ def at_the_first_rename(event, args):
 sys.addaudithook(at_the_first_rename)
 app()
 """
-_TEACHER = {"LOOKTWICE_TEACHER_KIND": "openai", "LOOKTWICE_TEACHER_MODEL": "batched"}
+# Python renames what it compiles, too.
+_ENVIRONMENT = {
+    "LOOKTWICE_TEACHER_KIND": "openai",
+    "LOOKTWICE_TEACHER_MODEL": "batched",
+    "PYTHONDONTWRITEBYTECODE": "1",
+}
 
 
 @pytest.mark.parametrize(
@@ -51,7 +56,7 @@ def test_a_killed_export_is_no_result_and_leaves_nothing_to_the_next(
     options = ["build", "export", str(build), "--form", form, "--scenes", str(file), "--to", str(to)]
 
     def export(*python: str) -> int:
-        environment = os.environ | _TEACHER
+        environment = os.environ | _ENVIRONMENT
         return subprocess.run([sys.executable, *python, *options], env=environment, check=False).returncode
 
     assert export("-c", KILLED) == -signal.SIGKILL

@@ -4,7 +4,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from looktwice.model.driving.direction import CHANGES, done, group_of, needed, track_changes, wanted_changes
+from looktwice.model.driving.direction import (
+    CHANGES,
+    does,
+    group_of,
+    needed,
+    track_changes,
+    wanted_changes,
+)
 from looktwice.model.driving.phrases import (
     NOTHING,
     Bend,
@@ -19,7 +26,7 @@ from looktwice.model.driving.phrases import (
     facts_of,
     read_facts,
 )
-from looktwice.model.driving.plan import GROUPS, Plan, parse_plan
+from looktwice.model.driving.plan import GROUPS, Plan, parse_plan, track_from_words
 from tests.model.driving.strategies import facts
 from tests.model.formats.strategies import plans
 
@@ -121,7 +128,32 @@ def test_a_change_that_is_not_stated_disagrees() -> None:
     assert not agrees(Facts((SLOWER,)), before, plan("Accelerate"))
 
 
+@pytest.mark.parametrize(
+    ("lane", "changes"),
+    [
+        ("Left Lane Change", {"lane_left"}),
+        ("Keep Lane|Left Lane Change", {"lane_left"}),
+        ("Left Lane Change|Right Lane Change", {"lane_left"}),
+        ("Right Lane Change|Left Lane Change", {"lane_right"}),
+        ("Keep Lane", set()),
+    ],
+)
+def test_who_moves_to_one_side_does_not_move_to_the_other_first(lane: str, changes: set[str]) -> None:
+    first, _, second = lane.partition("|")
+    words = [first] * 32 + [second or first] * 32
+    after = Plan(**{**dict(plan().tracks()), "lane": track_from_words(words)})
+    assert track_changes(plan(), after, "lane") == changes
+
+
+def test_who_stays_in_the_lane_leaves_it_nowhere() -> None:
+    leaves = Plan(lane=track_from_words(["Left Lane Change"] * 40 + ["Keep Lane"] * 24))
+    later = Plan(lane=track_from_words(["Keep Lane"] * 32 + ["Left Lane Change"] * 32))
+    assert track_changes(leaves, later, "lane") == set()
+    assert track_changes(leaves, Plan(lane=plan().lane), "lane") == {"keep_lane"}
+    assert not agrees(Facts((STAY,)), leaves, later)
+
+
 @given(plans(), plans())
 def test_what_is_needed_for_a_change_is_what_wanted_changes_finds(before: Plan, after: Plan) -> None:
     found = frozenset().union(*wanted_changes(before, after))
-    assert found == {change for change in CHANGES if done(after, change) >= needed(before, change)}
+    assert found == {change for change in CHANGES if does(after, change, needed(before, change))}
