@@ -8,9 +8,10 @@ the opposite.
 from __future__ import annotations
 
 import re
+from itertools import accumulate
 from typing import Final, Literal, get_args
 
-from looktwice.model.driving.plan import GROUPS, TICKS, Group, Plan
+from looktwice.model.driving.plan import GROUPS, TICKS, Group, Plan, Track
 
 Change = Literal["slower", "faster", "left", "right", "straight", "lane_left", "lane_right", "keep_lane"]
 CHANGES: Final[tuple[Change, ...]] = get_args(Change)
@@ -137,9 +138,7 @@ def wanted_changes(before: Plan, after: Plan) -> list[frozenset[Change]]:
 def track_changes(before: Plan, after: Plan, group: Group) -> frozenset[Change]:
     """The directions, each for half a second or longer, in which one track changes."""
     return frozenset(
-        change
-        for change in CHANGES
-        if group_of(change) == group and does(after, change, needed(before, change))
+        change for change in CHANGES if group_of(change) == group and changed(before, after, change)
     )
 
 
@@ -155,21 +154,31 @@ def gain(change: Change, word: str) -> int:
 
 def done(plan: Plan, change: Change) -> int:
     """How much a plan does of what a change asks for more of, in ticks."""
-    track = plan.track(group_of(change)) or ()
-    return sum((action.end - action.start) * gain(change, action.word) for action in track)
+    return counted(plan.track(group_of(change)), change)[-1]
 
 
-def does(plan: Plan, change: Change, ticks: int) -> bool:
-    """Whether a plan does at least ``ticks`` of a change, as `done` counts, and does not contradict it.
+def changed(before: Plan, after: Plan, change: Change) -> bool:
+    """Whether a plan does more of a change than another, for half a second or longer, and nothing against it.
 
-    Who stays in the lane leaves it nowhere, and who moves to one side does not move to the other first.
+    Who slows down is not half a second ahead of the other plan in speeding up first, who picks up speed not
+    behind. Who stays in the lane leaves it nowhere, and who moves to one side moves to the other only later.
     """
-    if done(plan, change) < ticks:
+    if done(after, change) < needed(before, change):
         return False
-    moves = [action.word for action in plan.lane or () if action.word != KEEP_LANE]
+    group = group_of(change)
+    if group == "longitudinal":
+        both = zip(counted(before.track(group), change), counted(after.track(group), change), strict=True)
+        return all(other > one - MIN_TICKS for one, other in both)
+    moves = [action.word for action in after.lane or () if action.word != KEEP_LANE]
     if change == "keep_lane":
         return not moves
     return change not in OTHER_LANE or moves[0] != OTHER_LANE[change]
+
+
+def counted(track: Track | None, change: Change) -> tuple[int, ...]:
+    """How much a track does for a change until each of the ticks 0 to `TICKS`, as `done` counts."""
+    each = [gain(change, action.word) for action in track or () for _ in range(action.start, action.end)]
+    return tuple(accumulate(each or [0] * TICKS, initial=0))
 
 
 def needed(before: Plan, change: Change) -> int:

@@ -93,7 +93,7 @@ class _Exporter:
                 return self._codes(piece, range(count))
             case Track() | TrackWord():
                 free = replace(piece, segments_left=MAX_SEGMENTS, previous=None, aim=None)
-                return self._later(replace(free, ticks=0) if isinstance(free, TrackWord) else free)
+                return self._later(replace(free, start=0) if isinstance(free, TrackWord) else free)
             case Shorthand():
                 if piece not in self._shorthands:
                     text = self._of(self._compiled.expanded(piece))

@@ -5,10 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache, partial
 from typing import Final
 
-from looktwice.model.driving.direction import KEEP_LANE, OTHER_LANE, Change, does, gain, group_of, needed
+from looktwice.model.driving.direction import (
+    KEEP_LANE,
+    MIN_TICKS,
+    OTHER_LANE,
+    Change,
+    changed,
+    counted,
+    gain,
+    group_of,
+    needed,
+)
 from looktwice.model.driving.phrases import Facts, PhraseError, agrees, read_facts
 from looktwice.model.driving.plan import (
     GROUPS,
@@ -103,8 +113,9 @@ class PlanTracks(Compound):
             if kept.get(group, track) != track:
                 raise FormatError(f"track {group} is to stay as it is: {kept[group]}")
         for aim in self.aims:
-            if not does(value, aim.change, aim.ticks):
-                raise FormatError(f"track {group_of(aim.change)} does too little {aim.change}")
+            group = group_of(aim.change)
+            if not changed(Plan(**{group: aim.first}), value, aim.change):
+                raise FormatError(f"track {group} does too little {aim.change}, or too late")
         return tuple(
             text
             for group, track in tracks
@@ -125,29 +136,81 @@ class PlanTracks(Compound):
 
 @dataclass(frozen=True)
 class Aim:
-    """What a track has to do more of, as `direction.does` tells.
+    """What a track has to do more of than the first plan's, as `direction.changed` tells.
 
     Attributes:
-        change, ticks: at least so many of it.
+        change: what.
+        first: the first plan's track.
+        ticks: how much of it is still to do, as `direction.done` counts.
         barred: a word that is not to be written before the change is begun.
     """
 
     change: Change
+    first: DrivingTrack
     ticks: int
     barred: str | None = None
 
-    def behind(self, word: str, ticks: int, left: int) -> Aim | None:
-        """What is left to do behind some ticks of a word; None where nothing can go wrong any more."""
+    @classmethod
+    def to(cls, change: Change, first: Plan) -> Aim:
+        """All of a change that a plan leaves room for."""
+        track = first.track(group_of(change)) or ()
+        return cls(change, track, needed(first, change), OTHER_LANE.get(change))
+
+    def allows(self, word: str, start: int, end: int, segments_left: int) -> bool:
+        """Whether the aim can be reached behind a word from tick to tick, in so many further meta-actions."""
+        if word == self.barred or end > self._holds_until(word, start):
+            return False
+        rest, left = self._behind(word, end - start), TICKS - end
+        if _most(self.change, word, left, segments_left) < rest.ticks:
+            return False
+        others = [each for each in _words(self.change) if each != word]
+        best = max(others, key=lambda each: gain(self.change, each))
+        if not left or gain(self.change, best) > 0:
+            return True
+        # The only word that does it has just been written: the next best one comes, as short as possible.
+        return rest._holds_until(best, end) >= (TICKS if segments_left == 1 else end + 1)
+
+    def behind(self, word: str, start: int, end: int) -> Aim | None:
+        """What is left to do behind a word from tick to tick; None where nothing can go wrong any more."""
+        rest, worst = (
+            self._behind(word, end - start),
+            min(_words(self.change), key=partial(gain, self.change)),
+        )
+        surely = gain(self.change, worst) * (TICKS - end) >= rest.ticks
+        return None if surely and rest._holds_until(worst, end) == TICKS else rest
+
+    def _behind(self, word: str, ticks: int) -> Aim:
         gained = gain(self.change, word)
-        rest = Aim(self.change, self.ticks - ticks * gained, None if gained > 0 else self.barred)
-        worst = min(gain(self.change, each) for each in WORDS[group_of(self.change)])
-        return rest if rest.ticks > worst * left else None
+        return replace(self, ticks=self.ticks - ticks * gained, barred=None if gained > 0 else self.barred)
+
+    def _holds_until(self, word: str, start: int) -> int:
+        """The last tick up to which a word from ``start`` on is not half a second behind the first plan."""
+        if group_of(self.change) != "longitudinal":
+            return TICKS
+        return _last_tick(self.first, self.change, self.ticks, gain(self.change, word), start)
+
+
+@lru_cache(1 << 14)
+def _last_tick(first: DrivingTrack, change: Change, left: int, gained: int, start: int) -> int:
+    """See `Aim._holds_until`: ``left`` is still to do at ``start``, and each tick gains ``gained``."""
+    before = counted(first, change)
+    done = before[-1] + MIN_TICKS - left
+    late = (
+        tick
+        for tick in range(start + 1, TICKS + 1)
+        if done + gained * (tick - start) <= before[tick] - MIN_TICKS
+    )
+    return next(late, TICKS + 1) - 1
+
+
+def _words(change: Change) -> tuple[str, ...]:
+    return WORDS[group_of(change)]
 
 
 @cache
 def _most(change: Change, previous: str, left: int, segments_left: int) -> int:
     """The most that ``left`` ticks behind a word can do for a change, in so many meta-actions."""
-    gains = {word: gain(change, word) for word in WORDS[group_of(change)] if word != previous}
+    gains = {word: gain(change, word) for word in _words(change) if word != previous}
     best = max(gains.values())
     if best > 0 or left < 2 or segments_left < 2:
         return best * left
@@ -176,16 +239,16 @@ class Track(Shorthand):
         return Sequence((Literal(f"  - {format_tick(self.start)}s-"), Choice(ends, ordered=True)))
 
     def _word(self, end: int) -> TrackWord:
-        # Without an aim a word does not depend on how long it is said.
-        ticks = 0 if self.aim is None else end - self.start
-        return TrackWord(self.group, end, self.segments_left - 1, self.previous, self.aim, ticks)
+        # Without an aim a word does not depend on when it begins.
+        start = 0 if self.aim is None else self.start
+        return TrackWord(self.group, end, self.segments_left - 1, self.previous, self.aim, start)
 
 
 @dataclass(frozen=True)
 class TrackWord(Shorthand):
     """The word of the meta-action that ends at the tick ``end``, and the rest of its track.
 
-    With an ``aim`` the meta-action takes so many ``ticks``.
+    With an ``aim`` it begins at the tick ``start``.
     """
 
     group: Group
@@ -193,33 +256,25 @@ class TrackWord(Shorthand):
     segments_left: int
     previous: str | None
     aim: Aim | None = None
-    ticks: int = 0
+    start: int = 0
 
     def expand(self) -> Sequence:
         """The words in simpler pieces; behind each the rest of the track, if there is one."""
         words = []
         for word in self.words():
-            aim = self.aim and self.aim.behind(word, self.ticks, TICKS - self.end)
+            aim = self.aim and self.aim.behind(word, self.start, self.end)
             rest = (Track(self.group, self.end, self.segments_left, word, aim),) if self.end < TICKS else ()
             words.append(Option(f" {word}", Sequence((Literal("\n"), *rest))))
         return Sequence((Literal("s:"), Choice(tuple(words))))
 
     def words(self) -> list[str]:
         """The words that can be written here; with an aim those behind which it can be reached."""
-        aim, left = self.aim, TICKS - self.end
+        aim = self.aim
         return [
             word
             for word in WORDS[self.group]
             if word != self.previous
-            and (
-                aim is None
-                or (
-                    word != aim.barred
-                    and self.ticks * gain(aim.change, word)
-                    + _most(aim.change, word, left, self.segments_left)
-                    >= aim.ticks
-                )
-            )
+            and (aim is None or aim.allows(word, self.start, self.end, self.segments_left))
         ]
 
 
@@ -286,11 +341,7 @@ class RevisedPlan(Narrowing):
             return GivenPlan(self.given)
         stated = {group_of(change) for change in facts.changes}
         kept = [(group, track) for group, track in first.tracks() if group not in stated]
-        aims = [
-            Aim(change, needed(first, change), OTHER_LANE.get(change))
-            for change in facts.changes
-            if change != "keep_lane"
-        ]
+        aims = [Aim.to(change, first) for change in facts.changes if change != "keep_lane"]
         if "keep_lane" in facts.changes:
             kept.append(("lane", (MetaAction(0, TICKS, KEEP_LANE),)))
         return PlanTracks(kept=tuple(kept), aims=tuple(aims))

@@ -6,9 +6,8 @@ from hypothesis import strategies as st
 
 from looktwice.model.driving.direction import (
     CHANGES,
-    does,
+    changed,
     group_of,
-    needed,
     track_changes,
     wanted_changes,
 )
@@ -145,6 +144,26 @@ def test_who_moves_to_one_side_does_not_move_to_the_other_first(lane: str, chang
     assert track_changes(plan(), after, "lane") == changes
 
 
+@pytest.mark.parametrize(
+    ("first", "revised", "changes"),
+    [
+        ("Keep Speed|Accelerate", "Keep Speed", {"slower"}),
+        ("Keep Speed", "Accelerate 1|Decelerate", set()),
+        ("Keep Speed", "Accelerate 0.4|Decelerate", {"slower"}),
+        ("Decelerate|Keep Speed", "Decelerate 4.1|Accelerate", set()),
+        ("Decelerate|Keep Speed", "Decelerate|Accelerate", {"faster"}),
+    ],
+)
+def test_who_slows_down_does_not_speed_up_first(first: str, revised: str, changes: set[str]) -> None:
+    def of(text: str) -> Plan:
+        one, _, other = text.partition("|")
+        word, _, seconds = one.rpartition(" ") if one[-1].isdigit() else (one, "", "3.2")
+        ticks = round(10 * float(seconds))
+        return Plan(longitudinal=track_from_words([word] * ticks + [other or word] * (64 - ticks)))
+
+    assert track_changes(of(first), of(revised), "longitudinal") == changes
+
+
 def test_who_stays_in_the_lane_leaves_it_nowhere() -> None:
     leaves = Plan(lane=track_from_words(["Left Lane Change"] * 40 + ["Keep Lane"] * 24))
     later = Plan(lane=track_from_words(["Keep Lane"] * 32 + ["Left Lane Change"] * 32))
@@ -156,4 +175,4 @@ def test_who_stays_in_the_lane_leaves_it_nowhere() -> None:
 @given(plans(), plans())
 def test_what_is_needed_for_a_change_is_what_wanted_changes_finds(before: Plan, after: Plan) -> None:
     found = frozenset().union(*wanted_changes(before, after))
-    assert found == {change for change in CHANGES if does(after, change, needed(before, change))}
+    assert found == {change for change in CHANGES if changed(before, after, change)}
