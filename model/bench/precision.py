@@ -43,13 +43,19 @@ Responses = dict[tuple[str, int], tuple[int, ...]]
 
 
 def measure(checkpoint: Path, scenes: Sequence[Scene], n: int) -> list[Precision]:
-    """Decode ``scenes`` with ``n`` draws each in float64, in float32, and with products in bfloat16."""
+    """Decode ``scenes`` with ``n`` draws each in float64, in float32, and with products in bfloat16.
+
+    Responses are in the checkpoint's first format, without a second look.
+    """
+    loaded = load(checkpoint, torch.float64)
     requests = [
-        PlanRequest(scene.scene_id, scene, "cf_vla", Controls(thinking="never", n=n, seed=seed))
+        PlanRequest(
+            scene.scene_id, scene, loaded.card.default_format, Controls(thinking="never", n=n, seed=seed)
+        )
         for seed, scene in enumerate(scenes)
     ]
     with torch.inference_mode():
-        exact = Runner(load(checkpoint, torch.float64), _AT_ONCE * n)
+        exact = Runner(loaded, _AT_ONCE * n)
         expected = _decode(exact, requests)
         found = []
         for name, products in (("float32", None), ("bfloat16", torch.bfloat16)):

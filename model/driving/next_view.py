@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from typing import Final
 
@@ -10,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from looktwice.model.driving.cameras import CAMERA_SPECS, CameraSpec
-from looktwice.model.driving.short_term import INERTIA
-from looktwice.model.driving.trajectory import FloatArray, GeometryError
+from looktwice.model.driving.short_term import AHEAD_S, INERTIA
+from looktwice.model.driving.trajectory import STEP_S, FloatArray, GeometryError, to_ego_frame
 
 Array = npt.NDArray[np.float64]
 
@@ -48,16 +49,35 @@ class Motion:
 def expected_view(
     frame: npt.NDArray[np.uint8], camera: str, history: FloatArray, motion: Motion | None = None
 ) -> npt.NDArray[np.uint8]:
-    """What a camera would see half a second later if only the ego moved.
+    """`expected_views` of what a camera sees now alone: uint8 [h, w, 3]."""
+    view: npt.NDArray[np.uint8] = expected_views((frame,), camera, history, motion)[0]
+    return view
+
+
+def expected_views(
+    frames: Sequence[npt.NDArray[np.uint8]], camera: str, history: FloatArray, motion: Motion | None = None
+) -> npt.NDArray[np.uint8]:
+    """What a camera would see in half a second if only the ego moved, as each of some pictures tells it.
+
+    Where two of them differ, something moved, or is no flat road.
 
     Args:
-        frame: uint8 [h, w, 3], what it sees now.
+        frames: uint8 [h, w, 3] each, half a second apart, the last one of now; at most four.
         camera: one of `CAMERAS`; taken for one that our models are trained with.
         history: float32 [16, 4] of the ego.
         motion: of the ego; without one it keeps its momentum.
+
+    Returns:
+        uint8 [frames, h, w, 3].
     """
-    pose = INERTIA.ego(history, None) if motion is None else astuple(motion)
-    return moved_view(frame, CAMERA_SPECS[camera], pose)
+    x_m, y_m, heading_rad = INERTIA.ego(history, None) if motion is None else astuple(motion)
+    taken_from = history[:: -round(AHEAD_S / STEP_S)][: len(frames)][::-1]
+    return np.stack(
+        [
+            moved_view(frame, CAMERA_SPECS[camera], to_ego_frame((x_m, y_m, 0, heading_rad), pose)[[0, 1, 3]])
+            for frame, pose in zip(frames, taken_from, strict=True)
+        ]
+    )
 
 
 def moved_view(

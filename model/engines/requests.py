@@ -232,7 +232,7 @@ def painted(visual_codes: VisualCodes | None, request: PlanRequest, codes: Seque
     if visual_codes is None:
         raise RequestError("this checkpoint has no codes of pictures to paint with")
     # Scheduling, which reads requests too, needs no torch.
-    from looktwice.model.network.inputs import moved_picture
+    from looktwice.model.network.inputs import moved_pictures
 
     view = request.controls.view
-    return visual_codes.decode(codes, None if view is None else moved_picture(request.scene, view))
+    return visual_codes.decode(codes, None if view is None else moved_pictures(request.scene, view))

@@ -18,7 +18,9 @@ from looktwice.model.driving.intervals import Interval
 from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.engines.engine import Draw
+from looktwice.model.families.family import View
 from looktwice.model.network.checkpoint import Loaded
+from looktwice.model.network.inputs import moved_pictures
 from looktwice.model.network.patches import resize
 from looktwice.model.network.visual_codes import Frame, VisualCodes, frame_of, psnr
 
@@ -152,7 +154,8 @@ def through_codes(visual_codes: VisualCodes, shown: Painter) -> Painter:
     """
 
     def paint(labelled: LabelledScene, camera: str) -> Frame:
-        return visual_codes.decode(visual_codes.encode(shown(labelled, camera)), warped(labelled, camera))
+        moved = moved_pictures(labelled.scene, View(camera))
+        return visual_codes.decode(visual_codes.encode(shown(labelled, camera)), moved)
 
     return paint
 

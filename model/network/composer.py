@@ -1,9 +1,9 @@
-"""A picture of half a second later out of two: what codes say of it, and what is seen now, moved as the ego.
+"""A picture of half a second later: what codes say of it, and what was seen until now, moved as the ego.
 
-What stands still is better copied than painted from 98 codes, and what moves or enters is in the codes alone.
-For each pixel the composer says where to look in the moved picture, how much of that to take, and what to
-paint instead. Decoders that are told of earlier frames come from video models; see iVideoGPT
-(https://arxiv.org/abs/2405.15223, section 3.1).
+What stands still is better copied than painted from 98 codes. What moves shows where two earlier pictures
+differ, and what enters is in the codes alone. For each pixel the composer says where to look in the latest
+picture, how much of that to take, and what to paint instead. Decoders that are told of earlier frames come
+from video models; see iVideoGPT (https://arxiv.org/abs/2405.15223, section 3.1).
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from torch import Tensor, nn
 
 from looktwice.model.network.blocks import ConvBlock
 
+SEEN_PICTURES: Final = 2
+"""Earlier pictures that a composer is shown, half a second apart, the last one of now."""
 _FINE: Final = 4
 """Pixels across a place of the finest grid."""
 _REACH: Final = 0.1
@@ -35,7 +37,9 @@ class Composer(nn.Module):
     def __init__(self, levels: int, fine: int = 48, coarse: int = 88) -> None:
         super().__init__()
         self.entry = nn.Sequential(
-            nn.PixelUnshuffle(_FINE), nn.Conv2d(6 * _FINE**2, fine, 1), ConvBlock(fine)
+            nn.PixelUnshuffle(_FINE),
+            nn.Conv2d(3 * (1 + SEEN_PICTURES) * _FINE**2, fine, 1),
+            ConvBlock(fine),
         )
         self.to_half = nn.Sequential(nn.Conv2d(fine, coarse, 2, stride=2), ConvBlock(coarse))
         self.to_patches = nn.Conv2d(coarse, coarse, 2, stride=2)
@@ -56,16 +60,16 @@ class Composer(nn.Module):
 
         Args:
             painted: [b, 3, h, w] of the codes alone.
-            moved: [b, 3, h, w] in 0..1, what is seen now, moved as the ego.
-            levels, moved_levels: [b, levels, h/16, w/16] of the codes and of those of ``moved``, in -1..1.
+            moved: [b, seen, 3, h, w] in 0..1, what was seen, moved as the ego; the last one is of now.
+            levels, moved_levels: [b, levels, h/16, w/16] of the codes and of the last moved one's, in -1..1.
         """
-        fine = self.entry(torch.cat((painted, moved), 1) - 0.5)
+        fine = self.entry(torch.cat((painted, moved.flatten(1, 2)), 1) - 0.5)
         half = self.to_half(fine)
         patches = self.to_patches(half) + self.changed(torch.cat((levels, moved_levels), 1))
         half = self.at_half(half + self.from_patches(self.at_patches(patches)))
         fine = self.at_fine(fine + self.from_half(half))
         elsewhere = F.interpolate(self.look(fine), scale_factor=_FINE, mode="bilinear", align_corners=False)
-        found = _looked_up(moved, elsewhere * _REACH)
+        found = _looked_up(moved[:, -1], elsewhere * _REACH)
         mixed = self.finish(fine)
         share = mixed[:, :1].sigmoid()
         composed: Tensor = share * found + (1 - share) * (painted + mixed[:, 1:])

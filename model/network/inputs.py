@@ -14,17 +14,18 @@ from cachetools import LRUCache
 
 from looktwice.model.driving.hashing import hash_of
 from looktwice.model.driving.images import ImageError, decode_image
-from looktwice.model.driving.next_view import expected_view
+from looktwice.model.driving.next_view import expected_views
 from looktwice.model.driving.scene import Clip, Scene
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.families.family import Attempt, Situation, TextInputs, View
 from looktwice.model.families.registry import family_named
 from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.network.composer import SEEN_PICTURES
 from looktwice.model.network.patches import normalise, patchify, resize
 from looktwice.model.network.prompts import prompt_text
 from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.track_features import track_features
-from looktwice.model.network.visual_codes import Frame, VisualCodes, frame_of
+from looktwice.model.network.visual_codes import Seen, VisualCodes, frame_of
 from looktwice.model.network.vocabulary import VIDEO_PAD, Vocabulary
 
 IntArray = npt.NDArray[np.int64]
@@ -75,16 +76,21 @@ class ModelInputs:
         return normalise(self.patches)
 
 
-def moved_picture(scene: Scene, view: View) -> Frame | None:
-    """What a view would show if only the ego moved, uint8 [112, 224, 3]; takes some ms.
+def moved_pictures(scene: Scene, view: View, count: int = SEEN_PICTURES) -> Seen | None:
+    """What a view would show if only the ego moved, as each of its last ``count`` pictures tells it.
 
-    None where the scene has no clip of its camera, or its picture is damaged.
+    Takes some ms each. None where the scene has no clip of its camera, or a picture is damaged.
+
+    Returns:
+        uint8 [count, 112, 224, 3], the last one of now.
     """
     shown = _shown(scene, view)
+    if shown is None:
+        return None
     # A picture that the tower does not look at must not decide whether the model answers.
     with suppress(ImageError):
-        if shown is not None:
-            return expected_view(frame_of(shown.images[-1]), view.camera, scene.history, view.motion)
+        frames = list(map(frame_of, shown.images[-count:]))
+        return expected_views(frames, view.camera, scene.history, view.motion)
     return None
 
 
@@ -163,8 +169,8 @@ class InputBuilder:
         with self._lock:
             if key in self._expected:
                 return self._expected[key]
-        moved = moved_picture(scene, view)
-        codes = None if moved is None else tuple(self._visual_codes.encode(moved).tolist())
+        moved = moved_pictures(scene, view, 1)
+        codes = None if moved is None else tuple(self._visual_codes.encode(moved[-1]).tolist())
         with self._lock:
             self._expected[key] = codes
         return codes

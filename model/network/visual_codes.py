@@ -4,7 +4,7 @@ An encoder of small convolutions writes four numbers for each patch of 16 x 16 p
 quantisation (https://arxiv.org/abs/2309.15505) rounds them to 8, 5, 5 and 5 levels, which together are one
 code. There is no codebook to learn or to collapse. A decoder paints the picture again. It has no adversary to
 please, so that pictures are soft where the codes do not say enough. Where it is known what the camera saw
-half a second before, a `Composer` takes from that what did not change.
+before, a `Composer` takes from that what did not change.
 """
 
 from __future__ import annotations
@@ -34,17 +34,20 @@ from looktwice.model.families.picture_codes import (
     levels_of,
 )
 from looktwice.model.network.blocks import ConvBlock
-from looktwice.model.network.composer import Composer
+from looktwice.model.network.composer import SEEN_PICTURES, Composer
 
 FRAME_WIDTH: Final = 224
 FRAME_HEIGHT: Final = 112
 CODE_ROWS, CODE_COLUMNS = FRAME_HEIGHT // 16, FRAME_WIDTH // 16
 WEIGHTS_FILE: Final = "visual_codes.safetensors"
-_VERSION: Final = 2
+_VERSION: Final = 3
 _INSIDE: Final = 1e-3
 """Keeps the outermost levels reachable: tanh itself reaches its bounds nowhere."""
 
 Frame = npt.NDArray[np.uint8]
+"""A picture uint8 [112, 224, 3]."""
+Seen = npt.NDArray[np.uint8]
+"""What a camera saw, moved as the ego: uint8 [2, 112, 224, 3], half a second apart, the last one of now."""
 
 
 def frame_of(encoded: bytes) -> Frame:
@@ -134,12 +137,12 @@ class VisualCodes(nn.Module):
         return painted
 
     def compose(self, levels: Tensor, moved: Tensor, before: Tensor) -> Tensor:
-        """The same, with what was seen half a second before; for those that have a composer.
+        """The same, with what was seen before; for those that have a composer.
 
         Args:
             levels: [b, 4, 7, 14].
-            moved: [b, 3, 112, 224] in 0..1, as the camera would see it if only the ego had moved since.
-            before: [b, 4, 7, 14], the levels of ``moved``.
+            moved: [b, 2, 3, 112, 224] in 0..1, as the camera would see it if only the ego had moved since.
+            before: [b, 4, 7, 14], the levels of the last of ``moved``.
         """
         assert self.composer is not None, "these codes compose no pictures"
         composed: Tensor = self.composer(self.paint(levels), moved, _scaled(levels), _scaled(before))
@@ -158,13 +161,13 @@ class VisualCodes(nn.Module):
         return codes_of(levels.movedim(0, -1).to(torch.int64).cpu().numpy()).ravel()
 
     @torch.inference_mode()
-    def decode(self, codes: npt.ArrayLike, moved: Frame | None = None) -> Frame:
+    def decode(self, codes: npt.ArrayLike, moved: Seen | None = None) -> Frame:
         """The picture uint8 [112, 224, 3] of codes [98].
 
         Args:
             codes: of the picture.
-            moved: what the camera saw half a second before, see `looktwice.model.driving.next_view`. Codes
-                without a composer paint without it.
+            moved: what the camera saw before, see `looktwice.model.driving.next_view`. Codes without a
+                composer paint without it.
 
         Raises:
             VisualCodesError: other codes, or a picture of another size or type.
@@ -177,8 +180,10 @@ class VisualCodes(nn.Module):
         if self.composer is None or moved is None:
             painted = self.paint(levels)
         else:
-            pictures = _checked(moved).to(self.place.device)
-            painted = self.compose(levels, pictures, self.levels(pictures))
+            if len(moved) != SEEN_PICTURES:
+                raise VisualCodesError(f"a composer is shown {SEEN_PICTURES} pictures, got {len(moved)}")
+            pictures = torch.cat(list(map(_checked, moved))).to(self.place.device)
+            painted = self.compose(levels, pictures[None], self.levels(pictures[-1:]))
         return (painted[0].clamp(0, 1) * 255).round().to(torch.uint8).movedim(0, -1).cpu().numpy()
 
     def save(self, folder: Path, details: Mapping[str, object]) -> None:

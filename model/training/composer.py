@@ -1,33 +1,39 @@
-"""Training of the composer of pictures: what to take from half a second before, and what to paint from codes.
+"""Training of the composer of pictures: what to take from what was seen, and what to paint from codes.
 
 The codes stay as they are, so models that write them need not learn anything anew. A model writes some codes
 wrong, most of them as if nothing had changed. So the composer learns with any share of them spoilt in that
-way, and learns how far to trust them.
+way, and from a checkpoint's own pictures where there is one. It learns how far to trust them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from looktwice.model.driving.images import encode_png, tiled
-from looktwice.model.driving.next_view import expected_view
+from looktwice.model.driving.next_view import expected_views
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.driving.whole_files import written_whole
-from looktwice.model.families.picture_codes import LEVELS
-from looktwice.model.network.composer import Composer
+from looktwice.model.families.picture_codes import LEVELS, levels_of
+from looktwice.model.network.card import CARD_FILE, LOG_FILE
+from looktwice.model.network.checkpoint import Loaded, load, save
+from looktwice.model.network.composer import SEEN_PICTURES, Composer
 from looktwice.model.network.visual_codes import (
+    CODE_COLUMNS,
+    CODE_ROWS,
     Frame,
+    Seen,
     VisualCodes,
     batch_of,
     frame_of,
@@ -35,8 +41,12 @@ from looktwice.model.network.visual_codes import (
     psnr,
 )
 from looktwice.model.training.recipes import Recipe
+from looktwice.model.training.run import inherit_log
 from looktwice.model.training.visual_codes import SHEET_FILE, held_out, learn, painting_losses, spread
+from looktwice.model.training.written_pictures import written_pictures
 
+WRITTEN_FILE: Final = "written.jsonl"
+"""What a checkpoint wrote, beside the log."""
 _SHEET_PICTURES: Final = 6
 _STEPPED_SHARE: Final = 0.25
 """The most levels that are spoilt by one up or down."""
@@ -44,24 +54,29 @@ _STEPPED_SHARE: Final = 0.25
 
 @dataclass(frozen=True, eq=False)
 class NextPair:
-    """What a camera saw, and what it saw half a second later: encoded pictures.
+    """What a camera saw until now, and what it saw half a second later: encoded pictures.
 
     Attributes:
-        episode: that they are of.
+        episode, scene_id: that they are of.
         camera: one of `CAMERAS`.
-        history: float32 [16, 4] of the ego, up to the first.
-        seen, came: the two.
+        history: float32 [16, 4] of the ego.
+        seen: half a second apart, the last one of now.
+        came: half a second later.
+        written: the 98 codes that a checkpoint writes of it, if it was asked.
     """
 
     episode: int
+    scene_id: str
     camera: str
     history: FloatArray
-    seen: bytes
+    seen: tuple[bytes, ...]
     came: bytes
+    written: tuple[int, ...] | None = None
 
-    def frames(self) -> tuple[Frame, Frame]:
-        """The first, moved as the ego moves on, and the second; takes some ms."""
-        return expected_view(frame_of(self.seen), self.camera, self.history), frame_of(self.came)
+    def frames(self) -> tuple[Seen, Frame]:
+        """What was seen, moved as the ego moves on, and what came; takes some ms."""
+        seen = expected_views(list(map(frame_of, self.seen)), self.camera, self.history)
+        return seen, frame_of(self.came)
 
 
 def pairs_of(scenes: Iterable[LabelledScene]) -> list[NextPair]:
@@ -71,13 +86,27 @@ def pairs_of(scenes: Iterable[LabelledScene]) -> list[NextPair]:
         came = {frame.camera: frame.image for frame in labelled.next_frames}
         for clip in labelled.scene.clips:
             if clip.camera in came:
-                about = labelled.seed, clip.camera, labelled.scene.history
-                pairs.append(NextPair(*about, clip.images[-1], came[clip.camera]))
+                about = labelled.seed, labelled.scene.scene_id, clip.camera, labelled.scene.history
+                pairs.append(NextPair(*about, clip.images[-SEEN_PICTURES:], came[clip.camera]))
     return pairs
 
 
-class PairDataset(Dataset[tuple[Frame, Frame]]):
-    """Each pair's frames, as they are or mirrored, by chance."""
+class Example(NamedTuple):
+    """A pair to learn from.
+
+    Attributes:
+        moved: uint8 [2, 112, 224, 3], what was seen, moved as the ego.
+        came: uint8 [112, 224, 3].
+        written: int64 [4, 7, 14], the levels that a checkpoint writes; -1 where none was asked.
+    """
+
+    moved: Seen
+    came: Frame
+    written: npt.NDArray[np.int64]
+
+
+class PairDataset(Dataset[Example]):
+    """Each pair as it is or mirrored, by chance; mirrored pictures have other codes, which nobody wrote."""
 
     def __init__(self, pairs: Sequence[NextPair], seed: int = 0) -> None:
         self._pairs = pairs
@@ -86,18 +115,25 @@ class PairDataset(Dataset[tuple[Frame, Frame]]):
     def __len__(self) -> int:
         return len(self._pairs)
 
-    def __getitem__(self, index: int) -> tuple[Frame, Frame]:
-        moved, came = self._pairs[index].frames()
+    def __getitem__(self, index: int) -> Example:
+        pair = self._pairs[index]
+        moved, came = pair.frames()
+        unwritten = np.full((len(LEVELS), CODE_ROWS, CODE_COLUMNS), -1)
         if self.random.random() < 0.5:
-            return np.ascontiguousarray(moved[:, ::-1]), np.ascontiguousarray(came[:, ::-1])
-        return moved, came
+            return Example(moved[:, :, ::-1], came[:, ::-1], unwritten)
+        if pair.written is None:
+            return Example(moved, came, unwritten)
+        levels = levels_of(pair.written).reshape(CODE_ROWS, CODE_COLUMNS, len(LEVELS))
+        return Example(moved, came, np.moveaxis(levels, -1, 0))
 
 
-def collate_pairs(pairs: Sequence[tuple[Frame, Frame]]) -> dict[str, Tensor]:
-    """Pairs as two batches float32 [b, 3, 112, 224]."""
+def collate_pairs(examples: Sequence[Example]) -> dict[str, Tensor]:
+    """Float32 batches: moved [b, 2, 3, 112, 224], came [b, 3, 112, 224], written [b, 4, 7, 14]."""
+    moved = [batch_of(list(example.moved)) for example in examples]
     return {
-        "moved": batch_of([moved for moved, _ in pairs]),
-        "came": batch_of([came for _, came in pairs]),
+        "moved": torch.stack(moved),
+        "came": batch_of([example.came for example in examples]),
+        "written": torch.from_numpy(np.stack([example.written for example in examples])).float(),
     }
 
 
@@ -111,12 +147,12 @@ class ComposerLearner(nn.Module):
         for name, parameter in codes.named_parameters():
             parameter.requires_grad_(name.startswith("composer."))
 
-    def forward(self, moved: Tensor, came: Tensor) -> dict[str, Tensor]:
-        """Losses of `painting_losses`, of pictures float [b, 3, 112, 224] in 0..1."""
+    def forward(self, moved: Tensor, came: Tensor, written: Tensor) -> dict[str, Tensor]:
+        """Losses of `painting_losses`; see `collate_pairs` for the arguments."""
         with torch.no_grad():
-            levels, before = self.codes.levels(came), self.codes.levels(moved)
-            spoilt = self._spoilt(levels, before)
-        return painting_losses(self.codes.compose(spoilt, moved, before), came)
+            levels, before = self.codes.levels(came), self.codes.levels(moved[:, -1])
+            guessed = torch.where(written < 0, self._spoilt(levels, before), written)
+        return painting_losses(self.codes.compose(guessed, moved, before), came)
 
     @staticmethod
     def _spoilt(levels: Tensor, before: Tensor) -> Tensor:
@@ -136,6 +172,7 @@ def train_composer(
     target: Path,
     validation: Path | None = None,
     *,
+    written_pairs: int = 4000,
     measured_pairs: int = 96,
     validate_every: int = 500,
     save_every: int = 250,
@@ -144,21 +181,24 @@ def train_composer(
 ) -> dict[str, float]:
     """Train the composer of codes of pictures, which get one where they have none; returns the last figures.
 
-    State is kept in ``target/state``: started again after a kill, it goes on from there.
+    From a checkpoint that imagines it learns what that writes too, and the outcome is the checkpoint with
+    its new composer. State is kept in ``target/state``, and what the checkpoint wrote in
+    ``target/written.jsonl``: started again after a kill, it goes on from there.
 
     Args:
         recipe: how long and how fast.
         scenes: file or folder, with pictures half a second ahead.
-        source: folder of the codes.
-        target: folder to write: the codes with their composer, a log, and a sheet of pictures.
+        source: folder of the codes, or of a checkpoint that has some.
+        target: folder to write: the codes with their composer or the checkpoint, a log, a sheet of pictures.
         validation: scenes whose pictures are held out; every tenth episode of ``scenes`` without them.
+        written_pairs: pairs that a checkpoint is asked for.
         measured_pairs: held-out pairs that figures are told of.
         validate_every, save_every: steps.
         bf16: mixed precision; float32 is the faster one on CPUs.
         use_cpu: stay off accelerators.
 
     Raises:
-        ValueError: no pairs to learn from, or none to hold out.
+        ValueError: no pairs to learn from, or none to hold out; a checkpoint that imagines nothing.
         VisualCodesError: there are no codes in ``source``.
     """
     codes = load_visual_codes(source)
@@ -171,13 +211,28 @@ def train_composer(
         raise ValueError(
             "there are no pictures half a second ahead: `looktwice scenes generate --next-frames`"
         )
+    measured = spread(others, measured_pairs)
+    writer = load(source) if (source / CARD_FILE).is_file() else None
+    stages: list[object] = []
+    if writer is not None:
+        target.mkdir(parents=True, exist_ok=True)
+        inherit_log(target / LOG_FILE, [source])
+        stages = list(writer.card.details.get("stages", []))
+        asked = np.random.default_rng(recipe.seed).permutation(len(pairs))[:written_pairs]
+        wanted = {(pair.scene_id, pair.camera) for pair in (*measured, *(pairs[place] for place in asked))}
+        folders = (scenes,) if validation is None else (scenes, validation)
+        shown = (labelled for folder in folders for labelled in read_scenes(folder, dense=False))
+        written = written_pictures(writer, shown, wanted, target / WRITTEN_FILE)
+        pairs, measured = (
+            [replace(pair, written=written.get((pair.scene_id, pair.camera))) for pair in some]
+            for some in (pairs, measured)
+        )
     torch.manual_seed(recipe.seed)
     if codes.composer is None:
         codes.composer = Composer(len(LEVELS))
-    measured = spread(others, measured_pairs)
     about, figures = learn(
         ComposerLearner(codes),
-        recipe,
+        recipe if writer is None else replace(recipe, name=f"{len(stages) + 1} {recipe.name}"),
         PairDataset(pairs, recipe.seed),
         collate_pairs,
         target,
@@ -188,13 +243,32 @@ def train_composer(
         use_cpu=use_cpu,
     )
     about |= {"pairs": len(pairs), "episodes": len({pair.episode for pair in pairs})}
-    rows = [[*pair.frames(), _composed(codes, *pair.frames())] for pair in spread(measured, _SHEET_PICTURES)]
+    if writer is not None:
+        about["written_pairs"] = sum(pair.written is not None for pair in pairs)
+    rows = [_row(codes, pair) for pair in spread(measured, _SHEET_PICTURES)]
     with written_whole(target / SHEET_FILE) as temporary:
         temporary.write_bytes(encode_png(tiled(rows)))
     before = codes.details.get("composer", [])
     assert isinstance(before, list)
-    codes.save(target, {**codes.details, "composer": [*before, about | figures]})
+    codes.details = {**codes.details, "composer": [*before, about | figures]}
+    if writer is None:
+        codes.save(target, codes.details)
+    else:
+        _save(target, writer, codes, [*stages, {"name": recipe.name, **about, **figures}])
     return figures
+
+
+def _save(target: Path, writer: Loaded, codes: VisualCodes, stages: Sequence[object]) -> None:
+    """Write a checkpoint with other codes of pictures."""
+    save(
+        target,
+        writer.model,
+        writer.vocabulary,
+        writer.codec,
+        dtype=torch.bfloat16,
+        details={**writer.card.details, "stages": list(stages)},
+        visual_codes=codes,
+    )
 
 
 def composed_figures(codes: VisualCodes, pairs: Sequence[NextPair]) -> dict[str, float]:
@@ -202,21 +276,32 @@ def composed_figures(codes: VisualCodes, pairs: Sequence[NextPair]) -> dict[str,
 
     Returns:
         ``moved_psnr_db``: what was seen, moved as the ego. ``painted_psnr_db``: the codes of what came,
-        painted without it. ``composed_psnr_db``: the same codes with it.
+        painted without it. ``composed_psnr_db``: the same codes with it. ``written_psnr_db``: the codes
+        that a checkpoint wrote, with it, if it wrote those of all pairs.
     """
     was_training = codes.training
     codes.eval()
-    found = []
+    found: dict[str, list[float]] = {}
     for pair in pairs:
         moved, came = pair.frames()
-        painted = codes.decode(codes.encode(came))
-        found.append([psnr(each, came) for each in (moved, painted, _composed(codes, moved, came))])
+        right = codes.encode(came)
+        pictures = {
+            "moved_psnr_db": moved[-1],
+            "painted_psnr_db": codes.decode(right),
+            "composed_psnr_db": codes.decode(right, moved),
+        }
+        if pair.written is not None:
+            pictures["written_psnr_db"] = codes.decode(pair.written, moved)
+        for name, picture in pictures.items():
+            found.setdefault(name, []).append(psnr(picture, came))
     codes.train(was_training)
-    names = ("moved_psnr_db", "painted_psnr_db", "composed_psnr_db")
-    return dict(zip(names, np.mean(found, axis=0).tolist(), strict=True)) | {
-        "measured_pairs": float(len(found))
+    return {name: float(np.mean(each)) for name, each in found.items()} | {
+        "measured_pairs": float(len(pairs))
     }
 
 
-def _composed(codes: VisualCodes, moved: Frame, came: Frame) -> Frame:
-    return codes.decode(codes.encode(came), moved)
+def _row(codes: VisualCodes, pair: NextPair) -> list[Frame]:
+    """What was seen, moved; what came; what its codes are composed to, and those that were written."""
+    moved, came = pair.frames()
+    row = [moved[-1], came, codes.decode(codes.encode(came), moved)]
+    return row if pair.written is None else [*row, codes.decode(pair.written, moved)]

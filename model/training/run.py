@@ -222,7 +222,7 @@ def run(
         workers=max(settings.workers, int(recipe.goal == "ground")),
     )
     if trainer.is_world_process_zero():
-        _inherit_log(target / LOG_FILE, [source, *([vision_source] if vision_source else [])])
+        inherit_log(target / LOG_FILE, [source, *([vision_source] if vision_source else [])])
     trainer.train(resume_from_checkpoint=last_whole_state(target / "state"))
     if trainer.is_world_process_zero():
         loaded.model.train(False)
@@ -411,7 +411,7 @@ def _prepare(
     return learner, responses, sampler, collate
 
 
-def _inherit_log(log: Path, sources: Sequence[Path]) -> None:
+def inherit_log(log: Path, sources: Sequence[Path]) -> None:
     """Begin a log that is not there yet with the rows of its sources, each row once."""
     if log.exists():
         return

@@ -32,7 +32,7 @@ def train(
         typer.Option(
             "--from",
             help="Checkpoint folder to start from; of a ladder one that writes meta-actions, for composer "
-            "the codes.",
+            "one that imagines, or codes alone.",
         ),
     ] = None,
     vision_from: Annotated[Path | None, typer.Option(help="Checkpoint whose vision tower is taken.")] = None,
@@ -156,23 +156,21 @@ def train(
             vision_rate=chosen.vision_rate if vision_rate is None else vision_rate,
             seed=seed,
         )
-        if recipe == VISUAL_CODES.name:
-            if source is not None:
-                raise ValueError("codes of pictures start from nothing: leave --from out")
-            # Convolutions are faster in float32 on CPUs, even where matrices are not.
-            _tell(train_visual_codes(chosen, scenes, target, validation, bf16=bf16 or False, use_cpu=not gpu))
-            training_curves(target / LOG_FILE, target / "curves.png")
-            return
-        if source is None:
+        if recipe == VISUAL_CODES.name and source is not None:
+            raise ValueError("codes of pictures start from nothing: leave --from out")
+        if recipe != VISUAL_CODES.name and source is None:
             raise ValueError("give the checkpoint to start from: --from FOLDER")
-        if recipe == COMPOSER.name:
+        if chosen.goal == "code":
+            # Convolutions are faster in float32 on CPUs, even where matrices are not.
+            how: dict[str, bool] = {"bf16": bf16 or False, "use_cpu": not gpu}
             _tell(
-                train_composer(
-                    chosen, scenes, source, target, validation, bf16=bf16 or False, use_cpu=not gpu
-                )
+                train_visual_codes(chosen, scenes, target, validation, **how)
+                if source is None
+                else train_composer(chosen, scenes, source, target, validation, **how)
             )
             training_curves(target / LOG_FILE, target / "curves.png")
             return
+        assert source is not None
         if refine_below is not None:
             chosen = refining_with(chosen, threshold=refine_below)
         if refine_by is not None:

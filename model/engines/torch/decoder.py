@@ -342,9 +342,10 @@ class Decoder:
         events: list[Event] = []
         row.passes += 1
         held = row.held
+        first = len(row.tokens) - len(row.pending)
         guessed = feed.tokens[len(row.pending) :]
         row.fed(min(len(row.pending), len(feed.tokens)))
-        for logits in found:
+        for place, logits in enumerate(found, 1):
             events += self._choose(row, logits, guessed[0] if guessed else None)
             agreed = 0
             while agreed < min(len(row.pending), len(guessed)) and row.pending[agreed] == guessed[agreed]:
@@ -352,6 +353,8 @@ class Decoder:
             row.fed(agreed)
             guessed = guessed[agreed:]
             if row.pending:
+                later = [first + position + 1 for position, _ in feed.wanted[place:]]
+                self._drafter.look_again(row, later, found[place:])
                 break
         self.counts.kept += row.held - held
         return events

@@ -5,7 +5,9 @@ There are four sources, asked in this order:
 
 1. the last response to the same pictures, while the row agrees with it (`_Responses`);
 2. the first plan, while a revised plan repeats it;
-3. within a picture that is imagined: the code that is expected there, which stands before it;
+3. within a picture that is imagined: what the last pass would have written there, had all guesses before it
+   been right (Jacobi decoding, https://arxiv.org/abs/2305.10427), or else the code that is expected there,
+   which stands before it;
 4. what followed the same last tokens in any response (`_Ngrams`).
 """
 
@@ -26,6 +28,7 @@ from looktwice.model.formats.cursor import AtCode, Cursor
 from looktwice.model.formats.pieces import FormatError
 
 Ids = npt.NDArray[np.int64]
+Logits = npt.NDArray[np.float64]
 
 _MAX_TOKENS: Final = 768
 """Guessed tokens of a pass, over all its rows: with more it is too large to be quick."""
@@ -52,8 +55,6 @@ class Drafter:
 
     def __init__(self) -> None:
         self._ngrams, self._responses = _Ngrams(), _Responses()
-        self._codes, self._codes_kept = 2, 1
-        """Codes of pictures that were written where one was expected, and how many were the same."""
 
     def propose(self, row: Row, rows: int) -> tuple[list[int], list[tuple[int, Ids]]]:
         """A row's pending tokens with guesses behind them, and the decisions among both.
@@ -84,8 +85,7 @@ class Drafter:
             elif position < len(copied):
                 token = copied[position]
             elif position < most and (expected := _code_expected(row, cursor, context)) is not None:
-                share *= self._codes_kept / self._codes
-                token = expected if share > least else None
+                token = row.foreseen.get(written + position, expected)
             elif position < most and (len(ids) <= _MAX_OPTIONS or cursor.stop_id is not None):
                 number = uniform(controls.seed, row.draws[0], written + position)
                 likely = self._ngrams.likely(context, number if controls.temperature else None)
@@ -110,14 +110,25 @@ class Drafter:
 
     def observe(self, row: Row, options: int, chosen: Sequence[tuple[int, tuple[int, ...]]]) -> None:
         """Draws of a row are about to write ``chosen`` tokens, each out of so many options."""
-        before = [token.id for token in row.tokens[-1:]]
-        if (expected := _code_expected(row, row.cursor, before)) is not None:
-            self._codes += sum(len(draws) for _, draws in chosen)
-            self._codes_kept += sum(len(draws) for token, draws in chosen if token == expected)
         if options <= _MAX_OPTIONS or row.cursor.stop_id is not None:
             context = [token.id for token in row.tokens[-max(_CONTEXTS) :]]
             for token, draws in chosen:
                 self._ngrams.count(context, token, len(draws))
+
+    def look_again(self, row: Row, places: Sequence[int], logits: Sequence[Logits]) -> None:
+        """A guess of a row was wrong: keep what it would have written behind it, at places of its response.
+
+        Where one code of a picture is another one, most that follow stay as they are.
+        """
+        before = [token.id for token in row.tokens[-1:]]
+        row.foreseen = {}
+        if _code_expected(row, row.cursor, before) is not None:
+            options = len(row.cursor.allowed().ids)
+            row.foreseen = {
+                place: row.would_choose(values, place)
+                for place, values in zip(places, logits, strict=True)
+                if len(values) == options
+            }
 
     def finished(self, row: Row) -> None:
         """A row has written its whole response."""

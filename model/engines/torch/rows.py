@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -35,6 +36,7 @@ class Row(Response):
         passes: how many it took part in.
         passes_before_ending: how many up to where a second look can no longer be cut: the branch, or the end
             of the text behind it. 0 without one.
+        foreseen: what it would have written at later places, had the guesses before these been right.
     """
 
     tree: Tree
@@ -45,6 +47,7 @@ class Row(Response):
     draft: bool = False
     passes: int = 0
     passes_before_ending: int = 0
+    foreseen: Mapping[int, int] = field(default_factory=dict)
 
     @property
     def request(self) -> Request:
@@ -100,6 +103,16 @@ class Row(Response):
         for draw, place in zip(self.draws, places, strict=True):
             chosen.setdefault(int(ids[place]), []).append(draw)
         return [(token, tuple(draws)) for token, draws in chosen.items()]
+
+    def would_choose(self, logits: npt.NDArray[np.float64], place: int) -> int:
+        """What the first draw chooses from these logits if it writes at ``place`` what it may write now."""
+        allowed, controls = self.cursor.allowed(), self.request.controls
+        expected = self.request.least_error.expected(allowed, controls)
+        if expected is not None:
+            return int(allowed.ids[least_error(logits, expected)])
+        numbers = uniforms(controls.seed, self.draws[:1], place)
+        [chosen] = choose(logits, controls.temperature, controls.top_p, numbers)
+        return int(allowed.ids[chosen])
 
     def write(self, token: int | None, vocabulary: Vocabulary, logprob: float | None = None) -> list[Event]:
         """Append a token that was chosen, if any, and the forced run behind it; returns what they finish."""

@@ -5,8 +5,8 @@ import numpy.typing as npt
 import pytest
 
 from looktwice.model.driving.cameras import CAMERA_SPECS
-from looktwice.model.driving.next_view import FAR_M, Motion, expected_view, moved_view
-from looktwice.model.driving.trajectory import GeometryError
+from looktwice.model.driving.next_view import FAR_M, Motion, expected_view, expected_views, moved_view
+from looktwice.model.driving.trajectory import GeometryError, to_ego_frame
 
 FRONT = CAMERA_SPECS["front"]
 
@@ -34,6 +34,24 @@ def test_a_motion_takes_the_place_of_momentum() -> None:
     np.testing.assert_array_equal(moved, moved_view(frame, FRONT, np.array([2.0, 0.5, 0.1])))
     np.testing.assert_array_equal(expected_view(frame, "front", history, Motion(0.0, 0.0, 0.0)), frame)
     assert (expected_view(frame, "front", history) != moved).any()
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.08])
+def test_earlier_pictures_show_the_road_where_the_last_one_does(turn: float) -> None:
+    steps = 15 - np.arange(16)
+    history = np.zeros((16, 4), np.float32)
+    history[:, 0], history[:, 3] = -0.6 * steps, -turn * steps / 5
+    history[:, 1] = 0.02 * steps
+    mark = np.array([16.0, 0.5, 0.0, 0.0])
+    frames = [
+        marked("front", tuple(to_ego_frame(mark, history[row].astype(np.float64))[:3])) for row in (5, 10, 15)
+    ]
+    views = expected_views(frames, "front", history)
+    np.testing.assert_array_equal(views[-1], expected_view(frames[-1], "front", history))
+    spots = np.array([spot(view) for view in views])
+    assert np.abs(spots - spots[-1]).max() < 2
+    moving = expected_views([frames[-1]] * 3, "front", history)
+    assert abs(spot(moving[0])[1] - spot(moving[-1])[1]) > 4
 
 
 @pytest.mark.parametrize(

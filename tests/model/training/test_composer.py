@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,17 @@ from typer.testing import CliRunner
 
 from looktwice.model.driving.scene import LabelledScene, NextFrame
 from looktwice.model.driving.scene_store import write_scenes
-from looktwice.model.families.picture_codes import LEVELS
+from looktwice.model.engines.engine import Draw, PlanRequest
+from looktwice.model.engines.torch.offline import draws_of
+from looktwice.model.engines.torch.runner import Runner
+from looktwice.model.families.picture_codes import LEVELS, codes_of
+from looktwice.model.network.card import LOG_FILE
+from looktwice.model.network.checkpoint import load, save
+from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes, frame_of, load_visual_codes
+from looktwice.model.training import written_pictures
 from looktwice.model.training.composer import (
+    WRITTEN_FILE,
     ComposerLearner,
     PairDataset,
     collate_pairs,
@@ -25,6 +34,7 @@ from looktwice.model.training.composer import (
 from looktwice.model.training.recipes import COMPOSER
 from looktwice.model.training.visual_codes import SHEET_FILE
 from looktwice.service.cli.commands import app
+from tests.checkpoints import write_untrained
 from tests.model.training.test_visual_codes import filmed_scene, road
 
 SHORT = replace(COMPOSER, steps=40, batch_size=4, warmup_steps=5, learning_rate=3e-3)
@@ -86,25 +96,78 @@ def test_a_composer_learns_on(scenes: Path, codes: Path, tmp_path: Path) -> None
     assert stages_of(second) == [(2, 10), (2, 10)]
 
 
+@pytest.fixture(scope="module")
+def imagining(codes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An untrained checkpoint that imagines, with the codes."""
+    folder = tmp_path_factory.mktemp("imagining") / "checkpoint"
+    settings = VlaSettings(name="world", formats=("vla_world",), reflection="phrases")
+    loaded = load(write_untrained(folder, narrow=True, settings=settings))
+    parts = loaded.model, loaded.vocabulary, loaded.codec
+    save(folder, *parts, details={"stages": [{"name": "sft"}]}, visual_codes=load_visual_codes(codes))
+    return folder
+
+
+def test_a_checkpoint_gets_a_composer_that_knows_what_it_writes(
+    scenes: Path, imagining: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def counted(runner: Runner, requests: Sequence[PlanRequest]) -> dict[str, list[Draw]]:
+        asked.extend(request.request_id for request in requests)
+        return draws_of(runner, requests)
+
+    monkeypatch.setattr(written_pictures, "draws_of", counted)
+    short = replace(SHORT, steps=4)
+    (tmp_path / LOG_FILE).write_text('{"stage": "1 sft", "step": 9}\n')
+    figures = train_composer(short, scenes, imagining, tmp_path, written_pairs=3, measured_pairs=2)
+    assert len(set(asked)) == len(asked) == 5
+    learned, before = load(tmp_path), load(imagining)
+    assert learned.card.revision != before.card.revision
+    assert [stage["name"] for stage in learned.card.details["stages"]] == ["sft", "composer"]
+    assert learned.card.details["stages"][1]["written_pairs"] == 3
+    assert learned.visual_codes is not None
+    assert learned.visual_codes.composer is not None
+    assert figures["written_psnr_db"] > 0
+    stages = [json.loads(line)["stage"] for line in (tmp_path / LOG_FILE).read_text().splitlines()]
+    assert (stages[0], set(stages[1:])) == ("1 sft", {"2 composer"})
+    # What was written once is read again, but for a line that a kill cut off.
+    file = tmp_path / WRITTEN_FILE
+    whole = file.read_text()
+    file.write_text(whole[:-20])
+    asked.clear()
+    train_composer(short, scenes, imagining, tmp_path, written_pairs=3, measured_pairs=2)
+    assert len(asked) == 1
+    assert file.read_text() == whole
+    with pytest.raises(ValueError, match="another checkpoint wrote"):
+        train_composer(short, scenes, tmp_path, tmp_path, written_pairs=3, measured_pairs=2)
+
+
 def test_pairs_are_of_cameras_that_show_both_moments() -> None:
     [pair] = pairs_of([foreseen_scene(3)])
     scene = foreseen_scene(3).scene
-    assert (pair.camera, pair.seen) == (scene.clips[0].camera, scene.clips[0].images[-1])
+    assert (pair.scene_id, pair.camera) == (scene.scene_id, scene.clips[0].camera)
+    assert pair.seen == scene.clips[0].images[-2:]
     moved, came = pair.frames()
     np.testing.assert_array_equal(came, frame_of(road(7003)))
-    assert (moved != frame_of(pair.seen)).any()
+    for one, seen in zip(moved, pair.seen, strict=True):
+        assert (one != frame_of(seen)).any()
 
 
-def test_pairs_are_mirrored_together() -> None:
-    pairs = pairs_of([foreseen_scene(0)])
-    moved, came = pairs[0].frames()
-    dataset = PairDataset(pairs)
-    seen = [dataset[0] for _ in range(40)]
-    plain = [(one == moved).all() and (other == came).all() for one, other in seen]
-    mirrored = [(one == moved[:, ::-1]).all() and (other == came[:, ::-1]).all() for one, other in seen]
-    assert any(plain)
-    assert any(mirrored)
-    assert all(one or other for one, other in zip(plain, mirrored, strict=True))
+def test_pairs_are_mirrored_together_and_nobody_wrote_mirrored_ones() -> None:
+    [pair] = pairs_of([foreseen_scene(0)])
+    moved, came = pair.frames()
+    codes = tuple(range(500, 598))
+    kinds = set()
+    for dataset in (PairDataset([pair]), PairDataset([replace(pair, written=codes)])):
+        for one, other, levels in (dataset[0] for _ in range(40)):
+            plain = (one == moved).all() and (other == came).all()
+            assert plain or ((one == moved[:, :, ::-1]).all() and (other == came[:, ::-1]).all())
+            written = (levels >= 0).all()
+            assert written or (levels == -1).all()
+            if written:
+                np.testing.assert_array_equal(codes_of(np.moveaxis(levels, 0, -1)).ravel(), codes)
+            kinds.add((bool(plain), bool(written)))
+    assert kinds == {(True, False), (True, True), (False, False)}
 
 
 def test_spoilt_levels_are_levels() -> None:
@@ -125,7 +188,7 @@ def test_composed_figures(codes: Path) -> None:
     figures = composed_figures(composing, pairs_of([foreseen_scene(0), foreseen_scene(1)]))
     assert figures["measured_pairs"] == 2
     assert set(figures) == {"moved_psnr_db", "painted_psnr_db", "composed_psnr_db", "measured_pairs"}
-    batch = collate_pairs([pair.frames() for pair in pairs_of([foreseen_scene(0)])])
+    batch = collate_pairs([PairDataset(pairs_of([foreseen_scene(0)]))[0]])
     losses = ComposerLearner(composing)(**batch)
     losses["loss"].backward()
     learned = {name for name, value in composing.named_parameters() if value.grad is not None}
