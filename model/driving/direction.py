@@ -169,10 +169,15 @@ def changed(before: Plan, after: Plan, change: Change) -> bool:
     if group == "longitudinal":
         both = zip(counted(before.track(group), change), counted(after.track(group), change), strict=True)
         return all(other > one - MIN_TICKS for one, other in both)
-    moves = [action.word for action in after.lane or () if action.word != KEEP_LANE]
+    move = _first_move(after)
     if change == "keep_lane":
-        return not moves
-    return change not in OTHER_LANE or moves[0] != OTHER_LANE[change]
+        return move is None
+    return change not in OTHER_LANE or move != OTHER_LANE[change]
+
+
+def _first_move(plan: Plan) -> str | None:
+    """The first lane change of a plan, if it has one."""
+    return next((action.word for action in plan.lane or () if action.word != KEEP_LANE), None)
 
 
 def counted(track: Track | None, change: Change) -> tuple[int, ...]:
@@ -182,7 +187,12 @@ def counted(track: Track | None, change: Change) -> tuple[int, ...]:
 
 
 def needed(before: Plan, change: Change) -> int:
-    """How much a plan has to do, as `done` counts, to be changed in a direction; beyond `TICKS` none can."""
+    """How much a plan has to do, as `done` counts, to be changed in a direction; beyond `TICKS` none can.
+
+    A plan that moves to the lane on one side already is not changed by moving there.
+    """
+    if change in OTHER_LANE and _first_move(before) not in (None, OTHER_LANE[change]):
+        return TICKS + 1
     return done(before, change) + MIN_TICKS
 
 

@@ -164,6 +164,14 @@ def test_who_slows_down_does_not_speed_up_first(first: str, revised: str, change
     assert track_changes(of(first), of(revised), "longitudinal") == changes
 
 
+def test_who_moves_over_already_is_not_told_to() -> None:
+    moves = Plan(lane=track_from_words(["Keep Lane"] * 30 + ["Left Lane Change"] * 34))
+    longer = Plan(lane=track_from_words(["Keep Lane"] * 10 + ["Left Lane Change"] * 54))
+    assert track_changes(moves, longer, "lane") == set()
+    other = Plan(lane=track_from_words(["Right Lane Change"] * 64))
+    assert track_changes(moves, other, "lane") == {"lane_right"}
+
+
 def test_who_stays_in_the_lane_leaves_it_nowhere() -> None:
     leaves = Plan(lane=track_from_words(["Left Lane Change"] * 40 + ["Keep Lane"] * 24))
     later = Plan(lane=track_from_words(["Keep Lane"] * 32 + ["Left Lane Change"] * 32))
