@@ -106,25 +106,30 @@ class Example(NamedTuple):
 
 
 class PairDataset(Dataset[Example]):
-    """Each pair as it is or mirrored, by chance; mirrored pictures have other codes, which nobody wrote."""
+    """Pairs to learn from; every second one, by chance, as a checkpoint writes it, where it wrote any.
+
+    The others are mirrored or not, by chance: mirrored pictures have other codes, which nobody wrote.
+    """
 
     def __init__(self, pairs: Sequence[NextPair], seed: int = 0) -> None:
         self._pairs = pairs
+        self._written = [pair for pair in pairs if pair.written is not None]
         self.random = np.random.default_rng(seed)
 
     def __len__(self) -> int:
         return len(self._pairs)
 
     def __getitem__(self, index: int) -> Example:
-        pair = self._pairs[index]
-        moved, came = pair.frames()
+        if self._written and self.random.random() < 0.5:
+            pair = self._written[self.random.integers(len(self._written))]
+            assert pair.written is not None
+            levels = levels_of(pair.written).reshape(CODE_ROWS, CODE_COLUMNS, len(LEVELS))
+            return Example(*pair.frames(), np.moveaxis(levels, -1, 0))
+        moved, came = self._pairs[index].frames()
         unwritten = np.full((len(LEVELS), CODE_ROWS, CODE_COLUMNS), -1)
         if self.random.random() < 0.5:
             return Example(moved[:, :, ::-1], came[:, ::-1], unwritten)
-        if pair.written is None:
-            return Example(moved, came, unwritten)
-        levels = levels_of(pair.written).reshape(CODE_ROWS, CODE_COLUMNS, len(LEVELS))
-        return Example(moved, came, np.moveaxis(levels, -1, 0))
+        return Example(moved, came, unwritten)
 
 
 def collate_pairs(examples: Sequence[Example]) -> dict[str, Tensor]:

@@ -34,7 +34,7 @@ def plan(
     scenes: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Scene files, or requests for /v1/plan as .json; the bundled test scenes without any. "
+            help="Scene files, or requests for /v1/plan as .json; the bundled scenes without any. "
             "A request is planned for as the service would, by its own controls, format and attempt; "
             "beside one, only --checkpoint, --out, --limit, --skip and --json are taken."
         ),

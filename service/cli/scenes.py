@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from looktwice.model.driving.scene import LabelledScene
 
 app = typer.Typer(help="Make, count and look at driving scenes.", no_args_is_help=True)
-_Scenes = Annotated[Path, typer.Argument(help="Scene file or folder; the bundled test scenes without one.")]
+_Scenes = Annotated[Path, typer.Argument(help="Scene file or folder; the bundled scenes without one.")]
 
 
 @app.command("generate")
