@@ -40,7 +40,7 @@ def test_it_is_small_and_tells_how_it_was_made(served: Served[TorchEngine]) -> N
     [card] = served.http.get("/v1/models").json()["models"]
     assert (card["name"], card["imagines"], card["paints"]) == ("world-nano", ["vla_world"], True)
     stages = [stage["name"] for stage in card["details"]["stages"]]
-    assert stages[-3:] == ["world-pretrain", "world-sft", "world-sft"]
+    assert stages[-4:] == ["world-sft", "world-sft", "composer", "composer"]
 
 
 def test_its_pictures_are_of_the_scene(planner: PlannerClient) -> None:
