@@ -163,8 +163,7 @@ class Aim:
         rest, left = self._behind(word, end - start), TICKS - end
         if _most(self.change, word, left, segments_left) < rest.ticks:
             return False
-        others = [each for each in _words(self.change) if each != word]
-        best = max(others, key=lambda each: gain(self.change, each))
+        best = max((each for each in _words(self.change) if each != word), key=partial(gain, self.change))
         if not left or gain(self.change, best) > 0:
             return True
         # The only word that does it has just been written: the next best one comes, as short as possible.
@@ -172,10 +171,8 @@ class Aim:
 
     def behind(self, word: str, start: int, end: int) -> Aim | None:
         """What is left to do behind a word from tick to tick; None where nothing can go wrong any more."""
-        rest, worst = (
-            self._behind(word, end - start),
-            min(_words(self.change), key=partial(gain, self.change)),
-        )
+        rest = self._behind(word, end - start)
+        worst = min(_words(self.change), key=partial(gain, self.change))
         surely = gain(self.change, worst) * (TICKS - end) >= rest.ticks
         return None if surely and rest._holds_until(worst, end) == TICKS else rest
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -92,27 +92,35 @@ class Row(Response):
         """
         allowed = self.cursor.allowed()
         left = self._controlled(allowed, logits, time_for)
-        controls = self.request.controls
-        expected = self.request.least_error.expected(allowed, controls)
-        if expected is not None:
-            return [(int(allowed.ids[least_error(logits, expected, left)]), self.draws)]
-        ids = allowed.ids[left]
-        numbers = uniforms(controls.seed, self.draws, len(self.tokens))
-        places = choose(logits[left], controls.temperature, controls.top_p, numbers)
         chosen: dict[int, list[int]] = {}
-        for draw, place in zip(self.draws, places, strict=True):
-            chosen.setdefault(int(ids[place]), []).append(draw)
+        tokens = self._selected(allowed, logits, self.draws, len(self.tokens), left)
+        for draw, token in zip(self.draws, tokens, strict=True):
+            chosen.setdefault(token, []).append(draw)
         return [(token, tuple(draws)) for token, draws in chosen.items()]
 
     def would_choose(self, logits: npt.NDArray[np.float64], place: int) -> int:
         """What the first draw chooses from these logits if it writes at ``place`` what it may write now."""
-        allowed, controls = self.cursor.allowed(), self.request.controls
+        [token] = self._selected(self.cursor.allowed(), logits, self.draws[:1], place)
+        return token
+
+    def _selected(
+        self,
+        allowed: Allowed,
+        logits: npt.NDArray[np.float64],
+        draws: Sequence[int],
+        place: int,
+        left: npt.NDArray[np.bool_] | None = None,
+    ) -> list[int]:
+        """What each of some draws chooses at a place of the response, among the allowed ids that are left."""
+        controls = self.request.controls
         expected = self.request.least_error.expected(allowed, controls)
         if expected is not None:
-            return int(allowed.ids[least_error(logits, expected)])
-        numbers = uniforms(controls.seed, self.draws[:1], place)
-        [chosen] = choose(logits, controls.temperature, controls.top_p, numbers)
-        return int(allowed.ids[chosen])
+            return [int(allowed.ids[least_error(logits, expected, left)])] * len(draws)
+        if left is None:
+            left = np.ones(len(allowed.ids), np.bool_)
+        numbers = uniforms(controls.seed, draws, place)
+        places = choose(logits[left], controls.temperature, controls.top_p, numbers)
+        return [int(token) for token in allowed.ids[left][places]]
 
     def write(self, token: int | None, vocabulary: Vocabulary, logprob: float | None = None) -> list[Event]:
         """Append a token that was chosen, if any, and the forced run behind it; returns what they finish."""
