@@ -485,7 +485,7 @@ def test_there_is_no_link_where_another_scene_is_shown(
     inspector.get_by_label("Scene", exact=True).select_option("second/scene")
     expect(inspector.get_by_role("status")).to_contain_text("second/scene")
     expect(inspector.locator("#link")).to_be_hidden()
-    assert inspector.url == f"{served.url}/"
+    expect(inspector).to_have_url(f"{served.url}/")
     plan(inspector)
     expect(inspector.locator("#link")).to_be_visible()
     write_scenes(tmp_path / "mine.parquet", [labelled("mine")])
@@ -494,7 +494,7 @@ def test_there_is_no_link_where_another_scene_is_shown(
     plan(inspector)
     expect(inspector.locator("#draws tbody tr")).to_have_count(6)
     expect(inspector.locator("#link")).to_be_hidden()
-    assert inspector.url == f"{served.url}/"
+    expect(inspector).to_have_url(f"{served.url}/")
 
 
 def test_a_link_is_followed_on_the_page_that_is_open(inspector: Page, engine: ScriptedEngine) -> None:

@@ -30,6 +30,7 @@ class StandIn:
         failing: every request fails.
         seen: parsed bodies of planning requests.
         waiting: requests under way now.
+        began_s: on time.monotonic(); periods of stalls count from here.
     """
 
     service_s: float = 0.001
@@ -40,10 +41,10 @@ class StandIn:
     failing: bool = False
     seen: list[dict[str, Any]] = field(default_factory=list)
     waiting: int = 0
+    began_s: float = field(default_factory=time.monotonic)
 
     def __post_init__(self) -> None:
         self._turns = asyncio.Semaphore(self.at_once)
-        self._began = time.monotonic()
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] != "http":
@@ -96,7 +97,7 @@ class StandIn:
     def _stalled_for_s(self) -> float:
         if not self.stall_s:
             return 0.0
-        into = (time.monotonic() - self._began) % self.stall_every_s
+        into = (time.monotonic() - self.began_s) % self.stall_every_s
         return self.stall_every_s - into if into > self.stall_every_s - self.stall_s else 0.0
 
 
