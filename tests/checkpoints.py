@@ -11,7 +11,8 @@ import torch
 
 from looktwice.model.driving.images import encode_jpeg
 from looktwice.model.driving.scene import CLIP_FRAMES, FRONT_TELE, FRONT_WIDE, Clip, Scene, Track
-from looktwice.model.network.checkpoint import load, save, write_code_embeddings
+from looktwice.model.families.picture_codes import PICTURE
+from looktwice.model.network.checkpoint import Loaded, load, save, write_code_embeddings
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.corpus import nano_corpus, nano_phrases
 from looktwice.model.network.numbers import needed_numbers, write_number_embeddings
@@ -67,6 +68,18 @@ def shake(model: LookTwiceVla) -> None:
         torch.manual_seed(1)
         for weight in model.parameters():
             weight.add_(torch.randn_like(weight) * weight.std(unbiased=False), alpha=0.1)
+
+
+def copy_picture_codes(loaded: Loaded) -> None:
+    """Change a network so that it mostly writes the code of a picture once more that it has just read."""
+    network: Any = loaded.model
+    ids = loaded.vocabulary.alphabets[PICTURE][0]
+    with torch.no_grad():
+        embeddings = network.get_input_embeddings().weight
+        random = torch.randn(
+            (len(ids), embeddings.shape[1]), dtype=embeddings.dtype, generator=torch.manual_seed(0)
+        )
+        embeddings[ids.start : ids.stop] = 0.12 * random
 
 
 def write_shaken(folder: Path, source: Path) -> Path:

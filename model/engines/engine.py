@@ -62,7 +62,8 @@ class Controls:
             a batch.
         deadline_ms: milliseconds from submission by which the answer must be there; None for no deadline.
             Thinking that would not fit is not begun, or cut; while it lasts, a direct trajectory is made
-            ready beside it and is the answer if the reflection does not end in time.
+            ready beside it and is the answer if the reflection does not end in time. A picture that the
+            model might choose to imagine is not begun.
         numbers: how numbers in the text are chosen, such as the times of a plan: ``least_error`` takes the
             one that is expected to be off the least (`looktwice.model.engines.least_error`), ``drawn`` draws
             them as words are.
@@ -183,7 +184,8 @@ class Draw:
         tokens: tokens per section, forced ones included.
         passes: how often the network was run for it, its prompt apart.
         chosen: tokens at which the format left more than one; all others are forced.
-        cut: what the deadline did to its second look; None where it did nothing.
+        cut: what the deadline did to its second look; ``skipped`` also where there was no time for a picture.
+            None where it did nothing.
         times_s: of the poses of the trajectory, its family's.
         ids: of its tokens.
         reasons: the statements that its reflection could make; None where it could make any.

@@ -99,10 +99,12 @@ def decided(request: PlanRequest, family: Family) -> dict[str, str]:
 
 
 def said(request: PlanRequest, family: Family, expected: PictureCodes) -> Said:
-    """What sections say that is decided beforehand; for families that imagine."""
-    if family.imagination is None or request.controls.imagine == "never":
-        return {}
-    return family.imagination.said(expected, request.controls.motion)
+    """What sections say that is decided beforehand."""
+    controls = request.controls
+    thoughts = family.unthought if controls.thinking == "never" else {}
+    if family.imagination is None or controls.imagine == "never":
+        return thoughts
+    return {**family.imagination.said(expected, controls.motion), **thoughts}
 
 
 def given_plans(request: PlanRequest, family: Family) -> dict[str, Plan]:

@@ -33,7 +33,7 @@ class Response:
         logprobs: of the tokens; None where they are forced, or nobody asks.
         think_probability: at the branch, once that is decided.
         chosen: how many tokens were chosen where the format left more than one.
-        cut: what a deadline did to the second look.
+        cut: what a deadline did to the second look, or to the picture.
         streamed: how many characters of the free text being written `new_text` has returned.
     """
 

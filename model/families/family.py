@@ -31,7 +31,7 @@ from looktwice.model.formats.pieces import (
     walk,
     with_picks,
 )
-from looktwice.model.formats.said import Decided, Said
+from looktwice.model.formats.said import Decided, Said, with_said
 
 
 class FamilyError(ValueError):
@@ -275,6 +275,8 @@ class Family:
         dialects: other formats of the same name, for checkpoints whose reflections are written otherwise.
         refines: whether its prompts hold an `Attempt`, which every request then has to bring.
         imagination: where it may imagine a picture.
+        unthought: what responses say whose thoughts the caller does not want, where the format has thoughts
+            without a branch.
         actions: what its responses say that they do, where tables can count it.
         rewards: what a response is worth beside the expert's trajectory [64, 4] at 10 Hz, part by part from 0
             to 1; None where drivers' scores alone tell.
@@ -302,6 +304,7 @@ class Family:
     dialects: Mapping[ReflectionLanguage, Format] = field(default_factory=dict)
     refines: bool = False
     imagination: Imagination | None = None
+    unthought: Said = field(default_factory=dict)
     actions: Actions | None = None
     rewards: Callable[[FloatArray, Reading], Mapping[str, float]] | None = None
 
@@ -330,6 +333,10 @@ class Family:
                     _check_one_value(self.name, section)
         if imagination is not None:
             self._check_imagination(imagination)
+        try:
+            with_said(self.format.body, self.unthought)
+        except FormatError as error:
+            raise FamilyError(f"family {self.name!r}: unthought: {error}") from None
 
     def _check_imagination(self, imagination: Imagination) -> None:
         try:

@@ -24,6 +24,7 @@ from looktwice.model.driving.scene import Clip, LabelledScene, NextFrame, mirror
 from looktwice.model.driving.short_term import INERTIA
 from looktwice.model.engines.engine import Controls, Decision, Draw, PlanRequest, RequestError
 from looktwice.model.engines.requests import begin, painted
+from looktwice.model.engines.torch.deadlines import LatencyModel
 from looktwice.model.engines.torch.decoder import Decoder
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.engines.torch.runner import Runner
@@ -46,7 +47,7 @@ from looktwice.model.training.examples import Examples
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.sampler import Item
 from looktwice.service.operations.settings import Settings
-from tests.checkpoints import noisy_scene, write_untrained
+from tests.checkpoints import copy_picture_codes, noisy_scene, write_untrained
 from tests.model.driving.drives import MIDDLES_S, agent, drive, labelled_scene
 from tests.model.driving.roads import mirrored_scene
 from tests.model.engines.decoding import decode
@@ -147,13 +148,7 @@ def test_callers_decide_whether_it_imagines_and_which_camera(
 def copying(checkpoint: Path) -> Loaded:
     """Mostly writes the code once more that it has just read."""
     found = exactly(load(checkpoint, torch.float64))
-    network: Any = found.model
-    with torch.no_grad():
-        embeddings = network.get_input_embeddings().weight
-        ids = found.vocabulary.alphabets["visual"][0]
-        embeddings[ids.start : ids.stop] = 0.12 * torch.randn(
-            (len(ids), embeddings.shape[1]), dtype=embeddings.dtype, generator=torch.manual_seed(0)
-        )
+    copy_picture_codes(found)
     return found
 
 
@@ -198,6 +193,43 @@ def test_guesses_of_a_picture_save_passes_and_change_nothing(
     right, saved = compared(copying, expected)
     assert 30 < right < 70 or codes == "least_error"
     assert saved > (right / 2 if n == 1 else 0)
+
+
+def test_no_picture_is_begun_that_would_miss_the_deadline(world: Loaded) -> None:
+    def drawn(deadline_ms: int, latency: LatencyModel, **controls: Any) -> list[Draw]:
+        controls = {"n": 6, "numbers": "drawn", "seed": 3, **controls}
+        asked = PlanRequest(
+            "a", noisy_scene(1, route=True), "vla_world", Controls(deadline_ms=deadline_ms, **controls)
+        )
+        with torch.inference_mode():
+            decoder = Decoder(Runner(world, 12), clock=lambda: 0.0, latency=latency)
+            draws = decode(decoder, asked)
+        return [draws["a", index] for index in range(6)]
+
+    def pictures(draws: list[Draw]) -> list[bool]:
+        return [draw.foreseen is not None and draw.foreseen.picture is not None for draw in draws]
+
+    latency = LatencyModel()
+    calm, hurried = (drawn(deadline_ms, latency) for deadline_ms in (100_000, 0))
+    assert set(pictures(calm)) == {True, False}
+    assert not any(pictures(hurried))
+    assert {draw.cut for draw in calm} == {None}
+    assert {draw.cut for draw in hurried} == {"skipped"}
+    for before, after in zip(calm, hurried, strict=True):
+        if before.foreseen is not None and before.foreseen.picture is None:
+            assert after.text == before.text, "who imagines nothing anyway writes what it would have written"
+    assert all(pictures(drawn(0, latency, imagine="always"))), "who asks for one gets it, late"
+    assert latency.picture_passes > 60.0, "the passes of pictures are learned"
+
+
+def test_who_never_thinks_thinks_of_nobody(world: Loaded) -> None:
+    draws, thinking = (
+        planned(world, n=6, numbers="drawn", seed=3, thinking=each) for each in ("never", "adaptive")
+    )
+    assert {draw.thinking for draw in draws} == {None} != {draw.thinking for draw in thinking}
+    for draw, other in zip(draws, thinking, strict=True):
+        assert "<think></think>" in draw.text
+        assert draw.text.partition("<think>")[0] == other.text.partition("<think>")[0]
 
 
 def test_a_motion_that_is_given_is_predicted_and_seen(world: Loaded, painting: Loaded) -> None:

@@ -1,4 +1,4 @@
-"""Deadlines: how long steps take, what a text may still do, which draws get a draft. No torch.
+"""Deadlines: how long steps take, what there is still time for, which draws get a draft. No torch.
 
 A draft is the direct trajectory of a draw that reflects. It is decoded beside the reflection and is the
 answer if the reflection does not end before the deadline.
@@ -20,6 +20,8 @@ _FIRST_STEP_S: Final = 0.02
 _FIRST_ENDING_PASSES: Final = 10.0
 """Before any was seen. Rather too few: a look that is not taken tells nothing of its length, and one that
 does not end in time has a draft beside it."""
+_FIRST_PICTURE_PASSES: Final = 60.0
+"""Likewise, but rather too many: nothing stands in for a response whose picture comes too late."""
 _CALM: Final = 1.5
 """With less than so many times the necessary time left, a text ends at the next sentence."""
 _LATE_DEVIATIONS: Final = 4.0
@@ -30,7 +32,7 @@ Choices = Sequence[tuple[int, tuple[int, ...]]]
 
 
 class TimeFor(Enum):
-    """What there is time for within a text."""
+    """What there is time for within a text. Where a picture may begin, all but the last mean that it may."""
 
     GO_ON = "go on"
     END_SENTENCE = "end with this sentence"
@@ -45,11 +47,12 @@ class LatencyModel:
         deviation_s: mean absolute deviation of a step from it.
         ending_passes: passes from where a second look can no longer be cut to the response's end: from the
             end of its text, or from the branch where there is no text that could be ended.
+        picture_passes: passes from where a response begins a picture to its end.
     """
 
     def __init__(self) -> None:
         self.step_s, self.deviation_s = _FIRST_STEP_S, 0.0
-        self.ending_passes = _FIRST_ENDING_PASSES
+        self.ending_passes, self.picture_passes = _FIRST_ENDING_PASSES, _FIRST_PICTURE_PASSES
 
     def saw_step(self, seconds: float) -> None:
         """A step took so long."""
@@ -60,10 +63,14 @@ class LatencyModel:
         """A second look that could no longer be cut took so many passes."""
         self.ending_passes += _WEIGHT * (passes - self.ending_passes)
 
-    def time_for(self, deadline_s: float, now_s: float) -> TimeFor:
-        """What a text may do so that the rest of the response fits before the deadline."""
+    def saw_picture(self, passes: int) -> None:
+        """A response took so many passes from where its picture began."""
+        self.picture_passes += _WEIGHT * (passes - self.picture_passes)
+
+    def time_for(self, deadline_s: float, now_s: float, *, picture: bool = False) -> TimeFor:
+        """What a text may do, or whether a ``picture`` may begin, so that the rest fits in time."""
         left_s = deadline_s - now_s
-        needed_s = self.step_s * self.ending_passes
+        needed_s = self.step_s * (self.picture_passes if picture else self.ending_passes)
         if left_s > _CALM * needed_s:
             return TimeFor.GO_ON
         return TimeFor.END_SENTENCE if left_s > needed_s else TimeFor.END_NOW

@@ -364,7 +364,7 @@ class Decoder:
 
         The row goes on with those that choose ``guess``, if any do.
         """
-        time_for = self._latency.time_for(row.request.deadline_s, self._clock())
+        time_for = self._latency.time_for(row.request.deadline_s, self._clock(), picture=row.may_imagine)
         chosen = sorted(row.choices(logits, time_for), key=lambda choice: choice[0] != guess)
         self._drafter.observe(row, len(logits), chosen)
         branch = row.request.family.branch if row.request.makes_drafts else None
@@ -396,6 +396,8 @@ class Decoder:
         )
         if row.passes_before_ending:
             self._latency.saw_ending(row.passes - row.passes_before_ending)
+        if row.passes_before_picture:
+            self._latency.saw_picture(row.passes - row.passes_before_picture)
         if row.draft:
             request.drafts |= {draw.index: draw for draw in draws}
             request.remove(row, self._memory)

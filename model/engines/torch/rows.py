@@ -36,6 +36,7 @@ class Row(Response):
         passes: how many it took part in.
         passes_before_ending: how many up to where a second look can no longer be cut: the branch, or the end
             of the text behind it. 0 without one.
+        passes_before_picture: how many up to where it chose to imagine a picture; 0 where it did not.
         foreseen: what it would have written at later places, had the guesses before these been right.
     """
 
@@ -47,6 +48,7 @@ class Row(Response):
     draft: bool = False
     passes: int = 0
     passes_before_ending: int = 0
+    passes_before_picture: int = 0
     foreseen: Mapping[int, int] = field(default_factory=dict)
 
     @property
@@ -59,6 +61,12 @@ class Row(Response):
         """Tells the format and the pictures of its prompt from others; only while its prompt is there."""
         assert self.tree.prompt is not None
         return self.tree.prompt.shown
+
+    @property
+    def may_imagine(self) -> bool:
+        """Whether it stands where it decides about a picture."""
+        imagination = self.request.family.imagination
+        return imagination is not None and self.cursor.allowed().choice == imagination.name
 
     def start(self, last_token: int) -> None:
         """Begin, or go on after a preemption, behind a prompt: all that was written is to be fed again."""
@@ -127,6 +135,8 @@ class Row(Response):
         written, finished = len(self.tokens), list[SectionText]()
         was_text = self.cursor.stop_id is not None
         reflects = token is not None and self._reflects(token)
+        if token is not None and self.may_imagine and self._imagines(token):
+            self.passes_before_picture = self.passes
         if token is not None:
             finished += self.append(token, vocabulary, logprob)
         if reflects or (was_text and self.cursor.stop_id is None):
@@ -144,6 +154,11 @@ class Row(Response):
         controls = self.request.controls
         everything = np.ones(len(allowed.ids), np.bool_)
         family = self.request.family
+        if self.may_imagine and time_for is TimeFor.END_NOW:
+            imagines = np.array([self._imagines(int(token)) for token in allowed.ids])
+            if not imagines.all():
+                self.cut = "skipped"
+                return ~imagines
         if family.branch is None or allowed.choice != family.branch.name:
             if self.cursor.stop_id in allowed.ids and self._ends(time_for):
                 self.cut = "shortened"
@@ -171,6 +186,11 @@ class Row(Response):
         if branch is None or self.cursor.allowed().choice != branch.name:
             return False
         return leads_to_reflection(branch, self.cursor, token)
+
+    def _imagines(self, token: int) -> bool:
+        """Where it decides about a picture: whether a token begins one."""
+        imagination = self.request.family.imagination
+        return imagination is not None and imagination.imagined in self.cursor.option_texts(token)
 
     def _ends(self, time_for: TimeFor) -> bool:
         """Whether a text stops here."""

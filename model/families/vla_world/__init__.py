@@ -51,6 +51,7 @@ VLA_WORLD: Final = Family(
         predicting=predicting,
         expecting=expecting,
     ),
+    unthought={its.THINK: ((),)},
     actions=ACTIONS,
     rewards=rewards,
 )

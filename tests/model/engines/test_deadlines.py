@@ -237,3 +237,19 @@ def test_steps_that_vary_are_left_more_room() -> None:
     assert steady.last_step(10.0, 9.96)
     assert varying.last_step(10.0, 9.9)
     assert not varying.last_step(10.0, 9.8)
+
+
+def test_a_picture_needs_the_time_that_pictures_took() -> None:
+    latency = LatencyModel()
+    latency.step_s = 0.01
+
+    def may_begin(left_s: float) -> bool:
+        return latency.time_for(left_s, 0.0, picture=True) is not TimeFor.END_NOW
+
+    assert may_begin(1.0)
+    assert not may_begin(0.5)
+    for _ in range(100):
+        latency.saw_picture(20)
+    assert may_begin(0.25)
+    assert not may_begin(0.15)
+    assert latency.time_for(0.15, 0.0) is not TimeFor.END_NOW, "second looks have passes of their own"

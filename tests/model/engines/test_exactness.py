@@ -39,9 +39,10 @@ from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.families.family import Attempt, Family
 from looktwice.model.families.registry import OURS, families_of, family_named
 from looktwice.model.formats.pieces import Format
-from looktwice.model.network.checkpoint import Loaded, load
+from looktwice.model.network.checkpoint import Loaded, load, with_visual_codes
 from looktwice.model.network.settings import NANO_SETTINGS, VlaSettings
-from tests.checkpoints import made_up_tracks, noisy_scene, write_untrained
+from looktwice.model.network.visual_codes import VisualCodes
+from tests.checkpoints import copy_picture_codes, made_up_tracks, noisy_scene, write_untrained
 from tests.model.engines.decoding import Again
 from tests.model.engines.reference import Shares, exactly, reference
 from tests.model.formats.strategies import branching_formats
@@ -121,7 +122,9 @@ def arrivals(draw: st.DrawFn) -> list[Arrival]:
             deadline_ms=draw(st.sampled_from([None, None, 2_000, 3_000])),
         )
         if family.imagination is not None and draw(st.booleans()):
-            controls = replace(controls, imagine="always", camera=draw(st.sampled_from(CAMERAS)))
+            # Where the scene shows the camera, its picture half a second later is guessed.
+            camera = draw(st.sampled_from([*(clip.camera for clip in scene.clips), *CAMERAS]))
+            controls = replace(controls, imagine="always", camera=camera)
         attempt = None
         if family.refines:
             draft = np.zeros((len(family.times_s), 4), np.float32)
@@ -175,7 +178,12 @@ def exact(
     folder = CHECKPOINT or write_untrained(
         tmp_path_factory.mktemp("narrow") / "untrained", narrow=True, settings=settings
     )
-    return exactly(load(Path(folder), dtype=torch.float64))
+    loaded = exactly(load(Path(folder), dtype=torch.float64))
+    if CHECKPOINT:
+        return loaded
+    torch.manual_seed(0)
+    copy_picture_codes(loaded)
+    return with_visual_codes(loaded, VisualCodes(24).eval())
 
 
 @pytest.fixture(scope="module", autouse=True)
