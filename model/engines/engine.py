@@ -77,6 +77,7 @@ class Controls:
         camera: whose picture is imagined, if one is; the prompt asks for it. None leaves it to the model.
         motion: where the ego will be when that picture is taken: forced, and asked for with the camera. None
             leaves it to the model.
+        picture: the 98 codes of that picture, given by the caller instead of written by the model.
     """
 
     thinking: Thinking = "adaptive"
@@ -95,6 +96,7 @@ class Controls:
     imagine: Imagine = "auto"
     camera: str | None = None
     motion: Motion | None = None
+    picture: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.thinking not in ("adaptive", "always", "never"):
@@ -111,8 +113,9 @@ class Controls:
                 raise RequestError(f"unknown camera {self.camera!r}; known are {', '.join(CAMERAS)}")
             if self.imagine == "never":
                 raise RequestError("camera has no meaning with imagine: never")
-        if self.motion is not None and self.camera is None:
-            raise RequestError("motion has no meaning without the camera whose picture is imagined")
+        for name, given in (("motion", self.motion), ("picture", self.picture)):
+            if given is not None and self.camera is None:
+                raise RequestError(f"{name} has no meaning without the camera whose picture is imagined")
         if not isinstance(self.n, int) or not 1 <= self.n <= MAX_DRAWS:
             raise RequestError(f"n must be a whole number in 1..{MAX_DRAWS}, got {self.n}")
         if not 0.0 <= self.temperature <= 2.0:

@@ -104,7 +104,7 @@ def said(request: PlanRequest, family: Family, expected: PictureCodes) -> Said:
     thoughts = family.unthought if controls.thinking == "never" else {}
     if family.imagination is None or controls.imagine == "never":
         return thoughts
-    return {**family.imagination.said(expected, controls.motion), **thoughts}
+    return {**family.imagination.said(expected, controls.motion, controls.picture), **thoughts}
 
 
 def given_plans(request: PlanRequest, family: Family) -> dict[str, Plan]:

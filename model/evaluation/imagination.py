@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Final
 
 import numpy as np
@@ -31,7 +31,7 @@ from looktwice.model.evaluation.open_loop import BASELINES, SceneResult
 from looktwice.model.evaluation.protocols import Protocol
 from looktwice.model.evaluation.report import evaluate_variants
 from looktwice.model.evaluation.table import comparison_cells
-from looktwice.model.evaluation.variants import Variant, next_camera, request_for
+from looktwice.model.evaluation.variants import Variant, donors, next_camera, request_for
 from looktwice.model.evaluation.waypoints import (
     PROTOCOLS,
     WAYPOINT_MEASURES,
@@ -52,6 +52,10 @@ NEVER: Final = "never"
 ALWAYS: Final = "always"
 ASKED: Final = "always, camera asked for"
 SHUFFLED: Final = f"{ASKED}, shuffled images"
+UNTHINKING: Final = f"{ASKED}, thinks of nobody"
+GIVEN_CAME: Final = f"{ASKED}, given what came"
+GIVEN_UNCHANGED: Final = f"{ASKED}, given the last frame, moved"
+GIVEN_OTHER: Final = f"{ASKED}, given another scene's"
 COPIED: Final = "the last frame"
 WARPED: Final = "the last frame, moved as the ego"
 UNCHANGED: Final = f"{WARPED}, through its codes"
@@ -62,13 +66,35 @@ _SHOWN: Final = 8
 _PICTURE_MEASURES: Final = ("psnr_db", "feature_distance")
 
 
-def imagination_variants(card: ModelCard, controls: Controls) -> list[Variant]:
+def imagination_variants(
+    loaded: Loaded, scenes: Sequence[LabelledScene], controls: Controls
+) -> list[Variant]:
     """The rows of a checkpoint that imagines; the route is given, as it says the mission goal.
+
+    Args:
+        loaded: the checkpoint.
+        scenes: that it is evaluated on; rows that are given another scene's picture take it from them.
+        controls: of all rows, but for what they differ in.
 
     Raises:
         ValueError: see `imagining`.
     """
-    family = imagining(card)
+    family = imagining(loaded.card)
+    codes = loaded.visual_codes
+    assert codes is not None, "a checkpoint that paints has them"
+
+    @cache  # and not at once: `check_variants` tells first what scenes lack
+    def others() -> dict[str, LabelledScene]:
+        places = donors([labelled.episode_id for labelled in scenes], seed=0)
+        return {each.scene.scene_id: scenes[place] for each, place in zip(scenes, places, strict=True)}
+
+    def given(see: Painter, labelled: LabelledScene) -> tuple[int, ...]:
+        return tuple(codes.encode(see(labelled, next_camera(labelled))).tolist())
+
+    def elsewhere(labelled: LabelledScene, camera: str) -> Frame:
+        other = others()[labelled.scene.scene_id]
+        return what_came(other, next_camera(other))
+
     plain = replace(controls, thinking="adaptive", think_threshold=None, imagine="auto", camera=None)
     always = replace(plain, imagine="always")
     asked = Variant(ASKED, family.name, always, route=True, next_camera=True)
@@ -78,6 +104,11 @@ def imagination_variants(card: ModelCard, controls: Controls) -> list[Variant]:
         Variant(ALWAYS, family.name, always, route=True),
         asked,
         replace(asked, name=SHUFFLED, shuffled_images=True),
+        replace(asked, name=UNTHINKING, controls=replace(always, thinking="never")),
+        *(
+            replace(asked, name=name, picture=partial(given, see))
+            for name, see in ((GIVEN_CAME, what_came), (GIVEN_UNCHANGED, warped), (GIVEN_OTHER, elsewhere))
+        ),
     ]
 
 
@@ -197,7 +228,7 @@ async def evaluate_imagination(
     def keep(variant: Variant, labelled: LabelledScene, of: Sequence[Draw]) -> None:
         scene_id = labelled.scene.scene_id
         draws[variant.name][scene_id] = of
-        if variant.next_camera:
+        if variant.name in (ASKED, SHUFFLED):
             request = request_for(labelled, variant)
             foreseen.setdefault(variant.name, {})[scene_id] = engine.paint(request, imagined_codes(of[0]))
 
@@ -294,7 +325,8 @@ def _comparisons(
     pictures: Mapping[str, Pictures],
 ) -> Iterator[Comparison]:
     """What should differ. The difference of passes is what a picture takes."""
-    for one, other in ((ALWAYS, NEVER), (AUTO, NEVER), (SHUFFLED, ASKED)):
+    told = (UNTHINKING, GIVEN_CAME, GIVEN_UNCHANGED, GIVEN_OTHER)
+    for one, other in ((ALWAYS, NEVER), (AUTO, NEVER), (SHUFFLED, ASKED), *((each, ASKED) for each in told)):
         for protocol, of in waypoints.items():
             for measure in ("l2_m", "collision_rate"):
                 yield compare(f"{one} : {other} ({protocol})", of[one], of[other], measure)

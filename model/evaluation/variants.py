@@ -46,6 +46,7 @@ class Variant:
         speed: the history is driven at so many times its speed.
         next_camera: a camera is asked for whose picture half a second later the scene brings, another one
             from scene to scene.
+        picture: tells the 98 codes that are given for that camera's picture; None where the model writes it.
         shuffled_images: scenes get the clips of scenes from other episodes: a planner that looks gets worse.
     """
 
@@ -59,6 +60,7 @@ class Variant:
     greedy: bool = False
     speed: float = 1.0
     next_camera: bool = False
+    picture: Callable[[LabelledScene], tuple[int, ...]] | None = None
 
 
 def standard_variants(
@@ -204,6 +206,7 @@ def request_for(labelled: LabelledScene, variant: Variant) -> PlanRequest:
             seed=seed,
             prefill=expert_plan(labelled) if variant.expert_plan else variant.controls.prefill,
             camera=next_camera(labelled) if variant.next_camera else variant.controls.camera,
+            picture=None if variant.picture is None else variant.picture(labelled),
         ),
     )
 
@@ -255,11 +258,11 @@ def with_shuffled_images(scenes: Iterable[LabelledScene], seed: int = 0) -> Iter
     for labelled in scenes:
         clips.append(labelled.scene.clips)
         episodes.append(labelled.episode_id)
-    for labelled, donor in zip(scenes, _donors(episodes, seed), strict=True):
+    for labelled, donor in zip(scenes, donors(episodes, seed), strict=True):
         yield replace(labelled, scene=replace(labelled.scene, clips=clips[donor]))
 
 
-def _donors(episodes: Sequence[str], seed: int) -> list[int]:
+def donors(episodes: Sequence[str], seed: int) -> list[int]:
     """A permutation that maps every place to a place of another episode.
 
     Episodes in random order, laid end to end and moved on by the longest one's length: nobody can stay within
@@ -269,10 +272,10 @@ def _donors(episodes: Sequence[str], seed: int) -> list[int]:
     rank = {episode: position for position, episode in enumerate(random.permutation(sorted(set(episodes))))}
     order = sorted(random.permutation(len(episodes)).tolist(), key=lambda index: rank[episodes[index]])
     longest = _longest(episodes)
-    donors = [0] * len(order)
+    found = [0] * len(order)
     for position, index in enumerate(order):
-        donors[index] = order[(position + longest) % len(order)]
-    return donors
+        found[index] = order[(position + longest) % len(order)]
+    return found
 
 
 def _longest(episodes: Sequence[str]) -> int:

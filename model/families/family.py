@@ -68,7 +68,8 @@ class Imagination:
             may be written later: a perception alone does not tell.
         predicting: the first values of the prediction, which say where the ego will be, of metres ahead and
             to the left.
-        expecting: the first values of the picture, which say what is expected of it, of 98 codes or None.
+        expecting: the first values of the picture, of the 98 codes that are expected and the 98 that are
+            given; either may be None.
     """
 
     name: str
@@ -83,16 +84,22 @@ class Imagination:
     predicted: Callable[[tuple[Value, ...]], Predicted]
     pictured: Callable[[tuple[Value, ...]], NextPicture]
     predicting: Callable[[float, float], tuple[Value, ...]]
-    expecting: Callable[[tuple[int, ...] | None], tuple[Decided, ...]]
+    expecting: Callable[[tuple[int, ...] | None, tuple[int, ...] | None], tuple[Decided, ...]]
 
-    def said(self, expected: tuple[int, ...] | None, motion: Motion | None = None) -> Said:
+    def said(
+        self,
+        expected: tuple[int, ...] | None,
+        motion: Motion | None = None,
+        picture: tuple[int, ...] | None = None,
+    ) -> Said:
         """What is decided beforehand.
 
         Args:
             expected: 98 codes of what the camera would see if only the ego moved; None where that is unknown.
             motion: where the ego will be; None where the model says that.
+            picture: 98 codes of the picture; None where the model writes them.
         """
-        found = {self.section: self.expecting(expected)}
+        found = {self.section: self.expecting(expected, picture)}
         return found if motion is None else found | {self.prediction: self.predicting(motion.x_m, motion.y_m)}
 
     def picks(self, imagines: bool | None, camera: str | None) -> dict[str, str]:

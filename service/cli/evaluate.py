@@ -345,8 +345,9 @@ def _imagination(
     from looktwice.model.evaluation.imagination import evaluate_imagination, imagination_variants
     from looktwice.model.network.checkpoint import load
 
-    variants = imagination_variants(engine.card, controls)
-    evaluate = partial(evaluate_imagination, loaded=load(checkpoint))
+    loaded = load(checkpoint)
+    variants = imagination_variants(loaded, scenes, controls)
+    evaluate = partial(evaluate_imagination, loaded=loaded)
     report = asyncio.run(run_started(evaluate, scenes, engine, variants, controls.n, rows, quiet=quiet))
     if plots is not None:
         with written_whole(plots / "imagined.png") as temporary:

@@ -48,9 +48,9 @@ def predicting(x_m: float, y_m: float) -> tuple[Value, ...]:
     return (its.told_points([[x_m, y_m]])[0],)
 
 
-def expecting(expected: tuple[int, ...] | None) -> tuple[Decided, ...]:
-    """The first value of a picture: what is expected of it, and all else left open."""
-    return (beside(expected, (None,) * PICTURE_CODES),)
+def expecting(expected: tuple[int, ...] | None, given: tuple[int, ...] | None) -> tuple[Decided, ...]:
+    """The first value of a picture: what is expected of it, and its codes where they are given."""
+    return (beside(expected, (None,) * PICTURE_CODES if given is None else given),)
 
 
 def pictured(values: tuple[Value, ...]) -> NextPicture:

@@ -62,7 +62,9 @@ def test_tables_with_and_without_pictures(checkpoint: Path, tmp_path: Path) -> N
     result = evaluated(checkpoint, scenes, tmp_path, "--json", *kept, "--plots", str(tmp_path / "plots"))
     assert result.exit_code == 0, result.output
     told = json.loads(result.stdout.splitlines()[-1])
-    rows = ["auto", "never", "always", ASKED, f"{ASKED}, shuffled images"]
+    more = ["shuffled images", "thinks of nobody"]
+    more += ["given what came", "given the last frame, moved", "given another scene's"]
+    rows = ["auto", "never", "always", ASKED, *(f"{ASKED}, {each}" for each in more)]
     for protocol in ("ST-P3", "UniAD"):
         named = {row["name"]: row for row in told["waypoints"][protocol]}
         assert list(named) == ["constant velocity", "constant turn rate", *rows]
@@ -84,7 +86,7 @@ def test_tables_with_and_without_pictures(checkpoint: Path, tmp_path: Path) -> N
     assert words == ["left", "forward", "right", "keep", "accelerate", "decelerate", "stop"]
     pictures = {row["name"]: row for row in told["pictures"]}
     assert set(pictures) == {
-        *rows[3:],
+        *rows[3:5],
         "the last frame",
         "the last frame, moved as the ego",
         "the last frame, moved as the ego, through its codes",
