@@ -90,7 +90,8 @@ class PlannedDraw:
         draft_trajectory: where the first plan would have led; None without a second look or a deadline.
         times_s: of the poses, in s from now; 64 at 10 Hz, the first at 0.1 s, unless the format has its own.
         tokens: tokens per section.
-        cut: what the deadline did to the second look: skipped (or a picture was), shortened, replaced; else None.
+        cut: what the deadline did to the second look: skipped (or a picture was), shortened, replaced;
+            else None.
         consistent: whether the parts of the draw agree; None where nothing can be said.
         disagreements: which do not: ``plan_trajectory``, ``reason_change``.
         reasons: the statements that the reflection could make; None without one, and where it could make any.

@@ -120,3 +120,8 @@ class Controls(ReflectControls):
         description="Where the ego will be when that picture is taken; needs a camera. null leaves it to the "
         "model.",
     )
+    imagine_once: bool = Field(
+        default=False,
+        description="All draws share what stands up to the picture, and differ in what they do about it: one "
+        "picture is written for all.",
+    )

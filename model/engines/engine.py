@@ -78,6 +78,8 @@ class Controls:
         motion: where the ego will be when that picture is taken: forced, and asked for with the camera. None
             leaves it to the model.
         picture: the 98 codes of that picture, given by the caller instead of written by the model.
+        imagine_once: all draws share what stands up to the picture: they see, foresee and imagine the same,
+            and differ in what they do about it.
     """
 
     thinking: Thinking = "adaptive"
@@ -97,6 +99,7 @@ class Controls:
     camera: str | None = None
     motion: Motion | None = None
     picture: tuple[int, ...] | None = None
+    imagine_once: bool = False
 
     def __post_init__(self) -> None:
         if self.thinking not in ("adaptive", "always", "never"):
@@ -113,6 +116,8 @@ class Controls:
                 raise RequestError(f"unknown camera {self.camera!r}; known are {', '.join(CAMERAS)}")
             if self.imagine == "never":
                 raise RequestError("camera has no meaning with imagine: never")
+        if self.imagine_once and self.imagine == "never":
+            raise RequestError("imagine_once has no meaning with imagine: never")
         for name, given in (("motion", self.motion), ("picture", self.picture)):
             if given is not None and self.camera is None:
                 raise RequestError(f"{name} has no meaning without the camera whose picture is imagined")

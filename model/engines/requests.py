@@ -93,7 +93,7 @@ def decided(request: PlanRequest, family: Family) -> dict[str, str]:
     controls = request.controls
     if family.imagination is not None:
         return family.imagination.picks(controls.imagines, controls.camera)
-    if controls.imagine != "auto" or controls.camera is not None:
+    if controls.imagine != "auto" or controls.camera is not None or controls.imagine_once:
         raise RequestError(f"imagine: responses in format {request.format!r} imagine no pictures")
     return {}
 
@@ -105,6 +105,14 @@ def said(request: PlanRequest, family: Family, expected: PictureCodes) -> Said:
     if family.imagination is None or controls.imagine == "never":
         return thoughts
     return {**family.imagination.said(expected, controls.motion, controls.picture), **thoughts}
+
+
+def drawn_as(request: PlanRequest, family: Family, cursor: Cursor, draws: Sequence[int]) -> Sequence[int]:
+    """Whose random numbers draws take: up to a picture that all share, those of the first draw."""
+    imagination = family.imagination
+    if not request.controls.imagine_once or imagination is None:
+        return draws
+    return [0] * len(draws) if cursor.section in imagination.sections else draws
 
 
 def given_plans(request: PlanRequest, family: Family) -> dict[str, Plan]:

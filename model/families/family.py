@@ -86,6 +86,11 @@ class Imagination:
     predicting: Callable[[float, float], tuple[Value, ...]]
     expecting: Callable[[tuple[int, ...] | None, tuple[int, ...] | None], tuple[Decided, ...]]
 
+    @property
+    def sections(self) -> frozenset[str]:
+        """What stands up to the picture, and the picture; the choice has a section of its name."""
+        return frozenset((self.perception, self.prediction, self.name, self.section))
+
     def said(
         self,
         expected: tuple[int, ...] | None,
@@ -318,8 +323,7 @@ class Family:
     def __post_init__(self) -> None:
         imagination = self.imagination
         declared = (
-            *(() if imagination is None else (imagination.section, imagination.perception)),
-            None if imagination is None else imagination.prediction,
+            *(() if imagination is None else imagination.sections - {imagination.name}),
             *(self.trajectory, self.first_plan, self.reflection, self.revised_plan),
             None if self.branch is None else self.branch.name,
         )

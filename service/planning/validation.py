@@ -114,7 +114,7 @@ def _check_imagining(asked: wire.Controls, format: str) -> None:
     """Raise `ProblemError` where a choice to imagine is made for a format that cannot."""
     if family_named(format).imagination is not None:
         return
-    for name, left_open in (("imagine", "auto"), ("camera", None), ("motion", None)):
+    for name, left_open in (("imagine", "auto"), ("camera", None), ("motion", None), ("imagine_once", False)):
         if getattr(asked, name) != left_open:
             raise at(CANNOT_IMAGINE, f"/controls/{name}", f"{format} imagines no pictures; leave it out")
 
@@ -245,6 +245,7 @@ def _controls(asked: wire.ReflectControls, prefill: Plan | None) -> Controls:
             imagine=imagining.imagine,
             camera=imagining.camera,
             motion=None if motion is None else Motion(motion.x_m, motion.y_m, motion.heading_rad),
+            imagine_once=imagining.imagine_once,
         )
     except (RequestError, GeometryError) as error:
         raise at(INVALID_CONTROLS, "/controls", str(error)) from None

@@ -232,6 +232,32 @@ def test_who_never_thinks_thinks_of_nobody(world: Loaded) -> None:
         assert draw.text.partition("<think>")[0] == other.text.partition("<think>")[0]
 
 
+def test_one_picture_for_all_draws(world: Loaded) -> None:
+    def imagined(**controls: Any) -> list[Draw]:
+        return planned(
+            world, n=4, imagine="always", camera="front", numbers="drawn", codes="drawn", seed=3, **controls
+        )
+
+    once, each = imagined(imagine_once=True), imagined()
+
+    def up_to_the_picture(draws: list[Draw]) -> set[str]:
+        return {draw.text.partition("</visual>")[0] for draw in draws}
+
+    assert len(up_to_the_picture(each)) > 1
+    assert up_to_the_picture(once) == {each[0].text.partition("</visual>")[0]}, "as the first draw writes it"
+    assert len({draw.text for draw in once}) > 1, "they differ in what they do about it"
+    with pytest.raises(RequestError, match="imagine_once"):
+        Controls(imagine="never", imagine_once=True)
+
+
+def test_a_picture_may_be_given(world: Loaded) -> None:
+    codes = tuple(np.random.default_rng(1).integers(0, 1000, PICTURE_CODES).tolist())
+    [draw] = planned(world, n=1, imagine="always", camera="front", picture=codes, logprobs=True)
+    assert draw.foreseen is not None
+    assert draw.foreseen.picture == NextPicture("front", codes)
+    assert draw.section_logprobs["visual"] == 0, "what the caller gives is no choice of the model's"
+
+
 def test_a_motion_that_is_given_is_predicted_and_seen(world: Loaded, painting: Loaded) -> None:
     motion = Motion(6.23, -1.5, -0.2)
     for draw in planned(world, n=2, imagine="always", camera="back", motion=motion, logprobs=True, seed=1):

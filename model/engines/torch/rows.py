@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from looktwice.model.engines.engine import Event
 from looktwice.model.engines.least_error import least_error
-from looktwice.model.engines.requests import leads_to_reflection, told
+from looktwice.model.engines.requests import drawn_as, leads_to_reflection, told
 from looktwice.model.engines.response import Response, SectionText
 from looktwice.model.engines.sampling import choose, probabilities, uniforms
 from looktwice.model.engines.torch.deadlines import TimeFor
@@ -126,7 +126,9 @@ class Row(Response):
             return [int(allowed.ids[least_error(logits, expected, left)])] * len(draws)
         if left is None:
             left = np.ones(len(allowed.ids), np.bool_)
-        numbers = uniforms(controls.seed, draws, place)
+        request = self.request
+        lots = drawn_as(request.plan_request, request.family, self.cursor, draws)
+        numbers = uniforms(controls.seed, lots, place)
         places = choose(logits[left], controls.temperature, controls.top_p, numbers)
         return [int(token) for token in allowed.ids[left][places]]
 

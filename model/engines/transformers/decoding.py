@@ -16,7 +16,7 @@ from looktwice.model.engines.engine import PlanRequest
 from looktwice.model.engines.least_error import LeastError, least_error
 from looktwice.model.engines.logprobs import reported
 from looktwice.model.engines.reason_mask import ReasonMask, reason_mask_of
-from looktwice.model.engines.requests import leads_to_reflection
+from looktwice.model.engines.requests import drawn_as, leads_to_reflection
 from looktwice.model.engines.response import Response, SectionText
 from looktwice.model.engines.sampling import choose, probabilities, uniform
 from looktwice.model.families.family import Family
@@ -122,7 +122,8 @@ class Decoding:
         expected = self._least_error.expected(allowed, controls)
         if expected is not None:
             return int(allowed.ids[least_error(scores, expected, left)])
-        number = np.array([uniform(controls.seed, index, len(response.tokens))])
+        [draw] = drawn_as(asked.request, asked.family, response.cursor, (index,))
+        number = np.array([uniform(controls.seed, draw, len(response.tokens))])
         place = choose(scores[left], controls.temperature, controls.top_p, number)[0]
         return int(allowed.ids[left][place])
 

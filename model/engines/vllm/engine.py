@@ -155,6 +155,8 @@ class VllmEngine:
         start = begin(request, self._card, self._families, self._formats)
         if request.controls.deadline_ms is not None:
             raise RequestError("deadline_ms needs the torch engine: vLLM cannot cut a text short and go on")
+        if request.controls.imagine_once:
+            raise RequestError("imagine_once needs the torch engine: vLLM gives each draw its random numbers")
         if request.controls.bind:
             raise RequestError("bind needs the torch engine: vLLM has no grammar that depends on the plan")
         family = self._families[request.format]

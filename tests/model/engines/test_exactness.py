@@ -124,7 +124,8 @@ def arrivals(draw: st.DrawFn) -> list[Arrival]:
         if family.imagination is not None and draw(st.booleans()):
             # Where the scene shows the camera, its picture half a second later is guessed.
             camera = draw(st.sampled_from([*(clip.camera for clip in scene.clips), *CAMERAS]))
-            controls = replace(controls, imagine="always", camera=camera)
+            once = draw(st.booleans())
+            controls = replace(controls, imagine="always", camera=camera, imagine_once=once)
         attempt = None
         if family.refines:
             draft = np.zeros((len(family.times_s), 4), np.float32)
