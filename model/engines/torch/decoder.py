@@ -29,7 +29,6 @@ from looktwice.model.engines.requests import begin, read
 from looktwice.model.engines.torch.batch import Batch, Feed
 from looktwice.model.engines.torch.deadlines import LatencyModel, drafts_of
 from looktwice.model.engines.torch.drafter import Drafter
-from looktwice.model.engines.torch.integrity import check
 from looktwice.model.engines.torch.request import Phase, Request, Tree
 from looktwice.model.engines.torch.rows import Row
 from looktwice.model.engines.torch.runner import ROWS_A_TREE, PromptRequest, Runner
@@ -443,7 +442,3 @@ class Decoder:
         counts.fan_out_row_passes += sum(len(row.draws) for row, _ in fed)
         counts.scene_passes += len({id(row.tree) for row, _ in fed})
         counts.tokens += sum(len(feed.tokens) for _, feed in fed)
-
-    def check_integrity(self) -> None:
-        """Raise `AssertionError` when requests and memory do not agree with each other."""
-        check(self._scheduler.requests, self._memory)

@@ -9,6 +9,7 @@ import torch
 
 from looktwice.model.engines.torch.decoder import Decoder
 from looktwice.model.network.checkpoint import Loaded, load
+from tests.model.engines.integrity import check_integrity
 from tests.model.engines.reference import exactly
 
 
@@ -38,4 +39,4 @@ def _books(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(Decoder, "__init__", noting)
     yield
     for decoder in made:
-        decoder.check_integrity()
+        check_integrity(decoder)

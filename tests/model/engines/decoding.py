@@ -17,6 +17,7 @@ from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.network.checkpoint import Loaded
 from tests.checkpoints import noisy_scene
+from tests.model.engines.integrity import check_integrity
 
 
 class Again:
@@ -49,7 +50,7 @@ def decode_some(decoder: Decoder, *requests: PlanRequest) -> tuple[Draws, dict[s
                 draws[name, event.draw.index] = event.draw
             elif isinstance(event, Failed):
                 failed[name] = event.error
-        decoder.check_integrity()
+        check_integrity(decoder)
     return draws, failed
 
 

@@ -20,6 +20,7 @@ from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.formats.pieces import Value, Values
 from looktwice.model.network.checkpoint import Loaded
 from tests.model.engines.decoding import beginning, decode, request
+from tests.model.engines.integrity import check_integrity
 from tests.model.engines.reference import reference_draws
 
 pytestmark = pytest.mark.usefixtures("inference")
@@ -52,7 +53,7 @@ def test_in_time_a_reflection_replaces_its_draft(exact: Loaded) -> None:
             elif isinstance(event, DrawFinished):
                 draws[event.draw.index] = event.draw
                 order.append(("draw", event.draw.index))
-        decoder.check_integrity()
+        check_integrity(decoder)
     unhurried = decode(Decoder(Runner(exact, 4)), request("a", n=2, seed=4, thinking="always"))
     direct = decode(Decoder(Runner(exact, 4)), request("a", n=2, seed=4, thinking="never"))
     for index in range(2):
@@ -73,7 +74,7 @@ def test_at_the_deadline_the_draft_is_the_answer(exact: Loaded) -> None:
                 drafts[event.draw.index] = event.draw
             elif isinstance(event, DrawFinished):
                 draws[event.draw.index] = event.draw
-        decoder.check_integrity()
+        check_integrity(decoder)
         if len(drafts) == 2:
             clock.now_s = 101.0
     assert [draws[index].text for index in range(2)] == [drafts[index].text for index in range(2)]
@@ -93,7 +94,7 @@ def test_who_gave_way_is_answered_with_drafts_at_the_deadline(exact: Loaded, wai
                 drafts[event.draw.index] = event.draw
             elif isinstance(event, DrawFinished):
                 draws[name, event.draw.index] = event.draw
-        decoder.check_integrity()
+        check_integrity(decoder)
 
     while len(drafts) < 2:
         step()

@@ -44,6 +44,7 @@ from looktwice.model.network.settings import NANO_SETTINGS, VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes
 from tests.checkpoints import copy_picture_codes, made_up_tracks, noisy_scene, write_untrained
 from tests.model.engines.decoding import Again
+from tests.model.engines.integrity import check_integrity
 from tests.model.engines.reference import Shares, exactly, reference
 from tests.model.formats.strategies import branching_formats
 
@@ -208,7 +209,7 @@ def decode(decoder: Decoder, mix: list[Arrival]) -> dict[tuple[str, int], Draw]:
             assert not isinstance(event, Failed), event
             if isinstance(event, DrawFinished):
                 draws[name, event.draw.index] = event.draw
-        decoder.check_integrity()
+        check_integrity(decoder)
         step += 1
     return draws
 
@@ -347,7 +348,7 @@ def test_a_soak_leaves_nothing_behind(exact: Loaded) -> None:
             decoder.cancel(names[int(random.integers(len(names)))])
         for _, event in decoder.step():
             assert not isinstance(event, Failed), event
-        decoder.check_integrity()
+        check_integrity(decoder)
         if step == steps // 2:
             halfway = resident_bytes()
     assert resident_bytes() < 1.1 * halfway, "memory grows"
@@ -356,7 +357,7 @@ def test_a_soak_leaves_nothing_behind(exact: Loaded) -> None:
     )
     for _ in range(2000):
         decoder.step()
-        decoder.check_integrity()
+        check_integrity(decoder)
     assert decoder.idle, "a request is stuck"
     assert decoder.rows_used == 0
     gc.collect()

@@ -17,6 +17,7 @@ from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.engines.torch.shortcuts import Shortcuts
 from looktwice.model.network.checkpoint import Loaded
 from tests.model.engines.decoding import decode_some, request
+from tests.model.engines.integrity import check_integrity
 from tests.model.engines.reference import reference_draws
 
 BAD = "bad"
@@ -129,12 +130,12 @@ def test_rows_that_nobody_owns_are_found(exact: Loaded) -> None:
     decoder.add(request("running", n=2))
     for _ in range(3):
         decoder.step()
-    decoder.check_integrity()
+    check_integrity(decoder)
     running = decoder._scheduler.get("running")
     assert running is not None
     decoder._scheduler.remove(running)
     with pytest.raises(AssertionError, match="held for nobody"):
-        decoder.check_integrity()
+        check_integrity(decoder)
     running.end(decoder._memory)
 
 

@@ -15,6 +15,7 @@ from looktwice.model.engines.torch.request import Phase
 from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.network.checkpoint import Loaded
 from tests.model.engines.decoding import Draws, decode, request
+from tests.model.engines.integrity import check_integrity
 
 pytestmark = pytest.mark.usefixtures("inference")
 
@@ -70,13 +71,13 @@ def test_requests_may_be_preempted_at_any_step(exact: Loaded, undisturbed: Draws
         running = [each for each in disturbed._scheduler.requests if each.phase is Phase.RUNNING]
         if running and random.random() < 1 / 6:
             disturbed._preempt(running[int(random.integers(len(running)))])
-            disturbed.check_integrity()
+            check_integrity(disturbed)
             preempted += 1
         for name, event in disturbed.step():
             if isinstance(event, DrawFinished):
                 assert (name, event.draw.index) not in draws, "a draw is answered twice"
                 draws[name, event.draw.index] = event.draw
-        disturbed.check_integrity()
+        check_integrity(disturbed)
     assert preempted > 3
     same(draws, undisturbed)
 
@@ -87,7 +88,7 @@ def test_a_request_that_waits_for_a_kv_row_can_be_cancelled(exact: Loaded) -> No
     while tight.counts.preempted == 0:
         tight.step()
     tight.cancel("long")
-    tight.check_integrity()
+    check_integrity(tight)
     assert tight.idle
     assert tight.rows_used == 0
     assert len(decode(tight, PlanRequest("next", MIX[2].scene, "traj_only"))) == 6

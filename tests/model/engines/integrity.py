@@ -1,20 +1,17 @@
-"""Whether requests and memory agree with each other: for tests, and while nobody waits. No torch."""
+"""Whether the requests and the memory of a decoder agree with each other."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from looktwice.model.engines.torch.memory import Memory
-from looktwice.model.engines.torch.request import Phase, Request
+from looktwice.model.engines.torch.decoder import Decoder
+from looktwice.model.engines.torch.request import Phase
 
 
-def check(requests: Sequence[Request], memory: Memory) -> None:
+def check_integrity(decoder: Decoder) -> None:
     """Raise `AssertionError` where something is held twice, for nobody, or by somebody who should not.
 
-    Args:
-        requests: all that wait or run.
-        memory: that they run in.
+    Nothing but tests looks into a decoder's books, so it has no public word for them.
     """
+    requests, memory = decoder._scheduler.requests, decoder._memory
     trees = [tree for request in requests for tree in request.trees]
     rows = [row for tree in trees for row in tree.rows]
     for kind, pool, used in (
