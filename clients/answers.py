@@ -49,7 +49,8 @@ class PlannerProblem(PlannerError):
 
     Attributes:
         type: stable URI of the kind of problem.
-        title, detail: for people.
+        title: for people.
+        detail: for people, of this request.
         status: of the HTTP answer.
         request_id: to find it in the service's log.
         errors: the places in the request that are wrong.
@@ -85,7 +86,8 @@ class PlannedDraw:
         plan: the first plan.
         branch: ``Action:`` or ``Thinking:``.
         think_probability: of a second look, 0..1.
-        thinking, revised_plan: the second look; None where none was taken.
+        thinking: the second look in words; None where none was taken.
+        revised_plan: that it led to; likewise.
         trajectory: float32 [t, 4]: x, y, z in m and heading in rad, ego frame, at ``times_s``.
         draft_trajectory: where the first plan would have led; None without a second look or a deadline.
         times_s: of the poses, in s from now; 64 at 10 Hz, the first at 0.1 s, unless the format has its own.
@@ -145,12 +147,17 @@ class LookedAt:
     Attributes:
         index: 0..n-1.
         decision: ``keep`` or ``revise``.
-        thinking, revised_plan: the second look; None where none was taken.
+        thinking: the second look in words; None where none was taken.
+        revised_plan: that it led to; likewise.
         plan_iou: of the given and the revised plan; 1 where it is kept.
         changes: the stretches in which they differ.
-        trajectory, times_s: as of a `PlannedDraw`.
+        trajectory: as of a `PlannedDraw`.
+        times_s: as of a `PlannedDraw`.
         tokens: tokens per section.
-        consistent, disagreements, reasons, logprobs: as of a `PlannedDraw`.
+        consistent: as of a `PlannedDraw`.
+        disagreements: as of a `PlannedDraw`.
+        reasons: as of a `PlannedDraw`.
+        logprobs: as of a `PlannedDraw`.
     """
 
     index: int

@@ -1,10 +1,10 @@
 """Clients of the planning service: scenes in, typed plans and trajectories out.
 
-::
-
-    with PlannerClient("http://127.0.0.1:8000") as planner:
-        result = planner.plan(scene, wire.Controls(n=6))
-        result.draws[0].trajectory  # float32 [64, 4]
+```python
+with PlannerClient("http://127.0.0.1:8000") as planner:
+    result = planner.plan(scene, wire.Controls(n=6))
+    result.draws[0].trajectory  # float32 [64, 4]
+```
 """
 
 from __future__ import annotations
@@ -137,7 +137,14 @@ class Access:
 
 
 class PlannerClient:
-    """Blocking client; safe to share between threads, as its httpx client is."""
+    """Blocking client; safe to share between threads, as its httpx client is.
+
+    Args:
+        base_url: of the service, such as ``http://127.0.0.1:8000``.
+        retries: how long it tries.
+        transport: of its httpx client, in place of connections.
+        access: how it speaks to the service.
+    """
 
     def __init__(
         self,

@@ -22,13 +22,18 @@ from looktwice.model.formats.pieces import Plain, Value
 from looktwice.model.network.model_card import ModelCard
 
 Thinking = Literal["adaptive", "always", "never"]
+"""Who decides whether there is a second look: the model, or the caller."""
 Decision = Literal["least_error", "drawn"]
+"""How numbers and codes are chosen."""
 Reasons = Literal["in_view", "any"]
+"""What a reflection in phrases may state."""
 Imagine = Literal["auto", "never", "always"]
+"""Who decides whether a picture is imagined: the model, or the caller."""
 Cut = Literal["skipped", "shortened", "replaced"]
 """What a deadline did to a second look: not begun, ended early, given up for the draft."""
 
 MAX_DRAWS = 64
+"""Of one request."""
 
 
 class EngineError(RuntimeError):
@@ -183,10 +188,12 @@ class Draw:
     Attributes:
         index: 0..n-1.
         text: the whole response as written.
-        plan, branch, thinking, revised_plan: its parts; None where the format or the branch has none.
-            ``branch`` is the option as the format writes it, ``thinking`` the reflection.
+        plan: the first plan; None where the format has none.
+        branch: the option as the format writes it; None where the format has none.
         think_probability: probability of a second look at the branch, at temperature 1, over its options;
             None where the format has no branch.
+        thinking: the reflection; None where the format or the branch has none.
+        revised_plan: None likewise.
         trajectory: float32 [t, 4] in the ego frame.
         codes: the trajectory codes it was decoded from.
         tokens: tokens per section, forced ones included.
@@ -301,6 +308,7 @@ class DraftFinished:
 
 
 Event = Started | TextWritten | CodesWritten | SectionFinished | DraftFinished | DrawFinished
+"""What an engine tells while it answers a request."""
 
 
 @dataclass(frozen=True)

@@ -59,13 +59,17 @@ class Imagination:
 
     Attributes:
         name: of the choice.
-        imagined, unseen: its options.
+        imagined: its option that leads to a picture.
+        unseen: its other option.
         camera: the name of the choice of the camera.
         cameras: how the format writes each of `CAMERAS`.
         section: that holds the picture's codes.
-        perception, prediction: the sections before it, of what is around and of where the ego will be.
-        perceived, predicted, pictured: what the values of these three sections say. When somebody comes near
-            may be written later: a perception alone does not tell.
+        perception: the section before it, of what is around.
+        prediction: the section before it, of where the ego will be.
+        perceived: what the values of the perception say. When somebody comes near may be written later: a
+            perception alone does not tell.
+        predicted: what the values of the prediction say.
+        pictured: what the values of the picture say.
         predicting: the first values of the prediction, which say where the ego will be, of metres ahead and
             to the left.
         expecting: the first values of the picture, of the 98 codes that are expected and the 98 that are
@@ -159,7 +163,13 @@ class NextPicture:
 
 
 class Predicted(NamedTuple):
-    """Where the ego will be in half a second, in its frame of now, and its turn: Left, Forward or Right."""
+    """Where the ego will be in half a second.
+
+    Attributes:
+        x_m: ahead, in its frame of now.
+        y_m: to the left.
+        direction: where it turns: Left, Forward or Right.
+    """
 
     x_m: float
     y_m: float
@@ -172,7 +182,8 @@ class Foreseen:
 
     Attributes:
         perceived: who is around, and where the road ends.
-        x_m, y_m: where the ego will be in half a second, in its frame of now.
+        x_m: where the ego will be in half a second, ahead, in its frame of now.
+        y_m: to the left.
         direction: where it turns: Left, Forward or Right.
         picture: what a camera will see then; None where it imagines nothing.
     """

@@ -292,6 +292,7 @@ class Record(Shorthand):
 
 
 Piece = Literal | Choice | Maybe | Sequence | Section | FreeText | Codes | Shorthand
+"""What a declaration is made of."""
 
 
 @dataclass(frozen=True)
