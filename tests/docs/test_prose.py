@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 LIMIT = 18
 PAGES = [
-    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
 ]
 
