@@ -9,7 +9,7 @@ from looktwice.clients.wire_values import rows, wire_agents, wire_scene
 from looktwice.model.driving.outcome import Outcome
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import Scene
-from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, at_times
+from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray
 from looktwice.model.driving.view import Surroundings
 
 
@@ -29,8 +29,7 @@ def plan_request(
 
 def attempt_at(trajectory: FloatArray, feedback: str, times_s: Sequence[float] = TEN_HZ_S) -> wire.Attempt:
     """An attempt to be refined: a draft [t, 4] with poses at ``times_s``, and feedback on it."""
-    told = None if tuple(times_s) == TEN_HZ_S else list(times_s)
-    return wire.Attempt(trajectory=rows(trajectory), times_s=told, feedback=feedback)
+    return wire.Attempt(trajectory=rows(trajectory), times_s=_told(times_s), feedback=feedback)
 
 
 def reflect_request(
@@ -67,18 +66,25 @@ def imagine_request(
     camera: wire.Camera,
     controls: wire_imagine.ImagineControls = wire_imagine.ImagineControls(),
     trajectory: FloatArray | None = None,
+    times_s: Sequence[float] = TEN_HZ_S,
 ) -> wire_imagine.ImagineRequest:
     """The body of POST /v1/imagine for what ``camera`` sees half a second after ``scene``.
 
-    With a ``trajectory`` [64, 4] at 10 Hz it asks what the camera would see if the ego drove that.
+    With a ``trajectory`` [t, 4] with poses at ``times_s``, such as those of a draw, it asks what the camera
+    would see if the ego drove that.
     """
-    motion = None
-    if trajectory is not None:
-        x_m, y_m, _, heading_rad = at_times(trajectory, TEN_HZ_S, (wire_imagine.SECONDS_AHEAD,))[0].tolist()
-        motion = wire.Motion(x_m=x_m, y_m=y_m, heading_rad=heading_rad)
     return wire_imagine.ImagineRequest(
-        scene=wire_scene(scene), camera=camera, motion=motion, controls=controls
+        scene=wire_scene(scene),
+        camera=camera,
+        trajectory=None if trajectory is None else rows(trajectory),
+        times_s=None if trajectory is None else _told(times_s),
+        controls=controls,
     )
+
+
+def _told(times_s: Sequence[float]) -> list[float] | None:
+    """Times as the wire has them."""
+    return None if tuple(times_s) == TEN_HZ_S else list(times_s)
 
 
 def label_request(

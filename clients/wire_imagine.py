@@ -19,11 +19,13 @@ from looktwice.clients.wire import (
     ModelName,
     Motion,
     Nearby,
+    Poses,
     Problem,
     RequestModel,
     ResponseModel,
     Scene,
     Temperature,
+    TimesS,
     Timing,
     TopP,
 )
@@ -69,8 +71,15 @@ class ImagineRequest(RequestModel):
     )
     motion: Motion | None = Field(
         default=None,
-        description="Asks what the camera would see if the ego did this, such as a trajectory's pose in half "
-        "a second. null leaves it to the model.",
+        description="Asks what the camera would see if the ego did this. null leaves it to the model.",
+    )
+    trajectory: Poses | None = Field(
+        default=None,
+        description="Asks the same of a trajectory, instead of a motion: where it is in half a second, which "
+        "must lie within it. That of a draw can be sent back as it is, with its times_s.",
+    )
+    times_s: TimesS = Field(
+        default=None, description="When the poses of the trajectory are, in s from now; null for 64 at 10 Hz."
     )
     controls: ImagineControls = Field(default=ImagineControls(), description="n pictures are made.")
     stream: bool = Field(

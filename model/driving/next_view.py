@@ -12,7 +12,17 @@ import numpy.typing as npt
 
 from looktwice.model.driving.cameras import CAMERA_SPECS, CameraSpec
 from looktwice.model.driving.short_term import AHEAD_S, INERTIA
-from looktwice.model.driving.trajectory import STEP_S, FloatArray, GeometryError, to_ego_frame
+from looktwice.model.driving.trajectory import (
+    STEP_S,
+    TEN_HZ_S,
+    FloatArray,
+    GeometryError,
+    at_times,
+    check_times,
+    check_trajectory,
+    shared_times,
+    to_ego_frame,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -44,6 +54,26 @@ class Motion:
                 f"nobody comes to ({self.x_m}, {self.y_m}) m with a heading of {self.heading_rad} in half a "
                 f"second; {MOST_M:g} m are the most"
             )
+
+
+def motion_along(trajectory: npt.ArrayLike, times_s: Sequence[float] = TEN_HZ_S) -> Motion:
+    """Where an ego that drives a trajectory will be in half a second; between two poses on a straight line.
+
+    Args:
+        trajectory: [64, 4], or [t, 4] with poses at ``times_s``, in the ego frame.
+
+    Raises:
+        GeometryError: no trajectory, or none of these times; one that begins later than in half a second or
+            ends before; or a `Motion` that nobody makes.
+    """
+    check_times(times_s)
+    poses = check_trajectory(trajectory, times_s)
+    if not (shared_times((AHEAD_S,), times_s[:1]) and shared_times(times_s, (AHEAD_S,))):
+        raise GeometryError(
+            f"half a second is beyond the horizon of a trajectory from {times_s[0]:g} s to {times_s[-1]:g} s"
+        )
+    x_m, y_m, _, heading_rad = at_times(poses, times_s, (AHEAD_S,))[0].tolist()
+    return Motion(x_m, y_m, heading_rad)
 
 
 def expected_view(

@@ -63,7 +63,10 @@ _KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], Kind]]] = (
     (("labels",), INVALID_LABELS),
     *(
         ((field,), INVALID_TRAJECTORY)
-        for field in ("trajectories", "reference", "previous", "human", "ground_truth", "draft")
+        for field in (
+            *("trajectories", "reference", "previous", "human", "ground_truth", "draft"),
+            *("trajectory", "times_s"),
+        )
     ),
     (("said", "written"), INVALID_FEEDBACK),
     (("feedback",), INVALID_FEEDBACK),

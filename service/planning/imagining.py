@@ -11,13 +11,23 @@ from dataclasses import dataclass
 import looktwice.clients.wire as wire
 import looktwice.clients.wire_imagine as wire_imagine
 from looktwice.model.driving.images import encode_png
+from looktwice.model.driving.next_view import Motion, motion_along
 from looktwice.model.driving.perceived import Perceived, PerceivedAgent
+from looktwice.model.driving.trajectory import TEN_HZ_S, GeometryError, check_times
 from looktwice.model.engines.engine import CodesWritten, Draw, SectionFinished
 from looktwice.model.families.family import Imagination, Predicted
 from looktwice.model.families.registry import family_named
 from looktwice.model.network.model_card import ModelCard
 from looktwice.service.planning.events import Arrival, Begun, Paint, Planned, SceneEvent
-from looktwice.service.problems import CANNOT_IMAGINE, UNKNOWN_FORMAT, ProblemError
+from looktwice.service.problems import (
+    CANNOT_IMAGINE,
+    INVALID_CONTROLS,
+    INVALID_REQUEST,
+    INVALID_TRAJECTORY,
+    UNKNOWN_FORMAT,
+    ProblemError,
+    at,
+)
 
 _DECIMALS = 4
 
@@ -48,7 +58,11 @@ class Imagining:
 
 
 def imagining_of(asked: wire_imagine.ImagineRequest, card: ModelCard) -> Imagining:
-    """What a request comes to; raises `ProblemError` for a model that cannot imagine, or cannot paint."""
+    """What a request comes to.
+
+    Raises:
+        ProblemError: a model that cannot imagine, or cannot paint; a motion or a trajectory that cannot be.
+    """
     if not card.formats:
         raise ProblemError(UNKNOWN_FORMAT, "this service runs without a model; it only scores")
     for format in card.formats:
@@ -69,13 +83,42 @@ def imagining_of(asked: wire_imagine.ImagineRequest, card: ModelCard) -> Imagini
             thinking="adaptive",
             imagine="always",
             camera=asked.camera,
-            motion=asked.motion,
+            motion=_motion(asked),
             logprobs=True,
         ),
         format=format,
         stream=asked.stream,
     )
     return Imagining(format, imagination, asked.camera, planning)
+
+
+def _motion(asked: wire_imagine.ImagineRequest) -> wire.Motion | None:
+    """What the ego is to do in half a second; raises `ProblemError` for what cannot be."""
+    if asked.trajectory is None:
+        if asked.times_s is not None:
+            raise at(INVALID_TRAJECTORY, "/times_s", "there is no trajectory; leave them out, or send one")
+        if asked.motion is not None:
+            try:
+                Motion(**dict(asked.motion))
+            except GeometryError as error:
+                raise at(INVALID_CONTROLS, "/motion", str(error)) from None
+        return asked.motion
+    if asked.motion is not None:
+        raise at(INVALID_REQUEST, "/trajectory", "there is a motion too; send one of the two")
+    times_s = TEN_HZ_S if asked.times_s is None else tuple(asked.times_s)
+    if len(asked.trajectory) != len(times_s):
+        of = "times_s has" if asked.times_s is not None else "10 Hz without times_s are"
+        poses = f"{len(asked.trajectory)} poses are told"
+        raise at(INVALID_TRAJECTORY, "/trajectory", f"{poses}, and {of} {len(times_s)}")
+    try:
+        check_times(times_s)
+    except GeometryError:
+        raise at(INVALID_TRAJECTORY, "/times_s", "must ascend") from None
+    try:
+        motion = motion_along(asked.trajectory, times_s)
+    except GeometryError as error:
+        raise at(INVALID_TRAJECTORY, "/trajectory", str(error)) from None
+    return wire.Motion(x_m=motion.x_m, y_m=motion.y_m, heading_rad=motion.heading_rad)
 
 
 def imagine_answer(imagining: Imagining, planned: Planned, arrival: Arrival) -> wire_imagine.ImagineResponse:

@@ -51,6 +51,13 @@ def example_imagining(cameras: tuple[str, ...]) -> dict[str, Any]:
     return {"scene": scene, "camera": "front_left", "controls": {"n": 2, "seed": 7}}
 
 
+def example_trajectory() -> dict[str, Any]:
+    """How the car of the same scene slows down, as a draw of poses every half second tells it."""
+    times_s = [0.5 * step for step in range(1, 7)]
+    poses = [[round(10.0 * t - t * t, 4), 0.0, 0.0, 0.0] for t in times_s]
+    return {"trajectory": poses, "times_s": times_s}
+
+
 def example_score() -> dict[str, Any]:
     """Two trajectories behind a slower car: one brakes, one does not."""
 

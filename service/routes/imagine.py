@@ -16,10 +16,10 @@ from looktwice.service.http.payloads import payload_route, respond
 from looktwice.service.planning.events import Planned
 from looktwice.service.planning.imagining import ImagineTeller, imagine_answer, imagining_of
 from looktwice.service.planning.submitting import last
-from looktwice.service.problems import CANNOT_IMAGINE
+from looktwice.service.problems import CANNOT_IMAGINE, INVALID_TRAJECTORY
 from looktwice.service.routes.arrivals import arrival_of
 from looktwice.service.routes.dependencies import Dependencies
-from looktwice.service.routes.examples import example_imagining
+from looktwice.service.routes.examples import example_imagining, example_trajectory
 from looktwice.service.routes.plan import REFUSALS
 from looktwice.service.routes.streaming import server_sent, streamed
 
@@ -28,17 +28,25 @@ EXAMPLES: Final[dict[str, Example]] = {
     "the same, told as it is written": {
         "value": example_imagining((FRONT_WIDE, FRONT_TELE)) | {"stream": True}
     },
+    "what it would see if the car moved so": {
+        "value": example_imagining((FRONT_WIDE, FRONT_TELE))
+        | {"motion": {"x_m": 4.5, "y_m": 0.2, "heading_rad": 0.1}}
+    },
+    "what it would see on this trajectory": {
+        "value": example_imagining((FRONT_WIDE, FRONT_TELE)) | example_trajectory()
+    },
 }
 
 
 def imagine_router(deps: Dependencies) -> APIRouter:
     """The endpoint; pictures take places as draws of /v1/plan do."""
     router = APIRouter(route_class=payload_route(lambda _: deps.planning.check_open()), tags=["planning"])
+    refusals = problems(*REFUSALS, CANNOT_IMAGINE, INVALID_TRAJECTORY)
 
     @router.post(
         "/v1/imagine",
         response_model=wire_imagine.ImagineResponse,
-        responses=problems(*REFUSALS, CANNOT_IMAGINE) | answers_and_stream(*wire_imagine.EVENTS),
+        responses=refusals | answers_and_stream(*wire_imagine.EVENTS),
         openapi_extra=payloads(wire_imagine.ImagineRequest),
     )
     async def imagine(

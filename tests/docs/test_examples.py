@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from PIL import Image
 from looktwice.clients.metadrive import simulator
 from looktwice.model.bundled import SCENES
 from looktwice.model.driving.images import decode_image
+from looktwice.model.driving.next_view import Motion
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.service.operations.settings import Settings
 from tests.service.scripted_engine import ScriptedEngine
@@ -65,6 +67,24 @@ def test_reflect_on_another_plan(served: Served) -> None:
     printed = run("reflect_on_another_plan.py", served.url)
     assert printed.count("think probability") == 12
     assert "Accelerate -> " in printed
+
+
+def test_imagine(tmp_path: Path) -> None:
+    engine = ScriptedEngine()
+    engine.card_shown = replace(engine.card, formats=("cf_vla", "vla_world"), paints=True)
+    with serve(engine, Settings()) as made:
+        printed = run("imagine.py", made.url, str(tmp_path / "seen"))
+    told = re.findall(r"seen/([a-z-]+)\.png: in half a second at ", printed)
+    assert told == ["as-it-expects", "as-planned", "straight-on", "if-it-stood-still"]
+    for name in told:
+        assert decode_image((tmp_path / "seen" / f"{name}.png").read_bytes()).shape == (112, 224, 3)
+    _, free, planned, straight_on, still = (request.controls.motion for request in engine.submitted)
+    assert free is None
+    assert still == Motion(0.0, 0.0, 0.0)
+    assert planned is not None
+    assert straight_on is not None
+    assert planned.x_m > 0
+    assert straight_on.y_m == 0
 
 
 def test_the_drive_is_imported_by_the_figures_of_its_own_camera(tmp_path: Path) -> None:

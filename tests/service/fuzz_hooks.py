@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 import looktwice.clients.wire as wire
 from looktwice.clients.wire_feedback import FeedbackRequest
+from looktwice.clients.wire_imagine import ImagineRequest
 from looktwice.clients.wire_refine import RefineRequest
 from looktwice.clients.wire_scores import ScoreRequest
 from looktwice.service.openai.requests import ChatRequest
@@ -27,6 +28,7 @@ DRAFT = example_refinement(("front_wide_120",))["draft"]
 REFINES = "elf_vla_refine"
 IMAGINES = "vla_world"
 ATTEMPT = {"trajectory": DRAFT, "times_s": [0.5 * step for step in range(1, 9)], "feedback": "Brake."}
+DRIVEN = {"motion": None, "trajectory": DRAFT, "times_s": ATTEMPT["times_s"]}
 ATTEMPTED = {"format": REFINES, "attempt": ATTEMPT}
 PICTURES = [
     {"type": "image_url", "image_url": {"url": f"data:image/jpeg;base64,{image}"}}
@@ -53,6 +55,8 @@ def map_body(context: Any, body: Any) -> Any:
             request.update(ATTEMPTED if _is_of_the_schema(wire.PlanRequest, request) else {})
         if isinstance(request, dict) and "draft" in request and len(str(request)) % 2:
             request.update({"draft": DRAFT} if _is_of_the_schema(RefineRequest, request) else {})
+        if isinstance(request, dict) and "camera" in request and len(str(request)) % 2:
+            request.update(DRIVEN if _is_of_the_schema(ImagineRequest, request) else {})
         if isinstance(request, dict) and _JUDGED_ONLY & request.keys() and len(str(request)) % 2:
             request.update(JUDGED if _is_of_the_schema(FeedbackRequest, request) else {})
         scene = request.get("scene") if isinstance(request, dict) else None

@@ -56,6 +56,8 @@ WHOLE: dict[tuple[str, str], dict[str, Any]] = {
     ("Attempt", "trajectory"): _one(ATTEMPT["trajectory"]),
     ("Attempt", "times_s"): _one(ATTEMPT["times_s"], None),
     ("RefineRequest", "draft"): _one(DRAFT),
+    ("ImagineRequest", "trajectory"): _one(DRAFT, None),
+    ("ImagineRequest", "times_s"): _one(ATTEMPT["times_s"], None),
     ("ReflectRequest", "format"): _one("cf_vla"),
     ("Extras", "format"): _one("cf_vla"),
     ("ChatRequest", "model"): _one(""),

@@ -1,11 +1,20 @@
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from looktwice.model.driving.cameras import CAMERA_SPECS
-from looktwice.model.driving.next_view import FAR_M, Motion, expected_view, expected_views, moved_view
+from looktwice.model.driving.next_view import (
+    FAR_M,
+    Motion,
+    expected_view,
+    expected_views,
+    motion_along,
+    moved_view,
+)
 from looktwice.model.driving.trajectory import GeometryError, to_ego_frame
 
 FRONT = CAMERA_SPECS["front"]
@@ -60,6 +69,45 @@ def test_earlier_pictures_show_the_road_where_the_last_one_does(turn: float) -> 
 def test_a_motion_that_nobody_makes_is_refused(pose: tuple[float, float, float]) -> None:
     with pytest.raises(GeometryError, match="in half a second; 40 m are the most"):
         Motion(*pose)
+
+
+TURNING = np.array([[1.0, 0.0, 0.1, 0.1], [3.0, 0.5, 0.2, 0.3]])
+
+
+@pytest.mark.parametrize(
+    ("times_s", "expected"),
+    [
+        ((0.5, 1.0), (1.0, 0.0, 0.1)),
+        ((0.1, 0.5), (3.0, 0.5, 0.3)),
+        ((0.25, 0.75), (2.0, 0.25, 0.2)),
+        ((0.4, 0.8), (1.5, 0.125, 0.15)),
+    ],
+)
+def test_half_a_second_of_a_trajectory_lies_between_its_poses(
+    times_s: tuple[float, ...], expected: tuple[float, float, float]
+) -> None:
+    assert astuple(motion_along(TURNING, times_s)) == pytest.approx(expected)
+    behind = np.concatenate([TURNING[:, :3], np.array([[3.1], [-3.1]])], axis=1)
+    halfway = motion_along(behind, (0.4, 0.6)).heading_rad
+    assert np.cos(halfway) == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize(
+    ("poses", "times_s", "message"),
+    [
+        (TURNING, (0.6, 1.0), "beyond the horizon of a trajectory from 0.6 s to 1 s"),
+        (TURNING, (0.1, 0.4), "beyond the horizon of a trajectory from 0.1 s to 0.4 s"),
+        (TURNING, (1.0, 0.5), "times must ascend"),
+        (TURNING, (0.5,), r"shape \[1, 4\], got \[2, 4\]"),
+        (TURNING * [[20.0, 1, 1, 1]], (0.4, 0.5), r"nobody comes to \(60.0, 0.5\) m"),
+        (TURNING * np.nan, (0.4, 0.5), "not finite"),
+    ],
+)
+def test_a_trajectory_that_does_not_tell_of_it_is_refused(
+    poses: npt.NDArray[np.float64], times_s: tuple[float, ...], message: str
+) -> None:
+    with pytest.raises(GeometryError, match=message):
+        motion_along(poses, times_s)
 
 
 @pytest.mark.parametrize("camera", ["front", "front_left", "back_right", "back"])

@@ -32,7 +32,7 @@ def test_a_wrong_request_is_one_line(tmp_path: Path) -> None:
     told = RUNNER.invoke(app, ["score", str(path)])
     assert told.exit_code == 2
     assert told.stderr == (
-        "looktwice: A trajectory cannot be scored: "
+        "looktwice: A trajectory cannot be taken: "
         "/trajectories/0: has 9 poses; 8 at 0.5 s or 64 at 0.1 s are scored\n"
     )
 

@@ -28,6 +28,7 @@ from looktwice.clients.planner import (
 from looktwice.clients.streams import ImagineEvent
 from looktwice.clients.wire_imagine import CodesWritten, ImagineControls, ImagineRequest, ImagineResponse
 from looktwice.model.driving.scene import CAMERAS
+from looktwice.model.driving.trajectory import TEN_HZ_S, at_times
 from looktwice.model.engines.engine import EngineError
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.engines.torch.shortcuts import Shortcuts
@@ -259,20 +260,112 @@ def test_a_motion_is_predicted_and_one_that_nobody_makes_is_refused(served: Serv
     future = np.zeros((64, 4), np.float32)
     future[:, 0], future[:, 1], future[:, 3] = np.arange(1, 65), 0.1 * np.arange(1, 65), 0.02
     controls = ImagineControls(n=2, seed=1)
-    request = imagine_request(scene(), "back", controls, trajectory=future)
-    assert request.motion is not None
-    assert tuple(request.motion.model_dump().values()) == pytest.approx((5.0, 0.5, 0.02))
-    told = imagined(served, request.model_dump())
+    free = imagine_request(scene(), "back", controls)
+    motion = wire.Motion(x_m=5.0, y_m=0.5, heading_rad=0.02)
+    told = imagined(served, free.model_copy(update={"motion": motion}).model_dump())
     assert [(each.prediction.x_m, each.prediction.y_m) for each in told.pictures] == [(5.0, 0.5)] * 2
-    free = imagined(served, imagine_request(scene(), "back", controls).model_dump())
-    assert free.pictures != told.pictures
+    assert imagined(served, free.model_dump()).pictures != told.pictures
+    for times_s in (TEN_HZ_S, TEN_HZ_S[1::3]):
+        driven = at_times(future, TEN_HZ_S, times_s)
+        request = imagine_request(scene(), "back", controls, trajectory=driven, times_s=times_s)
+        assert imagined(served, request.model_dump()).pictures == told.pictures
     far = problem(served.http.post(PATH, json=asked(motion={"x_m": 41.0})), "invalid-controls")
+    assert far.errors[0].pointer == "/motion"
     assert "nobody comes to (41.0, 0.0) m" in far.errors[0].detail
     endless = problem(served.http.post(PATH, json=asked(motion={"y_m": 1.0})), "invalid-request")
     assert endless.errors[0].pointer == "/motion/x_m"
     alone = body() | {"format": "vla_world", "controls": {"motion": {"x_m": 1.0}}}
     told_of = problem(served.http.post("/v1/plan", json=alone), "invalid-controls")
     assert "without the camera" in told_of.errors[0].detail
+
+
+@pytest.mark.parametrize("format", ["traj_only", "vla_world"])
+def test_a_draw_is_sent_back_as_it_is(served: Served[TorchEngine], format: str) -> None:
+    draw = served.http.post("/v1/plan", json=body() | {"format": format}).json()["draws"][0]
+    sent = asked(trajectory=draw["trajectory"], times_s=draw["times_s"])
+    at_half = draw["trajectory"][4 if draw["times_s"] is None else draw["times_s"].index(0.5)]
+    for picture in imagined(served, sent).pictures:
+        # The language has steps of 0.1 m.
+        assert (picture.prediction.x_m, picture.prediction.y_m) == pytest.approx(at_half[:2], abs=0.051)
+
+
+POSES: list[list[float]] = [[1.0 * row, 0.0, 0.0, 0.0] for row in range(1, 65)]
+
+
+def told_at(*times_s: float) -> dict[str, Any]:
+    return {"trajectory": POSES[: len(times_s)], "times_s": times_s}
+
+
+BEYOND = ("invalid-trajectory", "/trajectory", "beyond the horizon of a trajectory from ")
+ASTRAY: list[tuple[str, dict[str, Any], str, str, str]] = [
+    # what, fields, type, pointer, words
+    ("it ends before", told_at(0.1, 0.4), *BEYOND),
+    ("it begins after", told_at(0.6, 1.0), *BEYOND),
+    ("times that do not ascend", told_at(1.0, 0.5), "invalid-trajectory", "/times_s", "must ascend"),
+    ("a time that is past", told_at(0.0, 0.5), "invalid-trajectory", "/times_s/0", "greater than 0"),
+    (
+        "no times",
+        {"trajectory": POSES, "times_s": []},
+        "invalid-trajectory",
+        "/trajectory",
+        "times_s has 0",
+    ),
+    ("63 poses", {"trajectory": POSES[:63]}, "invalid-trajectory", "/trajectory", "63 poses are told"),
+    (
+        "poses for other times",
+        {"trajectory": POSES[:3], "times_s": [0.5, 1.0]},
+        "invalid-trajectory",
+        "/trajectory",
+        "times_s has 2",
+    ),
+    ("times of nothing", {"times_s": [0.5]}, "invalid-trajectory", "/times_s", "no trajectory"),
+    ("no poses", {"trajectory": []}, "invalid-trajectory", "/trajectory", "at least 1"),
+    ("words", {"trajectory": "straight on"}, "invalid-trajectory", "/trajectory", "valid list"),
+    ("points", {"trajectory": [[1.0, 0.0]] * 64}, "invalid-trajectory", "/trajectory/0", "at least 4"),
+    (
+        "NaN",
+        {"trajectory": [*POSES[:9], [float("nan")] * 4, *POSES[10:]]},
+        "invalid-trajectory",
+        "/trajectory/9/0",
+        "finite",
+    ),
+    (
+        "more than 40 m",
+        {"trajectory": [[50.0, 0.0, 0.0, 0.0]], "times_s": [0.5]},
+        "invalid-trajectory",
+        "/trajectory",
+        "nobody comes to (50.0, 0.0) m",
+    ),
+    (
+        "farther than any",
+        {"trajectory": [[1e300, 0.0, 0.0, 0.0]] * 64},
+        "invalid-trajectory",
+        "/trajectory",
+        "not finite",
+    ),
+    (
+        "a motion too",
+        {"trajectory": POSES, "motion": {"x_m": 5.0}},
+        "invalid-request",
+        "/trajectory",
+        "one of the two",
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("fields", "slug", "pointer", "words"), [bad[1:] for bad in ASTRAY], ids=[bad[0] for bad in ASTRAY]
+)
+def test_a_trajectory_that_cannot_be_is_refused_by_name(
+    served: Served[TorchEngine], fields: dict[str, Any], slug: str, pointer: str, words: str
+) -> None:
+    # Python's writer turns NaN into the literal that JSON does not have.
+    content, headers = json.dumps(asked(**fields)), {"Content-Type": "application/json"}
+    told = problem(served.http.post(PATH, content=content, headers=headers), slug)
+    assert (told.status, told.errors[0].pointer) == (422, pointer)
+    assert words in told.errors[0].detail
+    streamed = json.dumps(asked(**fields, stream=True))
+    problem(served.http.post(PATH, content=streamed, headers=headers), slug)
 
 
 def test_models_that_cannot_imagine_or_paint_are_named() -> None:
