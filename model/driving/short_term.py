@@ -32,6 +32,8 @@ Array = npt.NDArray[np.float64]
 AHEAD_S: Final = 0.5
 """How far ahead is predicted; steps of the past are as long."""
 _ROWS: Final = round(AHEAD_S / STEP_S)
+AHEAD_ROW: Final = _ROWS - 1
+"""The row of a trajectory at 10 Hz, or of an agent's future, that is as far ahead."""
 _PAST: Final = (HISTORY_STEPS - 1 - 2 * _ROWS, HISTORY_STEPS - 1 - _ROWS, HISTORY_STEPS - 1)
 """Rows of a history 1.0 s ago, 0.5 s ago and now."""
 
@@ -162,7 +164,7 @@ def fit_short_term(scenes: Iterable[LabelledScene]) -> ShortTermPredictor:
         if labelled.scene.route is not None:
             past = labelled.scene.history[list(_PAST)][:, [0, 1, 3]].astype(np.float64)
             two = steps(past)
-            actual = labelled.future[_ROWS - 1, :2].astype(np.float64)
+            actual = labelled.future[AHEAD_ROW, :2].astype(np.float64)
             row = float(np.hypot(*two[1, :2])), inertial_step(two), actual
             by_goal.setdefault(mission_goal(labelled.scene.route), []).append(row)
     fits = {goal: _fit_goal(rows) for goal, rows in by_goal.items() if len(rows) >= _FEWEST}
@@ -171,20 +173,15 @@ def fit_short_term(scenes: Iterable[LabelledScene]) -> ShortTermPredictor:
     return ShortTermPredictor(fits)
 
 
-def ego_errors(predictor: ShortTermPredictor, scenes: Iterable[LabelledScene]) -> Array:
-    """Metres [n] between where the ego was predicted and where the expert was in half a second."""
-    errors = []
-    for labelled in scenes:
-        route = labelled.scene.route
-        pose = predictor.ego(labelled.scene.history, None if route is None else mission_goal(route))
-        errors.append(np.hypot(*(pose[:2] - labelled.future[_ROWS - 1, :2])))
-    return np.array(errors, np.float64)
+def ego_error(pose: npt.NDArray[np.floating], labelled: LabelledScene) -> float:
+    """Metres between a pose (x, y, …) that was predicted and where the expert was in half a second."""
+    return float(np.hypot(*(pose[:2] - labelled.future[AHEAD_ROW, :2])))
 
 
 def agent_errors(predictor: ShortTermPredictor, agents: Iterable[Agent]) -> Array:
     """Metres [n] between where agents were predicted and where they were; NaN where either is not known."""
     known = list(agents)
-    actual = np.array([agent.future[_ROWS - 1, :2] for agent in known], np.float64).reshape(-1, 2)
+    actual = np.array([agent.future[AHEAD_ROW, :2] for agent in known], np.float64).reshape(-1, 2)
     apart: Array = np.linalg.norm(predictor.agents(known)[:, :2] - actual, axis=1)
     return apart
 

@@ -230,6 +230,20 @@ def stats(path: _Scenes = DEFAULT_SCENES, as_json: Json = False) -> None:
                 typer.echo(f"{name:26} {value}")
 
 
+@app.command("short-term")
+def short_term(
+    train: Annotated[Path, typer.Argument(help="Scene file or folder that lambda is fitted on.")],
+    validation: Annotated[Path, typer.Argument(help="Scene file or folder that it is measured on.")],
+    as_json: Json = False,
+) -> None:
+    """Measure how far off half a second ahead is predicted: VLA-World's short-term predictor."""
+    with reported_errors():
+        from looktwice.clients.summaries.short_term import format_short_term, short_term_figures
+
+        figures = short_term_figures(train, validation)
+        typer.echo(json.dumps(figures) if as_json else format_short_term(figures))
+
+
 @app.command("show")
 def show(
     path: _Scenes = DEFAULT_SCENES,

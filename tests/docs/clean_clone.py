@@ -45,6 +45,7 @@ TRIED: Final = {
     "scenes stats": "looktwice scenes stats",
     "scenes show": "looktwice scenes show --limit 2",
     "scenes pick": f"looktwice scenes pick {_SCENES} out/picked.parquet --count 2",
+    "scenes short-term": f"looktwice scenes short-term {_SCENES} {_SCENES}",
     "build rollout": f"looktwice build rollout out/build {_SCENES} --service http://localhost:{PORT} --n 1",
     "build filter": "looktwice build filter out/build --everything",
     "build label": f"looktwice build label out/build {_SCENES}",

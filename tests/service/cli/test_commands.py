@@ -143,6 +143,16 @@ def test_what_is_no_request_is_told_in_a_line(tmp_path: Path, content: str) -> N
     assert ran("plan", str(tmp_path / "request.json"), code=2).startswith("looktwice: ")
 
 
+def test_half_a_second_ahead_is_fitted_and_measured(tmp_path: Path) -> None:
+    told = ran("scenes", "short-term", str(SCENES), str(SCENES))
+    figures = json.loads(ran("scenes", "short-term", str(SCENES), str(SCENES), "--json"))
+    assert figures["scenes"] == 12
+    assert f"{figures['ego_m']['fitted']:.3f} m" in told
+    assert figures["ego_m"]["lambda_0"] < figures["ego_m"]["constant_velocity"]
+    missing = str(tmp_path / "none.parquet")
+    assert ran("scenes", "short-term", missing, missing, code=2) == f"looktwice: {missing} does not exist\n"
+
+
 def test_help_needs_neither_torch_nor_the_service() -> None:
     code = (
         "import sys; from looktwice.service.cli.commands import app; "
