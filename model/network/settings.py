@@ -167,3 +167,5 @@ NANO_SETTINGS: Final = VlaSettings(
     scene_tokens=21,
 )
 """Of the model that is trained from scratch: motion is seen within one patch, over all four frames."""
+EXPANDED_SETTINGS: Final = VlaSettings(image_width=336, image_height=168)
+"""Of a backbone that can write: free text, and all its vision tokens in the prompt, as in the paper."""

@@ -32,7 +32,7 @@ def train(
         typer.Option(
             "--from",
             help="Checkpoint folder to start from; of a ladder one that writes meta-actions, for composer "
-            "one that imagines, or codes alone.",
+            "one that imagines, or codes alone; for create a stock Qwen2.5-VL, which is expanded.",
         ),
     ] = None,
     vision_from: Annotated[Path | None, typer.Option(help="Checkpoint whose vision tower is taken.")] = None,
@@ -121,7 +121,7 @@ def train(
         torch.set_num_threads(threads)
     with reported_errors():
         if recipe == "create":
-            figures = create(scenes, cache, target, seed=seed)
+            figures = create(scenes, cache, target, source, seed=seed)
             _tell({f"codec {name}": value for name, value in figures.items()})
             return
         if recipe in DRIVING_KINDS:

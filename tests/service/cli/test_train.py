@@ -1,0 +1,43 @@
+"""Checkpoints to begin with, as the command makes them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from typer.testing import CliRunner, Result
+
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.network.checkpoint import load
+from looktwice.service.cli.commands import app
+from tests.model.network.stock import write_stock
+from tests.model.training.scenes import training_scene
+
+
+def ran(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+def test_a_stock_backbone_is_expanded_and_plans(tmp_path: Path) -> None:
+    scenes, stock, expanded = (tmp_path / name for name in ("scenes.parquet", "stock", "expanded"))
+    write_scenes(scenes, [training_scene(number) for number in range(4)])
+    write_stock(stock, spare_rows=0)
+    asked = ("train", "create", "--scenes", scenes, "--cache", tmp_path / "cache")
+    made = ran(*asked, "--from", stock, "--to", expanded)
+    assert made.exit_code == 0, made.output
+    assert "codec" in made.output
+    card = load(expanded).card
+    assert (card.name, card.formats) == ("expanded", ("cf_vla", "traj_only"))
+    planned = ran("plan", scenes, "--checkpoint", expanded, "--n", "1", "--format", "traj_only", "--json")
+    assert planned.exit_code == 0, planned.output
+    assert len(json.loads(planned.stdout)["draws"][0]["trajectory"]) == 64
+
+
+def test_what_is_no_backbone_is_refused_by_name(tmp_path: Path) -> None:
+    scenes = tmp_path / "scenes.parquet"
+    write_scenes(scenes, [training_scene(number) for number in range(4)])
+    asked = ("train", "create", "--scenes", scenes, "--cache", tmp_path / "cache")
+    refused = ran(*asked, "--from", tmp_path / "none", "--to", tmp_path / "made")
+    assert refused.exit_code == 2
+    assert "no config.json" in refused.output
+    assert not (tmp_path / "made").exists()
