@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -133,6 +133,19 @@ class Actions:
 
     groups: tuple[tuple[str, ...], ...]
     of: Callable[[FloatArray], tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Corpus:
+    """Text that a tokenizer learns from which is trained for a family, beside its prompts.
+
+    Attributes:
+        phrases: runs of text that it has a token for.
+        responses: makes whole ones, where they need them of sentences about driving.
+    """
+
+    phrases: tuple[str, ...]
+    responses: Callable[[Sequence[str]], Iterable[str]]
 
 
 LessonPart = Literal["thoughts", "perceived"]
@@ -303,6 +316,7 @@ class Family:
         actions: what its responses say that they do, where tables can count it.
         rewards: what a response is worth beside the expert's trajectory [64, 4] at 10 Hz, part by part from 0
             to 1; None where drivers' scores alone tell.
+        corpus: what a tokenizer learns of it, where one is trained; None where its words are plain English.
 
     Raises:
         FamilyError: the format lacks a section, the branch or the imagination that is declared, times do not
@@ -330,6 +344,7 @@ class Family:
     unthought: Said = field(default_factory=dict)
     actions: Actions | None = None
     rewards: Callable[[FloatArray, Reading], Mapping[str, float]] | None = None
+    corpus: Corpus | None = None
 
     def __post_init__(self) -> None:
         imagination = self.imagination
@@ -403,6 +418,11 @@ class Family:
     def looks_twice(self) -> bool:
         """Whether it reflects upon a plan of its own, as counterfactual examples teach."""
         return self.first_plan is not None and self.reflection is not None
+
+    @property
+    def bare(self) -> bool:
+        """Whether its responses are a trajectory and nothing else."""
+        return self.format.sections() == (self.trajectory,)
 
     def in_dialect(self, reflection: ReflectionLanguage) -> Family:
         """The family of a checkpoint whose reflections are so written."""

@@ -15,9 +15,9 @@ from typing import Final
 
 from looktwice.model.driving.phrases import ReflectionLanguage
 from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.cf_vla.traj_only import TRAJ_ONLY
 from looktwice.model.families.elf_vla import ELF_VLA, ELF_VLA_REFINE
 from looktwice.model.families.family import Family, FamilyError
-from looktwice.model.families.traj_only import TRAJ_ONLY
 from looktwice.model.families.vla_world import VLA_WORLD
 
 GROUP: Final = "looktwice.families"
@@ -25,6 +25,8 @@ GROUP: Final = "looktwice.families"
 
 OURS: Final = {family.name: family for family in (CF_VLA, TRAJ_ONLY, ELF_VLA, ELF_VLA_REFINE, VLA_WORLD)}
 """The families of LookTwice itself, by name."""
+FROM_SCRATCH: Final = (CF_VLA.name, TRAJ_ONLY.name)
+"""The formats of a checkpoint that is trained from scratch, the default first."""
 
 
 @cache

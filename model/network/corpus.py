@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import itertools
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
-from looktwice.model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, track_from_words
+from looktwice.model.driving.plan import TICKS, WORDS, format_tick
 from looktwice.model.driving.scene import CAMERAS
-from looktwice.model.families.cf_vla.format import ACTION, PLAN_START, THINKING
 from looktwice.model.families.registry import family_named
 from looktwice.model.network.prompts import SYSTEM, prompt_text
 from looktwice.model.network.settings import NANO_SETTINGS, VlaSettings
@@ -182,53 +181,6 @@ their he she we our you your in on at to from into onto of for with without by a
 across along around through within about per hour kilometers ahead, vehicle. lane. road.
 """
 
-_FORMATS: Final = ("cf_vla", "traj_only")
-_KINDS: Final = ("vehicle", "pedestrian", "traffic cone", "barrier")
-_PHRASES: Final = (
-    *"""
- is in my lane
- is in the left lane
- is in the right lane
- is on the left side
- is on the right side
- is oncoming
- in my lane
- in the left lane
- in the right lane
- right ahead
-The road bends left
-The road bends right
-The junction lets me go left
-The junction lets me go right
-My lane is clear
-My lane ends
-There is room in the left lane
-There is room in the right lane
- Going on like this
- would bring me too close
- would leave no time to react
- would carry too much speed into the curve
- would get me stuck
- would carry me out of the lane
- would be needlessly cautious
- would be unnecessary
- would miss the way
-, so I should brake and stop
-, so I should slow down sooner
-, so I should pick up speed
-, so I should turn left
-, so I should turn right
-, so I should steer straight for longer
-, so I should stay in my lane
-, so I should move to the left lane
-, so I should move to the right lane
-s:
-""".strip("\n").splitlines(),
-    ACTION,
-    THINKING,
-)
-"""Phrases of reflections: what is seen and where, what would come of it, what is better."""
-
 
 def driving_sentences(per_template: int = 12, seed: int = 0) -> Iterator[str]:
     """Sentences about scenes, hazards and corrections; the same for the same arguments.
@@ -247,54 +199,27 @@ def driving_sentences(per_template: int = 12, seed: int = 0) -> Iterator[str]:
     yield " ".join(_WORDS_ALONE.split())
 
 
-def random_plans(count: int, seed: int = 0) -> Iterator[Plan]:
-    """Valid plans with one to four segments a group; the same for the same arguments."""
-    random_ = random.Random(seed)
-    for _ in range(count):
-        tracks = {}
-        for group in GROUPS:
-            edges = sorted(random_.sample(range(1, TICKS), random_.randrange(4)))
-            words = itertools.chain.from_iterable(
-                [random_.choice(WORDS[group])] * (end - start)
-                for start, end in zip([0, *edges], [*edges, TICKS], strict=True)
-            )
-            tracks[group] = track_from_words(list(words))
-        yield Plan(**tracks)
-
-
-def response_texts(count: int = 300, seed: int = 0) -> Iterator[str]:
-    """Whole CF-VLA responses without their trajectory codes (the labels of CF-VLA section 8)."""
-    sentences = list(driving_sentences(per_template=3, seed=seed))
-    random_ = random.Random(seed)
-    plans = random_plans(2 * count, seed)
-    for first, second in zip(plans, plans, strict=True):
-        yield f"{PLAN_START}{first}{ACTION}\n"
-        thinking = " ".join(random_.sample(sentences, 3))
-        yield f"{PLAN_START}{first}{THINKING}\n{thinking}\n{PLAN_START}{second}{ACTION}\n"
-
-
-def nano_phrases() -> tuple[str, ...]:
-    """Runs of text that the nano tokenizer has a token for: what prompts, plans and reflections are made of.
+def nano_phrases(formats: Sequence[str] = NANO_SETTINGS.formats) -> tuple[str, ...]:
+    """Runs of text that the nano tokenizer has a token for: what prompts and responses are made of.
 
     A small model spends its passes on choices, then, not on spelling.
     """
-    objects = [f"A {state}{kind}" for kind in _KINDS for state in ("", "standing ", "slower ", "braking ")]
-    distances = [f" some {metres} metres ahead" for metres in range(5, 105, 5)]
-    words = [f" {word}" for words in WORDS.values() for word in words]
-    groups = [f"- {group}\n" for group in GROUPS]
-    tasks = (family_named(name).task for name in _FORMATS)
-    return (SYSTEM, *tasks, PLAN_START, *groups, *words, *objects, *distances, *_PHRASES)
+    families = [family_named(name) for name in formats]
+    own = itertools.chain.from_iterable(family.corpus.phrases for family in families if family.corpus)
+    return (SYSTEM, *(family.task for family in families), *own)
 
 
-def nano_corpus() -> Iterator[str]:
-    """Everything the nano tokenizer is trained on."""
-    for phrase in nano_phrases():
+def nano_corpus(formats: Sequence[str] = NANO_SETTINGS.formats) -> Iterator[str]:
+    """Everything the nano tokenizer of a checkpoint that writes ``formats`` is trained on."""
+    for phrase in nano_phrases(formats):
         yield from [phrase] * 50
     for tick in range(TICKS + 1):
         yield from [f"{format_tick(tick)}  - {format_tick(tick)}s-"] * 50
     yield from driving_sentences()
-    yield from response_texts()
-    for format in _FORMATS:
+    for format in formats:
+        if corpus := family_named(format).corpus:
+            yield from corpus.responses(list(driving_sentences(per_template=3)))
+    for format in formats:
         for route in (False, True):
             # Often enough that the prompt's own words become single tokens.
             for tokens in (0, NANO_SETTINGS.scene_tokens):

@@ -9,6 +9,7 @@ from typing import Any, Final, get_args
 from looktwice.model.driving.facts import FACT_GROUPS
 from looktwice.model.driving.phrases import ReflectionLanguage
 from looktwice.model.driving.scene import CAMERAS, CLIP_FRAMES, CLIP_PERIOD_S, FRONT_TELE, FRONT_WIDE
+from looktwice.model.families.registry import FROM_SCRATCH
 from looktwice.model.families.trajectory_codes import CODES
 from looktwice.model.network.intent import INTENT_TOKENS
 
@@ -42,7 +43,7 @@ class VlaSettings:
     """
 
     name: str = "looktwice-nano"
-    formats: tuple[str, ...] = ("cf_vla", "traj_only")
+    formats: tuple[str, ...] = FROM_SCRATCH
     reflection: ReflectionLanguage = "free_text"
     cameras: tuple[str, ...] = (FRONT_WIDE, FRONT_TELE)
     image_width: int = 224

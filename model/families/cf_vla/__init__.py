@@ -3,6 +3,7 @@
 from typing import Final
 
 from looktwice.model.families.cf_vla import format as its
+from looktwice.model.families.cf_vla.corpus import CORPUS
 from looktwice.model.families.cf_vla.read import read
 from looktwice.model.families.cf_vla.targets import teach
 from looktwice.model.families.family import Branch, Family
@@ -20,5 +21,6 @@ CF_VLA: Final = Family(
     read=read,
     title="meta-act",
     about="writes a driving plan in words, may look at it twice, and gives 6.4 s of trajectory",
+    corpus=CORPUS,
 )
 """plan, branch { act: trajectory | reflect: reflection, revised plan, trajectory }"""

@@ -20,7 +20,7 @@ from looktwice.model.engines.reason_mask import ReasonMask, reason_mask_of
 from looktwice.model.engines.torch.decoder import Decoder
 from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.families.cf_vla import CF_VLA
-from looktwice.model.families.traj_only import TRAJ_ONLY
+from looktwice.model.families.cf_vla.traj_only import TRAJ_ONLY
 from looktwice.model.formats.cursor import CompiledFormat, Token
 from looktwice.model.formats.phrases import Phrases
 from looktwice.model.formats.pieces import Format, Section, Sequence

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.cf_vla.traj_only import TRAJ_ONLY
 from looktwice.model.families.family import Branch, FamilyError
-from looktwice.model.families.traj_only import TRAJ_ONLY
 from looktwice.model.formats.pieces import NOTHING, Choice, Format, Literal, Option, Section, Sequence, Values
 
 

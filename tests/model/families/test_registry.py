@@ -8,9 +8,9 @@ import pytest
 
 from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.families.cf_vla.format import PHRASES
+from looktwice.model.families.cf_vla.traj_only import TRAJ_ONLY
 from looktwice.model.families.family import FamilyError
 from looktwice.model.families.registry import GROUP, families_of, family_named
-from looktwice.model.families.traj_only import TRAJ_ONLY
 
 MODULE = """
 from looktwice.model.families.family import Family, Reading

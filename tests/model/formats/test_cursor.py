@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from looktwice.model.driving.plan import GROUPS, TICKS, WORDS, Plan, format_tick, parse_plan
 from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.families.cf_vla.format import MAX_THINKING_TOKENS
-from looktwice.model.families.traj_only import TRAJ_ONLY
+from looktwice.model.families.cf_vla.traj_only import TRAJ_ONLY
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.pieces import Format, FormatError, Value, Values
 from looktwice.model.formats.plan_tracks import MAX_SEGMENTS

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from looktwice.model.driving.plan import WORDS
 from looktwice.model.families.cf_vla import CF_VLA
-from looktwice.model.families.traj_only import TRAJ_ONLY
+from looktwice.model.families.cf_vla.traj_only import TRAJ_ONLY
 from looktwice.model.formats.cursor import AtChoice, CompiledFormat, Cursor
 from looktwice.model.formats.grammar_export import to_lark
 from looktwice.model.formats.pieces import Values

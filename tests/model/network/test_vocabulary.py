@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 from tokenizers import Tokenizer, models
 from transformers import AutoTokenizer, PreTrainedTokenizerFast
 
+from looktwice.model.families.cf_vla import CF_VLA
+from looktwice.model.families.cf_vla.corpus import random_plans
 from looktwice.model.network import vocabulary as words
-from looktwice.model.network.corpus import driving_sentences, nano_corpus, random_plans
+from looktwice.model.network.corpus import driving_sentences, nano_corpus
 from looktwice.model.network.vocabulary import (
     FUTURE_START,
     Vocabulary,
@@ -94,6 +96,13 @@ def test_plans_and_reasoning_are_compact(vocabulary: Vocabulary) -> None:
         # A segment takes bullet, two times of four characters, its words and the line's end.
         segments = sum(len(track) for _, track in plan.tracks())
         assert len(vocabulary.encode(str(plan))) <= 17 * segments + 3 * len(plan.tracks())
+
+
+def test_families_bring_phrases_and_responses() -> None:
+    [bare, planning] = (set(nano_corpus([name])) for name in ("traj_only", "cf_vla"))
+    assert CF_VLA.corpus is not None
+    assert not bare & {*CF_VLA.corpus.phrases}
+    assert planning > {*CF_VLA.corpus.phrases, *CF_VLA.corpus.responses(list(driving_sentences(3)))}
 
 
 def test_corpus_is_deterministic_and_varied() -> None:

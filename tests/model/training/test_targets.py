@@ -11,8 +11,8 @@ from looktwice.model.driving.trajectory import HISTORY_STEPS, constant_velocity
 from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.families.cf_vla.format import PHRASES
 from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
+from looktwice.model.families.cf_vla.traj_only import TRAJ_ONLY
 from looktwice.model.families.family import Lesson, Reflection
-from looktwice.model.families.traj_only import TRAJ_ONLY
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.pieces import FormatError, Values
 from looktwice.model.formats.text import parse
