@@ -23,6 +23,7 @@ from looktwice.model.evaluation.open_loop import (
 )
 from looktwice.model.evaluation.table import Row, format_table, to_json
 from looktwice.model.evaluation.variants import Variant, evaluate_engine
+from looktwice.model.families.registry import family_named
 
 LEAD_SUBGROUP = f"lead within {LEAD_WITHIN_M:.0f} m"
 SOON_SUBGROUP = f"lead within {LEAD_WITHIN_S:.0f} s"
@@ -146,8 +147,8 @@ def compare_variants(
     """What should differ, pair by pair.
 
     Of the draw that is driven by: free planning against every baseline but the expert. Of minADE: against
-    the format without plans, and given the expert's plan against free. Of avgADE: against the format without
-    plans, and shuffled images against free. Of path lengths: shuffled against free, where a lead is near.
+    bare trajectories, and given the expert's plan against free. Of avgADE: against bare trajectories, and
+    shuffled images against free. Of path lengths: shuffled against free, where a lead is near.
     """
     comparisons = []
     for variant, of in results.items():
@@ -170,9 +171,9 @@ def compare_variants(
             if name != EXPERT
         ]
         for other in results:
-            plain = other.format == "traj_only" and not other.shuffled_images
+            plain = family_named(other.format).bare and not other.shuffled_images
             given = (other.route, other.tracks) == (variant.route, variant.tracks)
-            if variant.format != "traj_only" and plain and given:
+            if not family_named(variant.format).bare and plain and given:
                 name = f"{variant.name} : {other.name}"
                 comparisons += [
                     compare(name, of, results[other], measure) for measure in ("min_ade_m", "avg_ade_m")

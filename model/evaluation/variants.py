@@ -51,7 +51,7 @@ class Variant:
     """
 
     name: str
-    format: str = "cf_vla"
+    format: str
     controls: Controls = field(default_factory=Controls)
     route: bool = False
     tracks: bool = False

@@ -213,15 +213,17 @@ def _outcomes(
     """What comes of first plans and of second looks, as JSON and as text."""
     from looktwice.clients.metadrive.outcomes import Moment, setting_of
     from looktwice.model.evaluation.report import evaluate_variants
+    from looktwice.model.families.registry import family_named
     from looktwice.service.cli.outcomes import follow_pairs, outcome_pairs
 
     # What cannot be followed is refused before anything is planned.
     setting = setting_of(folder)
     for each in scenes:
         Moment.of(each)
-    if "cf_vla" not in engine.card.formats:
+    format = next((each for each in engine.card.formats if family_named(each).looks_twice), None)
+    if format is None:
         raise ValueError(f"{engine.card.name} writes no plans that could be looked at twice")
-    pairs = outcome_pairs(controls, engine.card.inputs)
+    pairs = outcome_pairs(format, controls, engine.card.inputs)
     variants = [variant for pair in pairs for variant in (pair.never, pair.adaptive)]
     draws: dict[str, dict[str, Sequence[Draw]]] = {variant.name: {} for variant in variants}
 

@@ -50,7 +50,7 @@ class Pair:
     adaptive: Variant
 
 
-def outcome_pairs(controls: Controls, inputs: Sequence[str]) -> list[Pair]:
+def outcome_pairs(format: str, controls: Controls, inputs: Sequence[str]) -> list[Pair]:
     """The runs for a checkpoint that takes ``inputs``: with the route, and where it can with tracks too."""
     adaptive = replace(controls, thinking="adaptive")
     never = replace(controls, thinking="never", think_threshold=None)
@@ -58,8 +58,8 @@ def outcome_pairs(controls: Controls, inputs: Sequence[str]) -> list[Pair]:
     return [
         Pair(
             given,
-            Variant(f"never thinks, {given}", controls=never, route=True, tracks=tracks),
-            Variant(f"adaptive, {given}", controls=adaptive, route=True, tracks=tracks),
+            Variant(f"never thinks, {given}", format, never, route=True, tracks=tracks),
+            Variant(f"adaptive, {given}", format, adaptive, route=True, tracks=tracks),
         )
         for given, tracks in (givens if "tracks" in inputs else givens[:1])
     ]

@@ -139,7 +139,7 @@ def test_the_pictures_show_what_is_measured(tmp_path: Path) -> None:
     adaptive = [result(scene, float(scene), scene / 40) for scene in range(40)]
     difficulty_plot(by_difficulty(adaptive, never), tmp_path / "difficulty.png")
     variants = temperature_variants(COUNTERFACTUAL, Controls(n=6))
-    variants += [Variant(f"{COUNTERFACTUAL}, threshold {value:g}") for value in THRESHOLDS]
+    variants += [Variant(f"{COUNTERFACTUAL}, threshold {value:g}", "cf_vla") for value in THRESHOLDS]
     rows = ladder_report({each: adaptive for each in variants}).report.rows
     by_name = {row.name: row for row in rows}
     temperature_plot(

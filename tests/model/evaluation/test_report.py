@@ -110,7 +110,7 @@ def test_the_text_holds_rows_comparisons_and_responses(report: Report) -> None:
 
 
 def test_a_variant_without_its_free_counterpart_is_only_a_row() -> None:
-    alone = Variant("given", controls=Controls(n=1), expert_plan=True)
+    alone = Variant("given", "cf_vla", Controls(n=1), expert_plan=True)
     scenes = [replace(scene, agents=()) for scene in SCENES]
     report = asyncio.run(evaluate_checkpoint(FakeEngine(), scenes, [alone]))
     assert report.comparisons == ()

@@ -23,7 +23,7 @@ from tests.model.driving.drives import agent, labelled_scene
 from tests.model.evaluation.fakes import FakeEngine
 
 SCENES = [labelled_scene(8.0 + i, scene_id=f"s{i}", episode_id=f"e{i // 3}", pictures=i) for i in range(10)]
-FREE = Variant("free", controls=Controls(n=3))
+FREE = Variant("free", "cf_vla", Controls(n=3))
 
 
 def evaluate(engine: FakeEngine, variant: Variant = FREE, concurrency: int = 4) -> list[SceneResult]:
@@ -72,21 +72,21 @@ def test_requests_carry_what_the_variant_says() -> None:
 def test_chances_differ_from_scene_to_scene_and_agree_between_variants() -> None:
     seeds = [request_for(labelled, FREE).controls.seed for labelled in SCENES]
     assert len(set(seeds)) == len(seeds)
-    assert seeds == [request_for(labelled, Variant("other")).controls.seed for labelled in SCENES]
+    assert seeds == [request_for(labelled, Variant("other", "cf_vla")).controls.seed for labelled in SCENES]
     assert seeds != [
-        request_for(scene, Variant("x", controls=Controls(seed=1))).controls.seed for scene in SCENES
+        request_for(scene, Variant("x", "cf_vla", Controls(seed=1))).controls.seed for scene in SCENES
     ]
 
 
 def test_a_prefilled_plan_reaches_the_results() -> None:
-    results = evaluate(FakeEngine(), Variant("prefilled", expert_plan=True))
+    results = evaluate(FakeEngine(), Variant("prefilled", "cf_vla", expert_plan=True))
     assert {result.plan_iou_first for result in results} == {1.0}
 
 
 def test_a_route_that_is_missing_is_an_error() -> None:
     bare = replace(SCENES[0], scene=replace(SCENES[0].scene, route=None))
     with pytest.raises(ValueError, match="scene s0 has no route"):
-        request_for(bare, Variant("routed", route=True))
+        request_for(bare, Variant("routed", "cf_vla", route=True))
 
 
 def test_the_engines_error_comes_through() -> None:
@@ -111,7 +111,7 @@ def test_shuffled_images_come_from_other_episodes_each_once() -> None:
 
 def test_the_engine_gets_the_shuffled_images() -> None:
     engine = FakeEngine()
-    evaluate(engine, Variant("shuffled", shuffled_images=True))
+    evaluate(engine, Variant("shuffled", "cf_vla", shuffled_images=True))
     given = {request.scene.scene_id: request.scene.clips for request in engine.requests}
     assert given == {
         labelled.scene.scene_id: labelled.scene.clips for labelled in with_shuffled_images(SCENES)
@@ -147,12 +147,13 @@ def test_the_standard_rows_fit_what_a_checkpoint_writes() -> None:
 def test_tracks_are_given_where_the_variant_says_so() -> None:
     car = agent(12.0, 0.0)
     labelled = labelled_scene(8.0, agents=(car,))
-    assert request_for(labelled, Variant("with", tracks=True)).scene.tracks == tracks_of(labelled.agents)
-    assert request_for(labelled, Variant("without")).scene.tracks is None
+    seen = request_for(labelled, replace(FREE, tracks=True)).scene
+    assert seen.tracks == tracks_of(labelled.agents)
+    assert request_for(labelled, FREE).scene.tracks is None
 
 
 def test_another_speed_is_the_same_way_driven_faster() -> None:
-    request = request_for(SCENES[3], Variant("fast", speed=1.5))
+    request = request_for(SCENES[3], Variant("fast", "cf_vla", speed=1.5))
     history = SCENES[3].scene.history
     np.testing.assert_allclose(request.scene.history[:, :3], 1.5 * history[:, :3], rtol=1e-6)
     np.testing.assert_array_equal(request.scene.history[:, 3], history[:, 3])
