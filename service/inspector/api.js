@@ -47,7 +47,6 @@ export async function reflect(scene, text, controls, signal) {
   const draws = body.draws.map((draw) => ({
     ...draw,
     plan: body.plan,
-    branch: draw.thinking === null ? "Action:" : "Thinking:",
     think_probability: body.think_probability,
   }));
   return { ...body, draws };

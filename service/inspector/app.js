@@ -231,7 +231,7 @@ function showDraws({ draws, agreed = null, deadline = null }) {
 function drawRow(draw, index) {
   const radio = element("input", { type: "radio", name: "draw", value: index });
   radio.addEventListener("change", () => choose(index));
-  const thinks = draw.branch === "Thinking:";
+  const thinks = draw.thinking !== null || draw.revised_plan !== null;
   const branch = element("span", { className: `branch${thinks ? " think" : ""}`, textContent: thinks ? "second look" : "direct" });
   const tokens = Object.values(draw.tokens).reduce((sum, count) => sum + count, 0);
   const row = element("tr", {},
