@@ -69,16 +69,14 @@ class FeedbackRow:
 
 
 _TYPES: Final = {
-    "draw": pa.int32(),
-    "trajectory": pa.list_(pa.list_(pa.float32())),
-    "score": pa.float64(),
-    "is_partial": pa.bool_(),
-    "threshold": pa.float64(),
-    "correct": pa.bool_(),
-    "attempts": pa.int32(),
+    "int": pa.int32(),
+    "float": pa.float64(),
+    "bool": pa.bool_(),
+    "list[list[float]]": pa.list_(pa.list_(pa.float32())),
 }
+"""Of columns, by what a row holds; all others are texts."""
 _SCHEMA: Final = pa.schema(
-    [(name, _TYPES.get(name, pa.string())) for name in FeedbackRow.__dataclass_fields__]
+    [(name, _TYPES.get(kind, pa.string())) for name, kind in FeedbackRow.__annotations__.items()]
 )
 
 
