@@ -31,7 +31,7 @@ OTHERWISE = {
     "model/evaluation/pictures.py": ("plan", "a caption"),
     "model/families/trajectory_codes.py": ("trajectory", "an alphabet"),
     "service/cli": ("branch plan thinking trajectory", "commands, and what they print"),
-    "service/http/errors.py": ("plan", "a field of the HTTP contract"),
+    "service/http/errors.py": ("plan trajectory", "fields of the HTTP contract"),
     "service/inspector": ("plan thinking", "elements of the page"),
     "service/operations/metrics.py": ("branch plan thinking", "labels of metrics"),
     "service/planning": ("branch plan revised_plan thinking trajectory", "endpoints and events"),
