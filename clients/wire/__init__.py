@@ -6,180 +6,93 @@ positive. Requests refuse fields they do not know; answers may grow fields, so r
 A module for each endpoint; what is public is here too.
 """
 
-from looktwice.clients.wire.base import (
-    IDEMPOTENCY_KEY_HEADER,
-    MAX_SEED,
-    MSGPACK_MEDIA_TYPE,
-    MULTIPART_MEDIA_TYPE,
-    PART_SCHEME,
-    PROBLEM_MEDIA_TYPE,
-    REQUEST_ID_HEADER,
-    REQUEST_PART,
-    SSE_MEDIA_TYPE,
-    AgentKind,
-    Camera,
-    Finite,
-    History,
-    Length,
-    Light,
-    Milliseconds,
-    ModelName,
-    Nearby,
-    NearbyPoint,
-    Point,
-    Pose,
-    Poses,
-    Probability,
-    RequestModel,
-    ResponseModel,
-    Route,
-    Temperature,
-    TimesS,
-    TopP,
-    Trajectory,
-)
-from looktwice.clients.wire.controls import (
-    Controls,
-    Decision,
-    Imagine,
-    MetaAction,
-    Motion,
-    PlanGiven,
-    Reasons,
-    ReflectControls,
-    Thinking,
-    Tracks,
-)
-from looktwice.clients.wire.events import (
-    EVENTS,
-    BranchTaken,
-    Event,
-    PlanWritten,
-    SectionWritten,
-    ThinkingWritten,
-    TrajectoryWritten,
-)
-from looktwice.clients.wire.label import (
-    Annotations,
-    LabelRequest,
-    LabelResponse,
-    PlanOutcome,
-    Seconds,
-    TeacherName,
-)
-from looktwice.clients.wire.models import LoadRequest, ModelCard, ModelList, NamedModel
-from looktwice.clients.wire.plan import (
-    MAX_BATCH,
-    MAX_FEEDBACK_CHARACTERS,
-    Attempt,
-    BatchRequest,
-    BatchResponse,
-    BatchResult,
-    Branch,
-    Cut,
-    Deadline,
-    Draw,
-    Logprobs,
-    Plan,
-    PlanRequest,
-    PlanResponse,
-    Section,
-    Timing,
-)
-from looktwice.clients.wire.problem import Fault, Problem
-from looktwice.clients.wire.reflect import Group, PlanChange, Reflection, ReflectRequest, ReflectResponse
-from looktwice.clients.wire.scene import Clip, Image, Scene, Track
-from looktwice.clients.wire.scenes import Agent, LabelledScene, NextImage, SceneEntry, SceneFile, SceneList
-
-__all__ = [
-    "Agent",
-    "AgentKind",
-    "Annotations",
-    "ResponseModel",
-    "RequestModel",
-    "Attempt",
-    "BatchRequest",
-    "BatchResponse",
-    "BatchResult",
-    "Branch",
-    "BranchTaken",
-    "Camera",
-    "Clip",
-    "Controls",
-    "Cut",
-    "Deadline",
-    "Decision",
-    "Draw",
-    "EVENTS",
-    "Event",
-    "Fault",
-    "Finite",
-    "Group",
-    "History",
-    "IDEMPOTENCY_KEY_HEADER",
-    "Image",
-    "Imagine",
-    "LabelRequest",
-    "LabelResponse",
-    "LabelledScene",
-    "Length",
-    "Light",
-    "LoadRequest",
-    "Logprobs",
-    "MAX_BATCH",
-    "MAX_FEEDBACK_CHARACTERS",
-    "MAX_SEED",
-    "MSGPACK_MEDIA_TYPE",
-    "MULTIPART_MEDIA_TYPE",
-    "MetaAction",
-    "Milliseconds",
-    "ModelCard",
-    "ModelList",
-    "ModelName",
-    "Motion",
-    "NamedModel",
-    "Nearby",
-    "NearbyPoint",
-    "NextImage",
-    "PART_SCHEME",
-    "PROBLEM_MEDIA_TYPE",
-    "Plan",
-    "PlanChange",
-    "PlanGiven",
-    "PlanOutcome",
-    "PlanRequest",
-    "PlanResponse",
-    "PlanWritten",
-    "Point",
-    "Pose",
-    "Poses",
-    "Probability",
-    "Problem",
-    "REQUEST_ID_HEADER",
-    "REQUEST_PART",
-    "Reasons",
-    "ReflectControls",
-    "ReflectRequest",
-    "ReflectResponse",
-    "Reflection",
-    "Route",
-    "SSE_MEDIA_TYPE",
-    "Scene",
-    "SceneEntry",
-    "SceneFile",
-    "SceneList",
-    "Seconds",
-    "TeacherName",
-    "Temperature",
-    "Thinking",
-    "ThinkingWritten",
-    "TimesS",
-    "Timing",
-    "TopP",
-    "Track",
-    "Tracks",
-    "Trajectory",
-    "TrajectoryWritten",
-    "Section",
-    "SectionWritten",
-]
+from looktwice.clients.wire.base import IDEMPOTENCY_KEY_HEADER as IDEMPOTENCY_KEY_HEADER
+from looktwice.clients.wire.base import MAX_SEED as MAX_SEED
+from looktwice.clients.wire.base import MSGPACK_MEDIA_TYPE as MSGPACK_MEDIA_TYPE
+from looktwice.clients.wire.base import MULTIPART_MEDIA_TYPE as MULTIPART_MEDIA_TYPE
+from looktwice.clients.wire.base import PART_SCHEME as PART_SCHEME
+from looktwice.clients.wire.base import PROBLEM_MEDIA_TYPE as PROBLEM_MEDIA_TYPE
+from looktwice.clients.wire.base import REQUEST_ID_HEADER as REQUEST_ID_HEADER
+from looktwice.clients.wire.base import REQUEST_PART as REQUEST_PART
+from looktwice.clients.wire.base import SSE_MEDIA_TYPE as SSE_MEDIA_TYPE
+from looktwice.clients.wire.base import AgentKind as AgentKind
+from looktwice.clients.wire.base import Camera as Camera
+from looktwice.clients.wire.base import Finite as Finite
+from looktwice.clients.wire.base import History as History
+from looktwice.clients.wire.base import Length as Length
+from looktwice.clients.wire.base import Light as Light
+from looktwice.clients.wire.base import Milliseconds as Milliseconds
+from looktwice.clients.wire.base import ModelName as ModelName
+from looktwice.clients.wire.base import Nearby as Nearby
+from looktwice.clients.wire.base import NearbyPoint as NearbyPoint
+from looktwice.clients.wire.base import Point as Point
+from looktwice.clients.wire.base import Pose as Pose
+from looktwice.clients.wire.base import Poses as Poses
+from looktwice.clients.wire.base import Probability as Probability
+from looktwice.clients.wire.base import RequestModel as RequestModel
+from looktwice.clients.wire.base import ResponseModel as ResponseModel
+from looktwice.clients.wire.base import Route as Route
+from looktwice.clients.wire.base import Temperature as Temperature
+from looktwice.clients.wire.base import TimesS as TimesS
+from looktwice.clients.wire.base import TopP as TopP
+from looktwice.clients.wire.base import Trajectory as Trajectory
+from looktwice.clients.wire.controls import Controls as Controls
+from looktwice.clients.wire.controls import Decision as Decision
+from looktwice.clients.wire.controls import Imagine as Imagine
+from looktwice.clients.wire.controls import MetaAction as MetaAction
+from looktwice.clients.wire.controls import Motion as Motion
+from looktwice.clients.wire.controls import PlanGiven as PlanGiven
+from looktwice.clients.wire.controls import Reasons as Reasons
+from looktwice.clients.wire.controls import ReflectControls as ReflectControls
+from looktwice.clients.wire.controls import Thinking as Thinking
+from looktwice.clients.wire.controls import Tracks as Tracks
+from looktwice.clients.wire.events import EVENTS as EVENTS
+from looktwice.clients.wire.events import BranchTaken as BranchTaken
+from looktwice.clients.wire.events import Event as Event
+from looktwice.clients.wire.events import PlanWritten as PlanWritten
+from looktwice.clients.wire.events import SectionWritten as SectionWritten
+from looktwice.clients.wire.events import ThinkingWritten as ThinkingWritten
+from looktwice.clients.wire.events import TrajectoryWritten as TrajectoryWritten
+from looktwice.clients.wire.label import Annotations as Annotations
+from looktwice.clients.wire.label import LabelRequest as LabelRequest
+from looktwice.clients.wire.label import LabelResponse as LabelResponse
+from looktwice.clients.wire.label import PlanOutcome as PlanOutcome
+from looktwice.clients.wire.label import Seconds as Seconds
+from looktwice.clients.wire.label import TeacherName as TeacherName
+from looktwice.clients.wire.models import LoadRequest as LoadRequest
+from looktwice.clients.wire.models import ModelCard as ModelCard
+from looktwice.clients.wire.models import ModelList as ModelList
+from looktwice.clients.wire.models import NamedModel as NamedModel
+from looktwice.clients.wire.plan import MAX_BATCH as MAX_BATCH
+from looktwice.clients.wire.plan import MAX_FEEDBACK_CHARACTERS as MAX_FEEDBACK_CHARACTERS
+from looktwice.clients.wire.plan import Attempt as Attempt
+from looktwice.clients.wire.plan import BatchRequest as BatchRequest
+from looktwice.clients.wire.plan import BatchResponse as BatchResponse
+from looktwice.clients.wire.plan import BatchResult as BatchResult
+from looktwice.clients.wire.plan import Branch as Branch
+from looktwice.clients.wire.plan import Cut as Cut
+from looktwice.clients.wire.plan import Deadline as Deadline
+from looktwice.clients.wire.plan import Draw as Draw
+from looktwice.clients.wire.plan import Logprobs as Logprobs
+from looktwice.clients.wire.plan import Plan as Plan
+from looktwice.clients.wire.plan import PlanRequest as PlanRequest
+from looktwice.clients.wire.plan import PlanResponse as PlanResponse
+from looktwice.clients.wire.plan import Section as Section
+from looktwice.clients.wire.plan import Timing as Timing
+from looktwice.clients.wire.problem import Fault as Fault
+from looktwice.clients.wire.problem import Problem as Problem
+from looktwice.clients.wire.reflect import Group as Group
+from looktwice.clients.wire.reflect import PlanChange as PlanChange
+from looktwice.clients.wire.reflect import Reflection as Reflection
+from looktwice.clients.wire.reflect import ReflectRequest as ReflectRequest
+from looktwice.clients.wire.reflect import ReflectResponse as ReflectResponse
+from looktwice.clients.wire.scene import Clip as Clip
+from looktwice.clients.wire.scene import Image as Image
+from looktwice.clients.wire.scene import Scene as Scene
+from looktwice.clients.wire.scene import Track as Track
+from looktwice.clients.wire.scenes import Agent as Agent
+from looktwice.clients.wire.scenes import LabelledScene as LabelledScene
+from looktwice.clients.wire.scenes import NextImage as NextImage
+from looktwice.clients.wire.scenes import SceneEntry as SceneEntry
+from looktwice.clients.wire.scenes import SceneFile as SceneFile
+from looktwice.clients.wire.scenes import SceneList as SceneList
