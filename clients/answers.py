@@ -14,7 +14,8 @@ import httpx
 from pydantic import BaseModel, JsonValue, ValidationError
 
 from looktwice.clients import wire
-from looktwice.model.driving.plan import Plan, PlanError, parse_plan
+from looktwice.clients.wire_values import plan_of_tracks
+from looktwice.model.driving.plan import Plan, PlanError
 from looktwice.model.driving.trajectory import (
     TEN_HZ_S,
     FloatArray,
@@ -280,7 +281,7 @@ def reflect_result(response: httpx.Response) -> ReflectResult:
 def reflected(answered: wire.ReflectResponse, response: httpx.Response) -> ReflectResult:
     """The typed result of what was ``answered`` in ``response``; raises `BadAnswer`."""
     with _contract(response):
-        plan = parse_plan(answered.plan.text)
+        plan = plan_of_tracks(answered.plan.tracks)
         draws = tuple(_looked_at(draw) for draw in answered.draws)
     probability, deadline = answered.think_probability, answered.deadline
     return ReflectResult(
@@ -304,13 +305,17 @@ def _times_s(draw: wire.Draw | wire.Reflection) -> tuple[float, ...]:
     return tuple(draw.times_s)
 
 
+def _plan(told: wire.Plan | None) -> Plan | None:
+    return None if told is None else plan_of_tracks(told.tracks)
+
+
 def _looked_at(draw: wire.Reflection) -> LookedAt:
     times_s = _times_s(draw)
     return LookedAt(
         index=draw.index,
         decision=draw.decision,
         thinking=draw.thinking,
-        revised_plan=None if draw.revised_plan is None else parse_plan(draw.revised_plan.text),
+        revised_plan=_plan(draw.revised_plan),
         plan_iou=draw.plan_iou,
         changes=tuple(draw.changes),
         trajectory=check_trajectory(draw.trajectory, times_s),
@@ -327,11 +332,11 @@ def _draw(draw: wire.Draw) -> PlannedDraw:
     times_s = _times_s(draw)
     return PlannedDraw(
         index=draw.index,
-        plan=None if draw.plan is None else parse_plan(draw.plan.text),
+        plan=_plan(draw.plan),
         branch=draw.branch,
         think_probability=draw.think_probability,
         thinking=draw.thinking,
-        revised_plan=None if draw.revised_plan is None else parse_plan(draw.revised_plan.text),
+        revised_plan=_plan(draw.revised_plan),
         trajectory=check_trajectory(draw.trajectory, times_s),
         times_s=times_s,
         draft_trajectory=None

@@ -1,4 +1,4 @@
-"""Scenes and what is known about them, as `looktwice.clients.wire` carries them."""
+"""Scenes, what is known about them, and plans, as `looktwice.clients.wire` carries them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from looktwice.clients import wire
+from looktwice.model.driving.plan import GROUPS, TICKS, MetaAction, Plan, PlanError
 from looktwice.model.driving.scene import Agent, Scene, Track
 
 
@@ -46,6 +47,30 @@ def wire_tracks(tracks: Sequence[Track], decimals: int | None = None) -> list[wi
     ]
 
 
+def wire_plan(plan: Plan) -> wire.Plan:
+    """A plan, in both its forms."""
+    tracks = {
+        group: [
+            wire.MetaAction(start_s=action.start / 10, end_s=action.end / 10, word=action.word)
+            for action in track
+        ]
+        for group, track in plan.tracks()
+    }
+    return wire.Plan(text=str(plan), tracks=wire.Tracks(**tracks))
+
+
+def plan_of_tracks(tracks: wire.Tracks) -> Plan:
+    """The plan that ``tracks`` tell; raises `PlanError`."""
+    told = {
+        group: tuple(MetaAction(_tick(action.start_s), _tick(action.end_s), action.word) for action in track)
+        for group in GROUPS
+        if (track := getattr(tracks, group)) is not None
+    }
+    if not told:
+        raise PlanError("the plan has no tracks")
+    return Plan(**told)
+
+
 def with_pictures(document: Any, change: Callable[[Any], Any]) -> Any:
     """A request's document with ``change`` made to every picture; what is no picture is as it was."""
     if isinstance(document, dict):
@@ -78,3 +103,10 @@ def rows(array: npt.NDArray[np.floating], decimals: int | None = None) -> list[l
     """A table of numbers as lists."""
     values = array.astype(float)
     return cast("list[list[float]]", (values if decimals is None else values.round(decimals)).tolist())
+
+
+def _tick(seconds: float) -> int:
+    tick = round(10 * seconds) if abs(seconds) <= 10 * TICKS else -1
+    if abs(10 * seconds - tick) > 1e-6:
+        raise PlanError(f"{seconds} s is not on the 0.1 s grid")
+    return tick

@@ -8,6 +8,7 @@ from typing import Final, get_args
 import numpy as np
 
 import looktwice.clients.wire as wire
+from looktwice.clients.wire_values import wire_plan
 from looktwice.model.driving.agreement import Agreement
 from looktwice.model.driving.plan import Plan, plan_changes, plan_iou
 from looktwice.model.driving.trajectory import TEN_HZ_S, agreed
@@ -69,18 +70,6 @@ def model_card(card: ModelCard) -> wire.ModelCard:
         inputs=list(card.inputs),
         details=dict(card.details),
     )
-
-
-def wire_plan(plan: Plan) -> wire.Plan:
-    """A plan for the wire."""
-    tracks = {
-        group: [
-            wire.MetaAction(start_s=action.start / 10, end_s=action.end / 10, word=action.word)
-            for action in track
-        ]
-        for group, track in plan.tracks()
-    }
-    return wire.Plan(text=str(plan), tracks=wire.Tracks(**tracks))
 
 
 def wire_branch(*, looked_twice: bool) -> wire.Branch:

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import looktwice.clients.wire as wire
+from looktwice.clients.wire_values import wire_plan
 from looktwice.model.driving.plan import Plan
 from looktwice.model.engines.engine import DraftFinished, SectionFinished, TextWritten
 from looktwice.model.families.family import Family
 from looktwice.model.families.registry import family_named
 from looktwice.model.formats.pieces import Values
-from looktwice.service.planning.answers import (
-    wire_branch,
-    wire_plan,
-    wire_sections,
-    wire_times,
-    wire_trajectory,
-)
+from looktwice.service.planning.answers import wire_branch, wire_sections, wire_times, wire_trajectory
 from looktwice.service.planning.events import Judged, SceneEvent
 
 Written = (

@@ -11,9 +11,10 @@ from typing import Final
 import numpy as np
 
 import looktwice.clients.wire as wire
+from looktwice.clients.wire_values import plan_of_tracks
 from looktwice.model.driving.images import ImageError, check_image
 from looktwice.model.driving.next_view import Motion
-from looktwice.model.driving.plan import GROUPS, TICKS, MetaAction, Plan, PlanError, parse_plan
+from looktwice.model.driving.plan import Plan, PlanError, parse_plan
 from looktwice.model.driving.scene import Clip, Scene, SceneError, Track
 from looktwice.model.driving.trajectory import (
     TEN_HZ_S,
@@ -254,24 +255,6 @@ def _controls(asked: wire.ReflectControls, prefill: Plan | None) -> Controls:
 def plan_of(asked: wire.PlanGiven, pointer: str) -> Plan:
     """A given plan; raises `ProblemError` where it breaks the plan language."""
     try:
-        return parse_plan(asked) if isinstance(asked, str) else _plan_of_tracks(asked)
+        return parse_plan(asked) if isinstance(asked, str) else plan_of_tracks(asked)
     except PlanError as error:
         raise at(INVALID_PLAN, pointer, str(error), error.line, error.column) from None
-
-
-def _plan_of_tracks(asked: wire.Tracks) -> Plan:
-    tracks = {
-        group: tuple(MetaAction(_tick(action.start_s), _tick(action.end_s), action.word) for action in track)
-        for group in GROUPS
-        if (track := getattr(asked, group)) is not None
-    }
-    if not tracks:
-        raise PlanError("the plan has no tracks")
-    return Plan(**tracks)
-
-
-def _tick(seconds: float) -> int:
-    tick = round(10 * seconds) if abs(seconds) <= 10 * TICKS else -1
-    if abs(10 * seconds - tick) > 1e-6:
-        raise PlanError(f"{seconds} s is not on the 0.1 s grid")
-    return tick

@@ -4,13 +4,15 @@ import json
 from typing import Any, get_args
 
 import pytest
+from hypothesis import given
 from pydantic import ValidationError
 
 from looktwice.clients import wire
-from looktwice.clients.wire_values import wire_tracks
+from looktwice.clients.wire_values import plan_of_tracks, wire_plan, wire_tracks
 from looktwice.model.driving import plan, scene, tracks, trajectory
 from looktwice.model.engines import engine
 from looktwice.model.families.cf_vla import CF_VLA
+from tests.model.driving.test_plan import plans
 from tests.service.serving import body
 
 
@@ -43,6 +45,12 @@ def test_shapes_are_those_of_the_model() -> None:
 def test_a_request_survives_json() -> None:
     asked = wire.PlanRequest.model_validate(body())
     assert wire.PlanRequest.model_validate_json(asked.model_dump_json()) == asked
+
+
+@given(plans())
+def test_a_plan_survives_in_both_its_forms(told: plan.Plan) -> None:
+    sent = wire.Plan.model_validate_json(wire_plan(told).model_dump_json())
+    assert plan_of_tracks(sent.tracks) == plan.parse_plan(sent.text) == told
 
 
 def change(document: dict[str, Any], *path: Any, to: Any) -> dict[str, Any]:
