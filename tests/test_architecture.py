@@ -98,7 +98,7 @@ ALLOWED = {
     ),
     "service/teaching": (
         *("service/teaching", "service/planning", "service/scoring", "service/operations"),
-        *("service/problems", *WIRE, "clients/labelling/teachers", "clients/labelling/retries"),
+        *("service/problems", *WIRE, "clients/labelling/teachers", "clients/retries"),
         "model/driving",
     ),
     "service/routes": (

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from looktwice.clients.labelling.retries import TryLater
+from looktwice.clients.retries import TryLater
 
 
 class ConcurrencyLimit:

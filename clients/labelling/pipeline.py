@@ -10,7 +10,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from looktwice.clients.labelling.concurrency import ConcurrencyLimit
 from looktwice.clients.labelling.ledger import Ledger, Record, Run
-from looktwice.clients.labelling.retries import TryLater, with_retries
+from looktwice.clients.retries import TryLater, with_retries
 
 _Subject = TypeVar("_Subject")
 

@@ -22,8 +22,8 @@ from looktwice.clients.answers import (
 )
 from looktwice.clients.labelling.ledger import Record, Run
 from looktwice.clients.labelling.pipeline import CannotBeDone, Job, StageStopped
-from looktwice.clients.labelling.retries import TryLater
 from looktwice.clients.planner import AsyncPlannerClient, RetryPolicy
+from looktwice.clients.retries import TryLater
 from looktwice.model.driving.hashing import hash_of, scene_hash
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.metrics import displacement_errors

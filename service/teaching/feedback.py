@@ -6,9 +6,9 @@ import asyncio
 from typing import Final
 
 import looktwice.clients.wire_feedback as wire_feedback
-from looktwice.clients.labelling.retries import with_retries
 from looktwice.clients.labelling.teachers.feedback import FeedbackQuestion, FeedbackTeacher, ask_feedback
 from looktwice.clients.labelling.teachers.teacher import ReflectionRefused
+from looktwice.clients.retries import with_retries
 from looktwice.clients.wire import TeacherName
 from looktwice.model.driving.pdm.feedback import Feedback
 from looktwice.service.operations.metrics import Metrics

@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 
 import looktwice.clients.wire as wire
-from looktwice.clients.labelling.retries import with_retries
 from looktwice.clients.labelling.teachers.teacher import (
     AnnotationsMissing,
     NothingInView,
@@ -17,6 +16,7 @@ from looktwice.clients.labelling.teachers.teacher import (
     Teacher,
     ask,
 )
+from looktwice.clients.retries import with_retries
 from looktwice.model.driving.outcome import Outcome
 from looktwice.model.driving.scene import AGENT_KINDS, Agent, SceneError
 from looktwice.model.driving.tracks import track_of

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
 from looktwice.clients.labelling.checks import FailedCheck, check_reflection
-from looktwice.clients.labelling.retries import TryLater
+from looktwice.clients.retries import TryLater
 from looktwice.model.driving.outcome import Outcome
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import Scene

@@ -9,7 +9,7 @@ import pytest
 from looktwice.clients.labelling.concurrency import ConcurrencyLimit
 from looktwice.clients.labelling.ledger import Ledger, Record
 from looktwice.clients.labelling.pipeline import CannotBeDone, Job, Limits, StageStopped, Tally, work_through
-from looktwice.clients.labelling.retries import TryLater
+from looktwice.clients.retries import TryLater
 
 
 def jobs(count: int, first: int = 0) -> Iterator[Job[int]]:

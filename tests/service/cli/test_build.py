@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from looktwice.clients.labelling.ledger import Run
-from looktwice.clients.labelling.retries import TryLater, with_retries
+from looktwice.clients.retries import TryLater, with_retries
 from looktwice.model.bundled import CHECKPOINT, SCENES
 from looktwice.model.driving.phrases import agrees, read_facts
 from looktwice.model.driving.reflection_store import read_reflections, write_reflections

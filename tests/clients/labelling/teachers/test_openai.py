@@ -16,7 +16,6 @@ from starlette.responses import StreamingResponse
 from starlette.types import ASGIApp
 
 from looktwice.clients.labelling.checks import FailedCheck, check_reflection
-from looktwice.clients.labelling.retries import with_retries
 from looktwice.clients.labelling.teachers.facts import phrases_of
 from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
 from looktwice.clients.labelling.teachers.teacher import (
@@ -27,6 +26,7 @@ from looktwice.clients.labelling.teachers.teacher import (
     TeacherError,
     ask,
 )
+from looktwice.clients.retries import with_retries
 from looktwice.model.driving.phrases import HEADS, Facts, head_of
 from tests.clients.labelling.builds import GOOD, LEAKING, ChatServer, completion
 from tests.model.driving.strategies import facts
