@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal, get_args
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +24,6 @@ from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryErr
 Array = npt.NDArray[np.float64]
 Longitudinal = Literal["accelerate", "decelerate", "maintain", "stop"]
 Lateral = Literal["keep", "turn left", "turn right", "change left", "change right"]
-LONGITUDINAL: Final[tuple[Longitudinal, ...]] = get_args(Longitudinal)
-LATERAL: Final[tuple[Lateral, ...]] = get_args(Lateral)
 
 STEP_S: Final = 0.5
 HORIZON_S: Final = 4.0
@@ -93,11 +91,6 @@ def action_of(
     poses = _poses(trajectory, times_s)
     way = graph.way_along(poses[:, :2])
     return None if way is None else HighLevelAction(_longitudinal(poses), _lateral(poses, way))
-
-
-def longitudinal_of(trajectory: FloatArray, times_s: Sequence[float] = TEN_HZ_S) -> Longitudinal:
-    """The state of speed of a trajectory [t, 4]; raises as `action_of` does."""
-    return _longitudinal(_poses(trajectory, times_s))
 
 
 def accuracy(pairs: Iterable[tuple[HighLevelAction, HighLevelAction]]) -> HighLevelAccuracy:

@@ -6,14 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from looktwice.model.driving.high_level import (
-    LATERAL,
-    LONGITUDINAL,
     HighLevelAction,
     Lateral,
     Longitudinal,
     accuracy,
     action_of,
-    longitudinal_of,
 )
 from looktwice.model.driving.lane_graph import LaneGraph
 from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, at_times
@@ -23,7 +20,7 @@ from tests.model.driving.roads import arc, flipped, junction, straight
 AHEAD: Array = np.maximum(MIDDLES_S, 0)
 HALF_SECONDS = tuple(0.5 * step for step in range(1, 9))
 THREE_LANES = (straight(3.5), straight(0.0), straight(-3.5))
-ACTIONS = st.builds(HighLevelAction, st.sampled_from(LONGITUDINAL), st.sampled_from(LATERAL))
+ACTIONS = st.builds(HighLevelAction)
 
 
 def sideways(left_m: float, *, within_s: float = 3.5) -> FloatArray:
@@ -62,12 +59,15 @@ def bent(turned_rad: float, begins_m: float = 10.0) -> FloatArray:
 )
 def test_speed_is_one_of_four_states(speed: Array, state: Longitudinal) -> None:
     future, _ = drive(speed)
-    assert longitudinal_of(future) == state
-    # Eight poses say as much as 64.
+    # Eight poses say as much as 64, and so they do as a model writes them.
     eight = at_times(future, TEN_HZ_S, HALF_SECONDS)
-    assert longitudinal_of(eight, HALF_SECONDS) == state
-    # And so they do as a model writes them.
-    assert longitudinal_of(np.round(eight, 1), HALF_SECONDS) == state
+    road = LaneGraph(THREE_LANES)
+    for told in (
+        action_of(future, road),
+        action_of(eight, road, HALF_SECONDS),
+        action_of(np.round(eight, 1), road, HALF_SECONDS),
+    ):
+        assert told == HighLevelAction(state, "keep")
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_off_all_lanes_nothing_is_told() -> None:
 
 def test_a_short_trajectory_is_refused() -> None:
     with pytest.raises(GeometryError, match="must reach 4 s to be judged, it ends at 3 s"):
-        longitudinal_of(np.zeros((3, 4), np.float32), (1.0, 2.0, 3.0))
+        action_of(np.zeros((3, 4), np.float32), LaneGraph(THREE_LANES), (1.0, 2.0, 3.0))
 
 
 def test_accuracy_counts_both_dimensions() -> None:
