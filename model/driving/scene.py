@@ -8,24 +8,17 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from looktwice.model.driving.agents import (
-    AGENT_KINDS,
-    LIGHTS,
-    TRACK_STEPS,
-    Agent,
-    AgentKind,
-    Light,
-    SceneError,
-)
+from looktwice.model.driving.agents import AGENT_KINDS as AGENT_KINDS
+from looktwice.model.driving.agents import LIGHTS as LIGHTS
+from looktwice.model.driving.agents import TRACK_STEPS as TRACK_STEPS
+from looktwice.model.driving.agents import Agent as Agent
+from looktwice.model.driving.agents import AgentKind as AgentKind
+from looktwice.model.driving.agents import Light as Light
+from looktwice.model.driving.agents import SceneError as SceneError
 from looktwice.model.driving.lane_map import LaneMap
-from looktwice.model.driving.tracks import Track, check_tracks, tracks_of
-from looktwice.model.driving.trajectory import (
-    FloatArray,
-    GeometryError,
-    check_history,
-    check_route,
-    check_trajectory,
-)
+from looktwice.model.driving.tracks import Track as Track
+from looktwice.model.driving.tracks import check_tracks, tracks_of
+from looktwice.model.driving.trajectory import FloatArray, check_history, check_route, check_trajectory
 
 FRONT_WIDE: Final = "front_wide_120"
 FRONT_TELE: Final = "front_tele_30"
@@ -42,8 +35,6 @@ CAMERAS: Final = (
 """Known cameras: the two of CF-VLA, then the six surround cameras of VLA-World."""
 CLIP_FRAMES: Final = 4
 CLIP_PERIOD_S: Final = 0.5
-NEXT_FRAME_S: Final = CLIP_PERIOD_S
-"""How long after the scene its next frames are taken."""
 
 Tag = Literal["lead_vehicle", "cut_in", "pedestrian", "lane_change", "turn", "hard_brake"]
 TAGS: Final[tuple[Tag, ...]] = (
@@ -92,7 +83,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class NextFrame:
-    """One encoded picture (JPEG, PNG or WebP): what a camera saw `NEXT_FRAME_S` after the scene."""
+    """One encoded picture (JPEG, PNG or WebP): what a camera saw `CLIP_PERIOD_S` after the scene."""
 
     camera: str
     image: bytes = field(repr=False)
@@ -260,35 +251,3 @@ def split_of_seed(seed: int) -> Literal["train", "validation", "test"]:
     if seed < 500_000:
         return "train"
     return "validation" if seed < 600_000 else "test"
-
-
-__all__ = [
-    "AGENT_KINDS",
-    "CAMERAS",
-    "CLIP_FRAMES",
-    "CLIP_PERIOD_S",
-    "EGO_LENGTH_M",
-    "EGO_WIDTH_M",
-    "FRONT_TELE",
-    "FRONT_WIDE",
-    "LIGHTS",
-    "NEXT_FRAME_S",
-    "SEMANTIC_CLASSES",
-    "TAGS",
-    "TRACK_STEPS",
-    "Agent",
-    "AgentKind",
-    "Clip",
-    "DenseTarget",
-    "GeometryError",
-    "LabelledScene",
-    "LaneTrace",
-    "Light",
-    "NextFrame",
-    "Scene",
-    "SceneError",
-    "Tag",
-    "Track",
-    "mirrored_camera",
-    "split_of_seed",
-]
