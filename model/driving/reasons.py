@@ -17,8 +17,6 @@ from looktwice.model.driving.claims import CLEAR_WITHIN_M
 from looktwice.model.driving.direction import CHANGES, Change
 from looktwice.model.driving.facts import FACTS, ROAD_DISTANCES_M, ROAD_SCALE_M, SPEED_SCALE_MS
 from looktwice.model.driving.phrases import (
-    FARTHEST_M,
-    STEP_M,
     Bend,
     Clear,
     Consequence,
@@ -29,7 +27,7 @@ from looktwice.model.driving.phrases import (
     Straight,
     Thing,
 )
-from looktwice.model.driving.seen import LANES, SLOWER_BY_MS, STANDING_MS, is_clear, spot_of, state_of
+from looktwice.model.driving.seen import LANES, SLOWER_BY_MS, STANDING_MS, is_clear, spot_of, state_of, told_m
 from looktwice.model.driving.tracks import Track
 from looktwice.model.driving.trajectory import FloatArray, present_speed
 from looktwice.model.driving.view import Place, Sight, View, bend_of, view_along
@@ -194,16 +192,11 @@ def _holds_up(sight: Sight, view: View) -> bool:
 
 
 def _thing(sight: Sight, view: View) -> Thing:
-    return Thing(sight.kind, spot_of(sight), _grid(sight.ahead_m), state_of(sight, view))
+    return Thing(sight.kind, spot_of(sight), told_m(sight.ahead_m), state_of(sight, view))
 
 
 def _bend(side: Side, view: View) -> Bend:
-    return Bend(side, _grid(view.bend_m) or None)
-
-
-def _grid(metres: float) -> int:
-    """A distance as one can estimate it."""
-    return min(FARTHEST_M, STEP_M * round(metres / STEP_M))
+    return Bend(side, told_m(view.bend_m) or None)
 
 
 def _road(told: Mapping[str, float]) -> Array:

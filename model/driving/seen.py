@@ -7,6 +7,8 @@ from typing import Final
 
 from looktwice.model.driving.claims import CLEAR_WITHIN_M, is_near
 from looktwice.model.driving.phrases import (
+    FARTHEST_M,
+    STEP_M,
     Bend,
     Clear,
     Cue,
@@ -66,6 +68,11 @@ def comes(sight: Sight) -> bool:
 def is_clear(view: View, place: Place) -> bool:
     """Whether nobody is to be seen near in a lane."""
     return not any(sight.place == place and sight.ahead_m < CLEAR_WITHIN_M for sight in view.sights)
+
+
+def told_m(metres: float) -> int:
+    """A distance as one can estimate it, in steps of `STEP_M`."""
+    return min(FARTHEST_M, STEP_M * round(metres / STEP_M))
 
 
 def spot_of(sight: Sight) -> Spot:
