@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,8 +22,8 @@ _TURNS: Final = ("Left Turn", "Right Turn")
 _ENDED_BADLY: Final = ("collision", "off_road")
 
 
-def scene_stats(path: Path, limit: int | None = None) -> dict[str, Any]:
-    """Count what the scenes of a file or folder hold; ``limit`` looks at the first ones only.
+def scene_stats(path: Path) -> dict[str, Any]:
+    """Count what the scenes of a file or folder hold.
 
     ``tags`` and ``meta_actions`` count scenes, shares are of scenes, ``meta_action_time`` is the share of the
     seconds that plans cover.
@@ -35,7 +34,7 @@ def scene_stats(path: Path, limit: int | None = None) -> dict[str, Any]:
     episodes: set[str] = set()
     collisions = off_road = near = turning = scenes = stationary = 0
     speeds, accelerations, jerks = [], [], []
-    for labelled in islice(read_scenes(path, dense=False), limit):
+    for labelled in read_scenes(path, dense=False):
         scenes += 1
         episodes.add(labelled.episode_id)
         tags.update(labelled.tags)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Final
 
@@ -35,16 +35,10 @@ class Lifecycle:
     Args:
         engine: not yet started.
         metrics: where it shows what it does.
-        sleep: waits so many seconds between attempts to start.
     """
 
-    def __init__(
-        self,
-        engine: Engine,
-        metrics: Metrics,
-        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
-    ) -> None:
-        self._engine, self._metrics, self._sleep = engine, metrics, sleep
+    def __init__(self, engine: Engine, metrics: Metrics) -> None:
+        self._engine, self._metrics = engine, metrics
         self._keeping: asyncio.Task[None] | None = None
         self._retiring: set[asyncio.Task[None]] = set()
         self._users: dict[int, int] = {}
@@ -222,7 +216,7 @@ class Lifecycle:
                 log.error("engine broke", reason=str(error), ready=self._ready, exc_info=error)
             self._set_ready(False)
             await engine.stop()
-            await self._sleep(wait_s)
+            await asyncio.sleep(wait_s)
             wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
             self._metrics.engine_restarted()
 
