@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import structlog
+from fastapi import Request
 
 from looktwice.clients.labelling.teachers.teacher import Teacher
 from looktwice.clients.wire import Problem
 from looktwice.model.engines.engine import Engine
 from looktwice.service.admission.places import Admission, full_as_problem
 from looktwice.service.http.errors import problem_document
-from looktwice.service.http.idempotency import Idempotency
+from looktwice.service.http.idempotency import Idempotency, made_before
 from looktwice.service.operations.lifecycle import Lifecycle
 from looktwice.service.operations.metrics import Metrics
 from looktwice.service.operations.pulse import Pulse
@@ -51,6 +52,11 @@ class Dependencies:
         self.lifecycle.check_accepting()
         with full_as_problem():
             admission.check_open()
+
+    def check_planning(self, request: Request, *, batch: bool = False) -> None:
+        """The same for plans; a request whose answer was made before needs no place."""
+        if not made_before(request, self.idempotency):
+            self.planning.check_open(batch=batch)
 
     def problem_within(self, error: Exception, request_id: str) -> Problem:
         """What ended one scene of a batch, counted; the others go on. To be called while it is handled."""

@@ -15,7 +15,7 @@ from starlette.responses import Response
 import looktwice.clients.wire as wire
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
 from looktwice.service.http.errors import validated
-from looktwice.service.http.idempotency import IdempotencyKey, NotCached, made_before, once, refuse_key
+from looktwice.service.http.idempotency import IdempotencyKey, NotCached, once, refuse_key
 from looktwice.service.http.openapi import PACKED, answers_and_stream, payloads, problems
 from looktwice.service.http.payloads import payload_route, respond
 from looktwice.service.planning.answers import plan_answer, reflect_answer
@@ -78,13 +78,9 @@ REFUSALS = (
 
 def plan_router(deps: Dependencies) -> APIRouter:
     """The endpoints that the engine works for."""
-
-    def check_open(request: Request, *, batch: bool = False) -> None:
-        if not made_before(request, deps.idempotency):
-            deps.planning.check_open(batch=batch)
-
-    router = APIRouter(route_class=payload_route(check_open), tags=["planning"])
-    batches = APIRouter(route_class=payload_route(partial(check_open, batch=True)), tags=["planning"])
+    router = APIRouter(route_class=payload_route(deps.check_planning), tags=["planning"])
+    check_batch = partial(deps.check_planning, batch=True)
+    batches = APIRouter(route_class=payload_route(check_batch), tags=["planning"])
     refusals = problems(*REFUSALS)
 
     @router.post(

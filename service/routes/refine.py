@@ -12,7 +12,7 @@ from starlette.responses import Response
 import looktwice.clients.wire_refine as wire_refine
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
 from looktwice.service.http.callers import while_connected
-from looktwice.service.http.idempotency import IdempotencyKey, made_before, once, refuse_key
+from looktwice.service.http.idempotency import IdempotencyKey, once, refuse_key
 from looktwice.service.http.openapi import answers_and_stream, payloads, problems
 from looktwice.service.http.payloads import payload_route, respond
 from looktwice.service.planning.events import Planned
@@ -34,12 +34,7 @@ EXAMPLES: Final[dict[str, Example]] = {
 
 def refine_router(deps: Dependencies) -> APIRouter:
     """The endpoint; refinements take places as draws of /v1/plan do."""
-
-    def check_open(request: Request) -> None:
-        if not made_before(request, deps.idempotency):
-            deps.planning.check_open()
-
-    router = APIRouter(route_class=payload_route(check_open), tags=["planning"])
+    router = APIRouter(route_class=payload_route(deps.check_planning), tags=["planning"])
     refusals = problems(*REFUSALS, INVALID_TRAJECTORY, INVALID_FEEDBACK, NEEDS_TRACKS)
 
     @router.post(
