@@ -16,6 +16,7 @@ import time
 from collections.abc import AsyncGenerator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from types import TracebackType
 from typing import Self, TypedDict, TypeVar
 
@@ -153,7 +154,7 @@ class PlannerClient:
         transport: httpx.BaseTransport | None = None,
         access: Access = Access(),
     ) -> None:
-        self._retries, self._packed = retries, access.packed
+        self._retries, self._body = retries, partial(_body, packed=access.packed)
         self._http = httpx.Client(
             base_url=base_url, timeout=retries.timeout_s, transport=transport, headers=_headers(access)
         )
@@ -336,9 +337,6 @@ class PlannerClient:
                 if (data := tell(event, response)) is not None:
                     yield event.event, data
 
-    def _body(self, asked: BaseModel, request_id: str | None = None) -> _Body:
-        return _body(asked, request_id, packed=self._packed)
-
     def _send(self, request: httpx.Request, deadline_ms: int | None = None) -> httpx.Response:
         attempts = _Attempts(self._retries, deadline_ms)
         while True:
@@ -360,7 +358,7 @@ class AsyncPlannerClient:
         transport: httpx.AsyncBaseTransport | None = None,
         access: Access = Access(),
     ) -> None:
-        self._retries, self._packed = retries, access.packed
+        self._retries, self._body = retries, partial(_body, packed=access.packed)
         self._http = httpx.AsyncClient(
             base_url=base_url, timeout=retries.timeout_s, transport=transport, headers=_headers(access)
         )
@@ -482,9 +480,6 @@ class AsyncPlannerClient:
                     if (data := tell(event, response)) is not None:
                         yield event.event, data
 
-    def _body(self, asked: BaseModel, request_id: str | None = None) -> _Body:
-        return _body(asked, request_id, packed=self._packed)
-
     async def _send(self, request: httpx.Request, deadline_ms: int | None = None) -> httpx.Response:
         attempts = _Attempts(self._retries, deadline_ms)
         while True:
@@ -520,7 +515,7 @@ class _Body(TypedDict):
     headers: dict[str, str]
 
 
-def _body(asked: BaseModel, request_id: str | None, *, packed: bool) -> _Body:
+def _body(asked: BaseModel, request_id: str | None = None, *, packed: bool) -> _Body:
     media_type = wire.MSGPACK_MEDIA_TYPE if packed else "application/json"
     headers = {"Content-Type": media_type}
     if request_id is not None:
