@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from looktwice.clients.metadrive import simulator
 from looktwice.model.driving.cameras import FRONT_CAMERAS, CameraSpec
+from looktwice.model.driving.images import encode_jpeg
 
-JPEG_QUALITY: Final = 85
 NEAR_M: Final = 0.3
 FAR_M: Final = 320.0
 
@@ -107,10 +105,3 @@ class Rig:
         for buffer, _, _ in self._cameras:
             self._engine.removeWindow(buffer)
         self._cameras = []
-
-
-def encode_jpeg(image: npt.NDArray[np.uint8]) -> bytes:
-    """An RGB picture [h, w, 3] as JPEG bytes."""
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, "JPEG", quality=JPEG_QUALITY)
-    return stream.getvalue()
