@@ -34,6 +34,7 @@ from looktwice.clients.metadrive.world.maps import MapError
 from looktwice.model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS
 from looktwice.model.driving.scene import LabelledScene, split_of_seed
 from looktwice.model.driving.scene_store import MANIFEST, SCENE_VERSION, write_scenes
+from looktwice.model.driving.whole_files import written_whole
 
 GENERATOR_VERSION: Final = "1"
 _EPISODES_KEY: Final = "looktwice.episodes"
@@ -236,8 +237,6 @@ def write_block(
     if rig is not None:
         rig.close()
     described = json.dumps([asdict(outcome) for outcome in outcomes])
-    for stale in out_dir.glob(f".{block_file(out_dir, seeds).name}.*.tmp"):
-        stale.unlink(missing_ok=True)
     write_scenes(block_file(out_dir, seeds), scenes, {_EPISODES_KEY: described})
 
 
@@ -299,7 +298,6 @@ def write_manifest(out_dir: Path, config: GenerateConfig) -> dict[str, Any]:
         "seeds": [episode["seed"] for episode in episodes],
         "episodes": episodes,
     }
-    temporary = out_dir / f".{MANIFEST}.tmp"
-    temporary.write_text(json.dumps(manifest, indent=1))
-    temporary.replace(out_dir / MANIFEST)
+    with written_whole(out_dir / MANIFEST) as temporary:
+        temporary.write_text(json.dumps(manifest, indent=1))
     return manifest
