@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 import torch
@@ -252,7 +253,8 @@ class OutcomeLearner(nn.Module):
         told = [place for place, each in enumerate(worth) if bool(each.any())]
         if not told:
             return torch.zeros(()), torch.ones(()), torch.zeros(())
-        batch = collate([with_draws(samples[place], [*draws[place], *refined[place]]) for place in told])
+        rows = [with_draws(samples[place], [*draws[place], *refined[place]]) for place in told]
+        batch = collate(list(chain.from_iterable(rows)))
         made, before = list[list[Decision]](), list[Tensor | None]()
         for place in told:
             for draw in draws[place]:

@@ -263,7 +263,7 @@ NANO: Final[Mapping[str, Recipe]] = (
         "world-rl": replace(
             _OUTCOME,
             name="world-rl",
-            batch_size=8,
+            batch_size=4,  # of 8 responses with hundreds of tokens each: more need over 16 GB
             tasks={"vla_world": 1.0},
             weights=vla_world.WEIGHTS,
             error_weight=0.0,

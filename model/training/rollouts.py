@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -15,9 +16,12 @@ from looktwice.model.network.track_features import track_features
 from looktwice.model.training.batches import Sample
 from looktwice.model.training.targets import Target
 
+_ROW_TOKENS: Final = 1536
+"""Of a prompt and the responses behind it: what attention takes grows with the square of a row."""
 
-def rollout(scene: Scene, format: str, draws: Sequence[Draw], inputs: InputBuilder) -> Sample:
-    """The prompt that an engine read and what it wrote behind it; all tokens weigh 1.
+
+def rollout(scene: Scene, format: str, draws: Sequence[Draw], inputs: InputBuilder) -> list[Sample]:
+    """The prompt that an engine read and what it wrote behind it, see `with_draws`.
 
     `ResponseLearner.log_probabilities` of it are those that the draws tell. It has no expert's future.
 
@@ -41,8 +45,18 @@ def rollout(scene: Scene, format: str, draws: Sequence[Draw], inputs: InputBuild
     return with_draws(prompt, draws)
 
 
-def with_draws(sample: Sample, draws: Sequence[Draw]) -> Sample:
-    """A prompt with what an engine wrote behind it, instead of its own responses; all tokens weigh 1."""
-    empty = np.zeros((len(draws), 0, 0), np.float32)
-    responses = [Target(draw.ids, (1.0,) * len(draw.ids)) for draw in draws]
-    return replace(sample, responses=responses, code_shares=empty, code_errors_m=empty)
+def with_draws(sample: Sample, draws: Sequence[Draw]) -> list[Sample]:
+    """A prompt with what an engine wrote behind it, instead of its own responses; all tokens weigh 1.
+
+    Draws keep their order. Long ones stand behind a prompt of their own.
+    """
+    rows: list[list[Target]] = []
+    left = 0
+    for draw in draws:
+        if not rows or len(draw.ids) > left:
+            rows.append([])
+            left = _ROW_TOKENS - len(sample.prompt)
+        rows[-1].append(Target(draw.ids, (1.0,) * len(draw.ids)))
+        left -= len(draw.ids)
+    empty = np.zeros((0, 0, 0), np.float32)
+    return [replace(sample, responses=row, code_shares=empty, code_errors_m=empty) for row in rows]

@@ -59,7 +59,9 @@ def test_the_learner_computes_what_the_engine_tells(
     asked = [request(f"{scene}", scene, format, n=3, logprobs=True, **controls) for scene in range(2)]
     draws = [drawn(loaded, each) for each in asked]
     samples = [
-        rollout(each.scene, format, some, loaded.inputs) for each, some in zip(asked, draws, strict=True)
+        sample
+        for each, some in zip(asked, draws, strict=True)
+        for sample in rollout(each.scene, format, some, loaded.inputs)
     ]
     start = beginning(loaded, format)
     every = [draw for some in draws for draw in some]
@@ -107,3 +109,17 @@ def test_only_whole_responses_are_replayed(loaded: Loaded) -> None:
         decisions(start, draw.ids[1:])
     with pytest.raises(FormatError, match="complete"):
         decisions(start, (*draw.ids, draw.ids[-1]))
+
+
+def test_long_draws_stand_behind_prompts_of_their_own(loaded: Loaded) -> None:
+    asked = request("a", n=6, logprobs=True, temperature=1.2)
+    draws = drawn(loaded, asked)
+    rows = rollout(asked.scene, "cf_vla", draws, loaded.inputs)
+    repeated = rollout(asked.scene, "cf_vla", 8 * draws, loaded.inputs)
+    assert len(repeated) > len(rows)
+    written = [response.ids for row in repeated for response in row.responses]
+    assert written == 8 * [draw.ids for draw in draws]
+    for row in repeated:
+        assert row.prompt == rows[0].prompt
+        lengths = [len(response.ids) for response in row.responses]
+        assert len(row.prompt) + sum(lengths) <= max(1536, len(row.prompt) + lengths[0])

@@ -279,7 +279,7 @@ def test_decisions_are_as_likely_as_training_says(
     start = CompiledFormat(families["cf_vla"].format, loaded.vocabulary).start()
     replayed = [decisions(start, draw.ids) for draw in draws]
     learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec)
-    batch = collate([rollout(BUNDLED[0], "cf_vla", draws, loaded.inputs)])
+    batch = collate(rollout(BUNDLED[0], "cf_vla", draws, loaded.inputs))
     with torch.no_grad():
         found = learner.log_probabilities(batch, replayed, controls.temperature)
     for draw, made, logprobs in zip(draws, replayed, found, strict=True):
