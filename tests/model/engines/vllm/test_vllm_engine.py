@@ -16,7 +16,7 @@ from looktwice.model.bundled import CHECKPOINT, SCENES
 from looktwice.model.driving.images import ImageError
 from looktwice.model.driving.phrases import read_facts
 from looktwice.model.driving.plan import parse_plan
-from looktwice.model.driving.scene import Clip, Scene
+from looktwice.model.driving.scene import FRONT_WIDE, Clip, Scene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.tracks import Track
 from looktwice.model.engines.engine import (
@@ -298,18 +298,10 @@ def test_new_weights_are_refused(loop: asyncio.AbstractEventLoop, vllm: VllmEngi
         loop.run_until_complete(vllm.load_weights(CHECKPOINT))
 
 
-def test_both_engines_write_the_same_in_a_family_of_ones_own(
-    loop: asyncio.AbstractEventLoop, toy_family: None, tmp_path: Path
-) -> None:
-    """With numbers, repeats, codes of its own, and a branch of another name."""
-    checkpoint = write_untrained(tmp_path / "toy", settings=VlaSettings(name="toy", formats=("toy",)))
-    arguments = {"enforce_eager": True, "block_size": 32}
-    theirs = VllmEngine(checkpoint, VllmSettings(rows=8, dtype="float32", arguments=arguments))
-    requests = [
-        PlanRequest(f"{thinking}-{k}", scene, "toy", Controls(n=1, temperature=0.0, thinking=thinking))
-        for k, scene in enumerate(mixed_scenes(6))
-        for thinking in get_args(Thinking)
-    ]
+def written_by_both(
+    loop: asyncio.AbstractEventLoop, checkpoint: Path, requests: list[PlanRequest]
+) -> tuple[list[Draw], list[Draw]]:
+    """The first draws of requests, by vLLM and by the torch engine over the same checkpoint."""
 
     async def draws(engine: Engine) -> list[Draw]:
         await engine.start()
@@ -318,11 +310,46 @@ def test_both_engines_write_the_same_in_a_family_of_ones_own(
         finally:
             await engine.stop()
 
+    arguments = {"enforce_eager": True, "block_size": 32}
+    theirs = VllmEngine(checkpoint, VllmSettings(rows=8, dtype="float32", arguments=arguments))
     written = loop.run_until_complete(draws(theirs))
     expected = loop.run_until_complete(draws(TorchEngine(checkpoint, TorchSettings(products=None))))
+    return written, expected
+
+
+def test_both_engines_write_the_same_in_a_family_of_ones_own(
+    loop: asyncio.AbstractEventLoop, toy_family: None, tmp_path: Path
+) -> None:
+    """With numbers, repeats, codes of its own, and a branch of another name."""
+    checkpoint = write_untrained(tmp_path / "toy", settings=VlaSettings(name="toy", formats=("toy",)))
+    requests = [
+        PlanRequest(f"{thinking}-{k}", scene, "toy", Controls(n=1, temperature=0.0, thinking=thinking))
+        for k, scene in enumerate(mixed_scenes(6))
+        for thinking in get_args(Thinking)
+    ]
+    written, expected = written_by_both(loop, checkpoint, requests)
     assert [draw.text for draw in written] == [draw.text for draw in expected]
     assert [draw.sections for draw in written] == [draw.sections for draw in expected]
     assert {draw.looked_twice for draw in written} == {True, False}
+
+
+def test_both_engines_imagine_the_same(loop: asyncio.AbstractEventLoop) -> None:
+    controls = [
+        Controls(n=1, temperature=0.0, imagine="always", camera=FRONT_WIDE),
+        Controls(n=1, temperature=0.0, imagine="always", camera="back", thinking="never"),
+        Controls(n=1, temperature=0.0, imagine="never"),
+    ]
+    requests = [
+        PlanRequest(f"{place}-{k}", scene, "vla_world", each)
+        for k, scene in enumerate(BUNDLED[:2])
+        for place, each in enumerate(controls)
+    ]
+    written, expected = written_by_both(loop, CHECKPOINT.parent / "world-nano", requests)
+    pictures = [None if draw.foreseen is None else draw.foreseen.picture for draw in written]
+    assert [picture and picture.camera for picture in pictures] == 2 * [FRONT_WIDE, "back", None]
+    # Of two codes that are as likely within rounding, either may be the likelier one.
+    same = [draw.text == other.text for draw, other in zip(written, expected, strict=True)]
+    assert sum(same) >= len(same) - 1
 
 
 def test_sections_come_before_their_draw(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
