@@ -25,8 +25,8 @@ from PIL import Image
 
 from looktwice.clients.wire import MSGPACK_MEDIA_TYPE
 from looktwice.loadtests.exchange import Call
-from looktwice.loadtests.mix import Kind
-from looktwice.loadtests.sending import Target
+from looktwice.loadtests.mix import RequestKind
+from looktwice.loadtests.sending import ServiceTarget
 from looktwice.model.driving.scene_store import SCENE_VERSION
 
 _DRIP_S: Final = 0.5
@@ -77,7 +77,7 @@ COSTLY: Final = Hostility(costly=8, labelling=4)
 
 
 async def be_hostile(
-    target: Target, bait: Bait, hostility: Hostility, seconds: float
+    target: ServiceTarget, bait: Bait, hostility: Hostility, seconds: float
 ) -> dict[str, dict[str, int]]:
     """Do it for so many seconds; what became of these clients, by kind and by how it ended.
 
@@ -105,7 +105,7 @@ async def be_hostile(
     return ends
 
 
-async def _is_ready(target: Target, seconds: float) -> Counter[str]:
+async def _is_ready(target: ServiceTarget, seconds: float) -> Counter[str]:
     ends = Counter[str]()
     clock = asyncio.get_running_loop().time
     until = clock() + seconds
@@ -120,7 +120,7 @@ async def _is_ready(target: Target, seconds: float) -> Counter[str]:
     return ends
 
 
-async def _leaves(target: Target, call: Call, after_s: float, seconds: float) -> Counter[str]:
+async def _leaves(target: ServiceTarget, call: Call, after_s: float, seconds: float) -> Counter[str]:
     ends = Counter[str]()
     clock = asyncio.get_running_loop().time
     until = clock() + seconds
@@ -139,7 +139,7 @@ async def _leaves(target: Target, call: Call, after_s: float, seconds: float) ->
     return ends
 
 
-async def _asks_much(target: Target, dear: Sequence[Call], first: int, seconds: float) -> Counter[str]:
+async def _asks_much(target: ServiceTarget, dear: Sequence[Call], first: int, seconds: float) -> Counter[str]:
     ends = Counter[str]()
     clock = asyncio.get_running_loop().time
     until, number = clock() + seconds, first
@@ -158,7 +158,7 @@ async def _asks_much(target: Target, dear: Sequence[Call], first: int, seconds: 
     return ends
 
 
-async def _never_reads(target: Target, call: Call, seconds: float) -> Counter[str]:
+async def _never_reads(target: ServiceTarget, call: Call, seconds: float) -> Counter[str]:
     try:
         reader, writer = await _connect(target)
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SMALL_BUFFER)
@@ -169,7 +169,7 @@ async def _never_reads(target: Target, call: Call, seconds: float) -> Counter[st
     return await _ending(reader, writer)
 
 
-async def _sends_slowly(target: Target, call: Call, seconds: float) -> Counter[str]:
+async def _sends_slowly(target: ServiceTarget, call: Call, seconds: float) -> Counter[str]:
     clock = asyncio.get_running_loop().time
     until = clock() + seconds
     try:
@@ -200,7 +200,7 @@ async def _ending(
     return Counter({end: 1})
 
 
-async def _connect(target: Target) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+async def _connect(target: ServiceTarget) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     where = urlsplit(target.url)
     secure = where.scheme == "https"
     # Beyond twice the limit, what is not read stays in the way of the service.
@@ -209,12 +209,12 @@ async def _connect(target: Target) -> tuple[asyncio.StreamReader, asyncio.Stream
     )
 
 
-def _head(target: Target, call: Call, length: int) -> bytes:
+def _head(target: ServiceTarget, call: Call, length: int) -> bytes:
     headers = (("Content-Length", str(length)), *call.headers)
     return _lines(target, f"POST {call.path} HTTP/1.1", headers)
 
 
-def _lines(target: Target, first: str, headers: Sequence[tuple[str, str]] = ()) -> bytes:
+def _lines(target: ServiceTarget, first: str, headers: Sequence[tuple[str, str]] = ()) -> bytes:
     named = (("Host", urlsplit(target.url).netloc), *headers, *target.headers.items())
     lines = [first, *(f"{name}: {value}" for name, value in named)]
     return ("\r\n".join(lines) + "\r\n\r\n").encode()
@@ -320,4 +320,4 @@ def _with_pictures(name: str, document: Any, picture: bytes) -> Call:
 
 
 def _call(path: str, media_type: str, body: bytes) -> Call:
-    return Call(Kind(), path, (("Content-Type", media_type),), body)
+    return Call(RequestKind(), path, (("Content-Type", media_type),), body)

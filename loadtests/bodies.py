@@ -15,7 +15,7 @@ from looktwice.clients import wire
 from looktwice.clients.planner import imagine_request, label_request, plan_request, reflect_request
 from looktwice.clients.wire_imagine import ImagineControls
 from looktwice.loadtests.exchange import Call
-from looktwice.loadtests.mix import BATCH_SCENES, Kind, Mix, Payload, Work
+from looktwice.loadtests.mix import BATCH_SCENES, Mix, Payload, RequestKind, Work
 from looktwice.model.driving.images import media_type
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.plan import Plan, parse_plan
@@ -42,7 +42,7 @@ PROPOSED: Final[Plan] = parse_plan(
 """What reflections and labels are asked about: to go straight on."""
 
 
-def make_calls(scenes: Sequence[LabelledScene], kinds: Sequence[Kind], seed: int) -> list[Call]:
+def make_calls(scenes: Sequence[LabelledScene], kinds: Sequence[RequestKind], seed: int) -> list[Call]:
     """A call of each kind, with pictures that no other one has: no cache of the service helps.
 
     Raises:
@@ -63,7 +63,7 @@ def make_calls(scenes: Sequence[LabelledScene], kinds: Sequence[Kind], seed: int
     ]
 
 
-def make_call(kind: Kind, scenes: Sequence[LabelledScene], seed: int) -> Call:
+def make_call(kind: RequestKind, scenes: Sequence[LabelledScene], seed: int) -> Call:
     """A call of ``kind`` for one scene, or for those of a batch; draws are those of ``seed``."""
     asked = [_asked(kind, labelled, seed) for labelled in scenes]
     document: dict[str, Any] = {"requests": asked} if kind.work == "batch" else asked[0]
@@ -74,7 +74,7 @@ def make_call(kind: Kind, scenes: Sequence[LabelledScene], seed: int) -> Call:
     return Call(kind, PATHS[kind.work], (("Content-Type", media), ("Accept", accept)), body)
 
 
-def _asked(kind: Kind, labelled: LabelledScene, seed: int) -> dict[str, Any]:
+def _asked(kind: RequestKind, labelled: LabelledScene, seed: int) -> dict[str, Any]:
     """The request with its pictures in base64."""
     scene = labelled.scene
     if kind.work == "label":

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from looktwice.clients import wire
 from looktwice.loadtests.mix import Mix
-from looktwice.loadtests.sending import Target
+from looktwice.loadtests.sending import ServiceTarget
 
 _ANSWER_WITHIN_S: Final = 10.0
 
@@ -47,7 +47,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def describe_service(target: Target, mix: Mix) -> dict[str, Any]:
+def describe_service(target: ServiceTarget, mix: Mix) -> dict[str, Any]:
     """The models behind the service.
 
     Raises:
@@ -90,7 +90,7 @@ _RELEASED_WITHIN_S: Final = 30.0
 _PAUSE_S: Final = 0.2
 
 
-def left_behind(target: Target) -> dict[str, float]:
+def left_behind(target: ServiceTarget) -> dict[str, float]:
     """Gauges that do not go back to 0 within half a minute; those that the service has.
 
     Raises:
@@ -104,12 +104,12 @@ def left_behind(target: Target) -> dict[str, float]:
         time.sleep(_PAUSE_S)
 
 
-def lines_lost(target: Target) -> int:
+def lines_lost(target: ServiceTarget) -> int:
     """Lines of the service's log that nobody took; raises `ServiceAway` as `left_behind` does."""
     return int(_samples(target).get(_LOST, 0))
 
 
-def _samples(target: Target) -> dict[str, float]:
+def _samples(target: ServiceTarget) -> dict[str, float]:
     try:
         answer = httpx.get(f"{target.url}/metrics", headers=target.headers, trust_env=False)
         answer.raise_for_status()

@@ -8,7 +8,7 @@ from typing import Final, Literal, get_args
 from pydantic import BaseModel, ValidationError
 
 from looktwice.clients.wire import Deadline
-from looktwice.loadtests.mix import Kind
+from looktwice.loadtests.mix import RequestKind
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Call:
         body: written as the kind's payload says.
     """
 
-    kind: Kind
+    kind: RequestKind
     path: str
     headers: tuple[tuple[str, str], ...]
     body: bytes = field(repr=False)
@@ -72,7 +72,7 @@ class Exchange:
         first_plan_s: when a stream's first plan, or its first picture, was there; None elsewhere.
     """
 
-    kind: Kind
+    kind: RequestKind
     due_s: float
     sent_s: float
     ended_s: float
@@ -124,19 +124,19 @@ class _Imagined(BaseModel):
     pictures: list[_Picture]
 
 
-class _Result(BaseModel):
+class _BatchResult(BaseModel):
     status: int
 
 
 class _Batch(BaseModel):
-    results: list[_Result]
+    results: list[_BatchResult]
 
 
 class _Problem(BaseModel):
     type: str
 
 
-def read_answer(kind: Kind, status: int, content: bytes) -> Verdict:
+def read_answer(kind: RequestKind, status: int, content: bytes) -> Verdict:
     """The verdict on a whole answer: its status and body, or those a stream ended with."""
     if status != 200:
         return refusal(status, content)
@@ -163,7 +163,7 @@ def refusal(status: int, content: bytes) -> Verdict:
     return Verdict("rejected" if status == TOO_MANY_REQUESTS else "failed", name)
 
 
-def _planned(kind: Kind, answer: _Planned) -> Verdict:
+def _planned(kind: RequestKind, answer: _Planned) -> Verdict:
     if len(answer.draws) != kind.n:
         return BAD_ANSWER
     branch: Branch = "think" if any(draw.thinking is not None for draw in answer.draws) else "direct"

@@ -18,13 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from looktwice.loadtests.exchange import MISSED, Call, Exchange
-from looktwice.loadtests.sending import Sender, Target, connected
+from looktwice.loadtests.sending import Sender, ServiceTarget, connected
 
 Times = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Phase:
+class LoadPhase:
     """A stretch of a run.
 
     Attributes:
@@ -56,13 +56,13 @@ class Window:
         return self.end_s - self.start_s
 
 
-def windows(phases: Sequence[Phase]) -> list[Window]:
+def windows(phases: Sequence[LoadPhase]) -> list[Window]:
     """Where each phase lies, one behind the other from 0 on."""
     ends = np.cumsum([phase.seconds for phase in phases]).tolist()
     return [Window(phase.name, end - phase.seconds, end) for phase, end in zip(phases, ends, strict=True)]
 
 
-def poisson_arrivals(phases: Sequence[Phase], seed: int) -> Times:
+def poisson_arrivals(phases: Sequence[LoadPhase], seed: int) -> Times:
     """Seconds from the run's start at which requests are due: float64 [k], ascending.
 
     A Poisson process of a constant rate is a Poisson number of times spread evenly at random.
@@ -118,7 +118,7 @@ class OpenLoop:
 
 
 @dataclass(frozen=True)
-class Planner:
+class PlanningCar:
     """A car that asks for a plan at every tick, unless it still waits for the one before.
 
     Attributes:
@@ -153,7 +153,7 @@ class Planner:
 class Fleet:
     """Planners side by side, for so many seconds."""
 
-    planners: tuple[Planner, ...]
+    planners: tuple[PlanningCar, ...]
     seconds: float
 
     def split(self, parts: int) -> list[Fleet]:
@@ -170,7 +170,9 @@ def fleet(drives: list[list[Call]], hz: float, seconds: float, seed: int) -> Fle
     """Planners at ``hz``, each with its own drive, whose ticks begin at random within the first period."""
     offsets = np.random.default_rng(seed).uniform(0, 1 / hz, len(drives)).tolist()
     return Fleet(
-        tuple(Planner(tuple(calls), 1 / hz, offset) for calls, offset in zip(drives, offsets, strict=True)),
+        tuple(
+            PlanningCar(tuple(calls), 1 / hz, offset) for calls, offset in zip(drives, offsets, strict=True)
+        ),
         seconds,
     )
 
@@ -179,7 +181,7 @@ _HEAD_START_S: Final = 0.2
 """From the last worker's word that it is ready until the run begins."""
 
 
-class WorkerDied(RuntimeError):
+class GeneratorDied(RuntimeError):
     """A process of the generator ended before its load did."""
 
 
@@ -193,7 +195,7 @@ class Crew:
             exchanges = crew.finish()
     """
 
-    def __init__(self, load: Load, target: Target, workers: int) -> None:
+    def __init__(self, load: Load, target: ServiceTarget, workers: int) -> None:
         # Spawned: a fork would copy whatever threads the caller has.
         context = multiprocessing.get_context("spawn")
         self._crew: list[tuple[multiprocessing.process.BaseProcess, Connection[object, object]]] = []
@@ -214,7 +216,7 @@ class Crew:
             pipe.close()
 
     def begin(self) -> float:
-        """Wait until all are ready, start them together, and return when they start; raises `WorkerDied`."""
+        """Wait until all are ready, start them together, return when they start; raises `GeneratorDied`."""
         for _, pipe in self._crew:
             _told(pipe)
         starts_at = time.monotonic() + _HEAD_START_S
@@ -223,7 +225,7 @@ class Crew:
         return starts_at
 
     def finish(self) -> list[Exchange]:
-        """All exchanges, in the order they were due; raises `WorkerDied`."""
+        """All exchanges, in the order they were due; raises `GeneratorDied`."""
         exchanges: list[Exchange] = []
         for _, pipe in self._crew:
             exchanges += _told(pipe)  # type: ignore[arg-type]
@@ -234,7 +236,7 @@ def _told(pipe: Connection[object, object]) -> object:
     try:
         return pipe.recv()
     except EOFError:
-        raise WorkerDied("a worker process of the load generator died; its own output says why") from None
+        raise GeneratorDied("a worker process of the load generator died; its own output says why") from None
 
 
 def _end_with_parent() -> None:
@@ -245,7 +247,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _work(load: Load, target: Target, pipe: Connection[object, object]) -> None:
+def _work(load: Load, target: ServiceTarget, pipe: Connection[object, object]) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     pipe.send("ready")
     starts_at = pipe.recv()
@@ -256,7 +258,7 @@ def _work(load: Load, target: Target, pipe: Connection[object, object]) -> None:
     pipe.send(asyncio.run(run_load(load, target, starts_at)))
 
 
-async def run_load(load: Load, target: Target, starts_at: float) -> list[Exchange]:
+async def run_load(load: Load, target: ServiceTarget, starts_at: float) -> list[Exchange]:
     """Run a load in this process; ``starts_at`` is on `time.monotonic`'s clock."""
     async with connected(target) as http:
         return await load.run(Sender(http, target.timeout_s, starts_at))

@@ -16,7 +16,7 @@ _EDGE: Final = 0.1
 
 
 @dataclass(frozen=True)
-class Reading:
+class MemoryReading:
     """Resident memory at one time, in seconds on the run's clock."""
 
     at_s: float
@@ -48,9 +48,9 @@ class MemoryWatch:
         self._ended.set()
         self._thread.join()
 
-    def readings(self, starts_at: float) -> list[Reading]:
+    def readings(self, starts_at: float) -> list[MemoryReading]:
         """What was read, on the clock of a run that began at ``starts_at`` of `time.monotonic`."""
-        return [Reading(at - starts_at, rss) for at, rss in self._readings]
+        return [MemoryReading(at - starts_at, rss) for at, rss in self._readings]
 
     def _watch(self) -> None:
         while True:
@@ -98,7 +98,7 @@ class Growth:
         }
 
 
-def growth(readings: Sequence[Reading]) -> Growth | None:
+def growth(readings: Sequence[MemoryReading]) -> Growth | None:
     """Growth over ``readings``; None where there are less than two."""
     if len(readings) < 2:
         return None

@@ -20,7 +20,7 @@ _UNHURRIED: Final = ("label", "imagine")
 
 
 @dataclass(frozen=True)
-class Kind:
+class RequestKind:
     """What tells one request from another as far as load goes.
 
     Attributes:
@@ -66,7 +66,7 @@ class Mix:
     """Weights of independent choices; only their proportions count.
 
     Attributes:
-        works, draws, payloads, deadlines_ms: see `Kind`.
+        works, draws, payloads, deadlines_ms: see `RequestKind`.
         stream: share of the requests that can be streamed and are.
     """
 
@@ -80,7 +80,7 @@ class Mix:
         if not 0 <= self.stream <= 1:
             raise ValueError(f"the streamed share is from 0 to 1, not {self.stream}")
 
-    def kinds(self, count: int, seed: int) -> list[Kind]:
+    def kinds(self, count: int, seed: int) -> list[RequestKind]:
         """So many kinds at random, the same for the same seed."""
         random = np.random.default_rng(seed)
         works = _chosen(self.works, count, random)
@@ -89,9 +89,9 @@ class Mix:
         deadlines_ms = _chosen(self.deadlines_ms, count, random)
         streams = random.random(count) < self.stream
         return [
-            Kind("label", 1, payload)
+            RequestKind("label", 1, payload)
             if work == "label"
-            else Kind(
+            else RequestKind(
                 work,
                 n,
                 payload,

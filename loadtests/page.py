@@ -15,7 +15,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullForma
 
 from looktwice.loadtests.accounting import PERCENTILES, Latencies, Summary
 from looktwice.loadtests.exchange import BRANCHES, OUTCOMES, Exchange
-from looktwice.loadtests.report import Report, latency_rows
+from looktwice.loadtests.report import LoadReport, latency_rows
 from looktwice.loadtests.run import Result
 
 _COLOURS: Final = {
@@ -194,7 +194,7 @@ _ENVIRONMENT: Final = Environment(
 )
 
 
-def page(report: Report) -> str:
+def page(report: LoadReport) -> str:
     """The whole HTML document."""
     result = report.result
     overall = result.overall

@@ -11,7 +11,7 @@ from looktwice.loadtests.run import Result, Setup
 
 
 @dataclass(frozen=True)
-class Report:
+class LoadReport:
     """A result with all that it depends on.
 
     Attributes:

@@ -8,9 +8,9 @@ from typing import Any
 
 from looktwice.loadtests.accounting import Summary, faults, summarise
 from looktwice.loadtests.exchange import Exchange
-from looktwice.loadtests.loads import Crew, Load, Phase, Window, windows
+from looktwice.loadtests.loads import Crew, Load, LoadPhase, Window, windows
 from looktwice.loadtests.mix import Mix
-from looktwice.loadtests.sending import Target
+from looktwice.loadtests.sending import ServiceTarget
 from looktwice.model.driving.scene import LabelledScene
 
 WARM_UP = "warm-up"
@@ -35,7 +35,7 @@ class Setup:
         tell: told what is being done.
     """
 
-    target: Target
+    target: ServiceTarget
     scenes: Sequence[LabelledScene] = field(repr=False)
     mix: Mix
     rate_rps: float
@@ -117,7 +117,7 @@ class Ran:
 
 def run(
     load: Load,
-    phases: Sequence[Phase],
+    phases: Sequence[LoadPhase],
     setup: Setup,
     meanwhile: Callable[[float], None] | None = None,
 ) -> Ran:
@@ -139,7 +139,7 @@ def check(summary: Summary, setup: Setup) -> list[str]:
     return faults(summary, setup.lag_limit_s)
 
 
-def needed(phases: Sequence[Phase], setup: Setup) -> int:
+def needed(phases: Sequence[LoadPhase], setup: Setup) -> int:
     """How many distinct calls a run is given."""
     return max(
         1, min(setup.distinct, round(sum(phase.seconds * phase.rate_rps for phase in phases) * 1.1) + 1)

@@ -20,7 +20,7 @@ _FIRST: Final = ("plan", "picture")
 
 
 @dataclass(frozen=True)
-class Target:
+class ServiceTarget:
     """Where requests go.
 
     Attributes:
@@ -103,7 +103,7 @@ def _told(data: str) -> Verdict:
 
 
 @asynccontextmanager
-async def connected(target: Target) -> AsyncIterator[httpx.AsyncClient]:
+async def connected(target: ServiceTarget) -> AsyncIterator[httpx.AsyncClient]:
     """A client that opens as many connections as requests are under way, and goes straight to the service."""
     limits = httpx.Limits(max_connections=None, max_keepalive_connections=None, keepalive_expiry=60)
     async with httpx.AsyncClient(

@@ -32,7 +32,7 @@ from looktwice.service.operations.metrics import Metrics
 from looktwice.service.operations.pulse import Pulse
 from looktwice.service.operations.settings import Settings
 from looktwice.service.operations.traces import Traces, traces_from_environment
-from looktwice.service.planning.submitting import Limits, Planning
+from looktwice.service.planning.submitting import SceneSubmitter, TimeLimits
 from looktwice.service.routes.dependencies import Dependencies
 from looktwice.service.routes.router import make_router
 from looktwice.service.scoring.process import Scorer
@@ -71,8 +71,8 @@ def create_app(
     lifecycle = Lifecycle(engine, metrics)
     admission = Admission(settings.max_draws, settings.max_scenes, time.monotonic)
     metrics.watch(lambda: lifecycle.load, admission)
-    limits = Limits(settings.queue_timeout_s, settings.decode_timeout_s)
-    planning = Planning(lifecycle, admission, Rates(settings.rate_limit), metrics, traces, limits)
+    limits = TimeLimits(settings.queue_timeout_s, settings.decode_timeout_s)
+    planning = SceneSubmitter(lifecycle, admission, Rates(settings.rate_limit), metrics, traces, limits)
     pulse, scorer = Pulse(), Scorer(settings.bundled_scenes)
     idempotency = Idempotency(settings.idempotency_s, time.monotonic)
 

@@ -12,7 +12,7 @@ TYPE_BASE: Final = "https://looktwice.dev/problems/"
 
 
 @dataclass(frozen=True)
-class Kind:
+class ProblemKind:
     """A kind of problem; ``slug`` is the last part of its stable type URI."""
 
     slug: str
@@ -25,64 +25,76 @@ class Kind:
         return TYPE_BASE + self.slug
 
 
-INVALID_JSON: Final = Kind("invalid-json", 400, "The body is not JSON")
-INVALID_BODY: Final = Kind("invalid-body", 400, "The body cannot be read")
-UNAUTHORIZED: Final = Kind("unauthorized", 401, "This needs a key")
-NOT_FOUND: Final = Kind("not-found", 404, "There is nothing here")
-FORBIDDEN: Final = Kind("forbidden", 403, "This key does not open this")
-UNKNOWN_MODEL: Final = Kind("unknown-model", 404, "There is no such model here")
-UNKNOWN_CHECKPOINT: Final = Kind("unknown-checkpoint", 404, "There is no such checkpoint")
-UNKNOWN_SCENE: Final = Kind("unknown-scene", 404, "There is no such scene")
-METHOD_NOT_ALLOWED: Final = Kind("method-not-allowed", 405, "This method is not allowed here")
-BODY_TIMEOUT: Final = Kind("body-timeout", 408, "The body came too slowly")
-SWAP_UNDER_WAY: Final = Kind("swap-under-way", 409, "Another checkpoint is being loaded")
-MISDIRECTED: Final = Kind("misdirected", 421, "This service does not answer to that name")
-BODY_TOO_LARGE: Final = Kind("body-too-large", 413, "The body is too large")
-UNSUPPORTED_MEDIA_TYPE: Final = Kind("unsupported-media-type", 415, "The body is of a type not taken here")
-INVALID_REQUEST: Final = Kind("invalid-request", 422, "The request breaks the contract")
-UNKNOWN_FIELD: Final = Kind("unknown-field", 422, "The request holds a field that does not exist")
-INVALID_CLIP: Final = Kind("invalid-clip", 422, "A camera clip is not four frames of one camera")
-UNKNOWN_CAMERA: Final = Kind("unknown-camera", 422, "There is no such camera")
-MISSING_CAMERA: Final = Kind("missing-camera", 422, "The model needs a camera that the scene lacks")
-INVALID_IMAGE: Final = Kind("invalid-image", 422, "A picture cannot be accepted")
-INVALID_HISTORY: Final = Kind("invalid-history", 422, "The ego history is not one a car can have driven")
-INVALID_ROUTE: Final = Kind("invalid-route", 422, "The route is not 20 points in the ego frame")
-INVALID_TRACKS: Final = Kind("invalid-tracks", 422, "The tracks are not ones that the model can take")
-INVALID_CONTROLS: Final = Kind("invalid-controls", 422, "The controls contradict each other or their limits")
-INVALID_PLAN: Final = Kind("invalid-plan", 422, "The given plan breaks the plan language")
-INVALID_LABELS: Final = Kind("invalid-labels", 422, "The labels are not ones to score by")
-INVALID_TRAJECTORY: Final = Kind("invalid-trajectory", 422, "A trajectory cannot be taken")
-INVALID_ATTEMPT: Final = Kind("invalid-attempt", 422, "The attempt is not one that the format refines")
-INVALID_FEEDBACK: Final = Kind("invalid-feedback", 422, "The feedback is not of the form, or tells no facts")
-CANNOT_IMAGINE: Final = Kind("cannot-imagine", 422, "The model imagines no such pictures")
-OTHER_PLAN: Final = Kind("other-plan", 422, "The feedback is for another plan")
-UNKNOWN_FORMAT: Final = Kind("unknown-format", 422, "The model does not write this response format")
-REFUSED: Final = Kind("request-refused", 422, "The model cannot serve this request")
-INVALID_SCENE_FILE: Final = Kind("invalid-scene-file", 422, "This is not a scene file of this version")
-IDEMPOTENCY_KEY_REUSED: Final = Kind(
+INVALID_JSON: Final = ProblemKind("invalid-json", 400, "The body is not JSON")
+INVALID_BODY: Final = ProblemKind("invalid-body", 400, "The body cannot be read")
+UNAUTHORIZED: Final = ProblemKind("unauthorized", 401, "This needs a key")
+NOT_FOUND: Final = ProblemKind("not-found", 404, "There is nothing here")
+FORBIDDEN: Final = ProblemKind("forbidden", 403, "This key does not open this")
+UNKNOWN_MODEL: Final = ProblemKind("unknown-model", 404, "There is no such model here")
+UNKNOWN_CHECKPOINT: Final = ProblemKind("unknown-checkpoint", 404, "There is no such checkpoint")
+UNKNOWN_SCENE: Final = ProblemKind("unknown-scene", 404, "There is no such scene")
+METHOD_NOT_ALLOWED: Final = ProblemKind("method-not-allowed", 405, "This method is not allowed here")
+BODY_TIMEOUT: Final = ProblemKind("body-timeout", 408, "The body came too slowly")
+SWAP_UNDER_WAY: Final = ProblemKind("swap-under-way", 409, "Another checkpoint is being loaded")
+MISDIRECTED: Final = ProblemKind("misdirected", 421, "This service does not answer to that name")
+BODY_TOO_LARGE: Final = ProblemKind("body-too-large", 413, "The body is too large")
+UNSUPPORTED_MEDIA_TYPE: Final = ProblemKind(
+    "unsupported-media-type", 415, "The body is of a type not taken here"
+)
+INVALID_REQUEST: Final = ProblemKind("invalid-request", 422, "The request breaks the contract")
+UNKNOWN_FIELD: Final = ProblemKind("unknown-field", 422, "The request holds a field that does not exist")
+INVALID_CLIP: Final = ProblemKind("invalid-clip", 422, "A camera clip is not four frames of one camera")
+UNKNOWN_CAMERA: Final = ProblemKind("unknown-camera", 422, "There is no such camera")
+MISSING_CAMERA: Final = ProblemKind("missing-camera", 422, "The model needs a camera that the scene lacks")
+INVALID_IMAGE: Final = ProblemKind("invalid-image", 422, "A picture cannot be accepted")
+INVALID_HISTORY: Final = ProblemKind(
+    "invalid-history", 422, "The ego history is not one a car can have driven"
+)
+INVALID_ROUTE: Final = ProblemKind("invalid-route", 422, "The route is not 20 points in the ego frame")
+INVALID_TRACKS: Final = ProblemKind("invalid-tracks", 422, "The tracks are not ones that the model can take")
+INVALID_CONTROLS: Final = ProblemKind(
+    "invalid-controls", 422, "The controls contradict each other or their limits"
+)
+INVALID_PLAN: Final = ProblemKind("invalid-plan", 422, "The given plan breaks the plan language")
+INVALID_LABELS: Final = ProblemKind("invalid-labels", 422, "The labels are not ones to score by")
+INVALID_TRAJECTORY: Final = ProblemKind("invalid-trajectory", 422, "A trajectory cannot be taken")
+INVALID_ATTEMPT: Final = ProblemKind("invalid-attempt", 422, "The attempt is not one that the format refines")
+INVALID_FEEDBACK: Final = ProblemKind(
+    "invalid-feedback", 422, "The feedback is not of the form, or tells no facts"
+)
+CANNOT_IMAGINE: Final = ProblemKind("cannot-imagine", 422, "The model imagines no such pictures")
+OTHER_PLAN: Final = ProblemKind("other-plan", 422, "The feedback is for another plan")
+UNKNOWN_FORMAT: Final = ProblemKind("unknown-format", 422, "The model does not write this response format")
+REFUSED: Final = ProblemKind("request-refused", 422, "The model cannot serve this request")
+INVALID_SCENE_FILE: Final = ProblemKind("invalid-scene-file", 422, "This is not a scene file of this version")
+IDEMPOTENCY_KEY_REUSED: Final = ProblemKind(
     "idempotency-key-reused", 422, "The idempotency key came with another request before"
 )
-QUEUE_FULL: Final = Kind("queue-full", 429, "The service has as much to do as it accepts")
-RATE_LIMITED: Final = Kind("rate-limited", 429, "The caller has asked for as much as is allowed")
-INTERNAL: Final = Kind("internal", 500, "The service failed")
-NEEDS_ANNOTATIONS: Final = Kind("needs-annotations", 422, "The teacher needs what the request lacks")
-NEEDS_TRACKS: Final = Kind("needs-tracks", 422, "Feedback is made of tracked objects, and none are sent")
-NOTHING_IN_VIEW: Final = Kind(
+QUEUE_FULL: Final = ProblemKind("queue-full", 429, "The service has as much to do as it accepts")
+RATE_LIMITED: Final = ProblemKind("rate-limited", 429, "The caller has asked for as much as is allowed")
+INTERNAL: Final = ProblemKind("internal", 500, "The service failed")
+NEEDS_ANNOTATIONS: Final = ProblemKind("needs-annotations", 422, "The teacher needs what the request lacks")
+NEEDS_TRACKS: Final = ProblemKind(
+    "needs-tracks", 422, "Feedback is made of tracked objects, and none are sent"
+)
+NOTHING_IN_VIEW: Final = ProblemKind(
     "nothing-in-view", 422, "The teacher sees nothing that asks for the better plan"
 )
-TEACHER_REFUSED: Final = Kind("teacher-refused", 502, "The teacher does not take the question")
-LABEL_REFUSED: Final = Kind("label-refused", 502, "None of the teacher's answers passed the checks")
-FEEDBACK_REFUSED: Final = Kind("feedback-refused", 502, "None of the teacher's feedback passed the checks")
-TEACHER_AWAY: Final = Kind("teacher-away", 503, "The teacher does not answer")
-SCENES_UNREADABLE: Final = Kind("scenes-unreadable", 500, "The bundled scenes cannot be read")
-NOT_READY: Final = Kind("not-ready", 503, "The model is not ready")
-DRAINING: Final = Kind("draining", 503, "The service is about to stop")
-ENGINE_FAILED: Final = Kind("engine-failed", 503, "The engine failed")
-QUEUE_TIMEOUT: Final = Kind("queue-timeout", 503, "The request waited too long for its turn")
-DECODE_TIMEOUT: Final = Kind("decode-timeout", 504, "Decoding took too long")
-CHECKPOINT_FAILED: Final = Kind("checkpoint-failed", 422, "The checkpoint cannot be served")
+TEACHER_REFUSED: Final = ProblemKind("teacher-refused", 502, "The teacher does not take the question")
+LABEL_REFUSED: Final = ProblemKind("label-refused", 502, "None of the teacher's answers passed the checks")
+FEEDBACK_REFUSED: Final = ProblemKind(
+    "feedback-refused", 502, "None of the teacher's feedback passed the checks"
+)
+TEACHER_AWAY: Final = ProblemKind("teacher-away", 503, "The teacher does not answer")
+SCENES_UNREADABLE: Final = ProblemKind("scenes-unreadable", 500, "The bundled scenes cannot be read")
+NOT_READY: Final = ProblemKind("not-ready", 503, "The model is not ready")
+DRAINING: Final = ProblemKind("draining", 503, "The service is about to stop")
+ENGINE_FAILED: Final = ProblemKind("engine-failed", 503, "The engine failed")
+QUEUE_TIMEOUT: Final = ProblemKind("queue-timeout", 503, "The request waited too long for its turn")
+DECODE_TIMEOUT: Final = ProblemKind("decode-timeout", 504, "Decoding took too long")
+CHECKPOINT_FAILED: Final = ProblemKind("checkpoint-failed", 422, "The checkpoint cannot be served")
 
-KINDS: Final = tuple(value for value in list(globals().values()) if isinstance(value, Kind))
+KINDS: Final = tuple(value for value in list(globals().values()) if isinstance(value, ProblemKind))
 """All of them, in the table's order."""
 
 RETRY_AFTER_S: Final = 1
@@ -109,7 +121,7 @@ class ProblemError(Exception):
     """
 
     def __init__(
-        self, kind: Kind, detail: str, errors: Sequence[Fault] = (), retry_after_s: int | None = None
+        self, kind: ProblemKind, detail: str, errors: Sequence[Fault] = (), retry_after_s: int | None = None
     ) -> None:
         super().__init__(detail)
         self.kind, self.detail, self.errors = kind, detail, tuple(errors)
@@ -123,7 +135,7 @@ def unforeseen() -> ProblemError:
 
 
 def at(
-    kind: Kind, pointer: str, detail: str, line: int | None = None, column: int | None = None
+    kind: ProblemKind, pointer: str, detail: str, line: int | None = None, column: int | None = None
 ) -> ProblemError:
     """A problem with one known place in the body; ``line`` and ``column`` are those of a text there."""
     fault = Fault(pointer=pointer, detail=detail, line=line, column=column)

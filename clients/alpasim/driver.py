@@ -20,7 +20,7 @@ from looktwice.clients.alpasim.errors import (
     UnknownSession,
 )
 from looktwice.clients.alpasim.frames import fitted
-from looktwice.clients.alpasim.session import CAMERAS, Moment, Session
+from looktwice.clients.alpasim.session import CAMERAS, PlanInput, Session
 from looktwice.clients.answers import PlanResult
 from looktwice.model.driving.scene import Scene
 from looktwice.model.driving.trajectory import FloatArray
@@ -73,7 +73,7 @@ class Driven:
         debug: what else is worth knowing, JSON-like.
     """
 
-    moment: Moment
+    moment: PlanInput
     trajectories: FloatArray
     chosen: int
     debug: dict[str, Any]

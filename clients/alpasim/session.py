@@ -24,7 +24,7 @@ CAMERAS: Final[Mapping[str, str]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class PlanInput:
     """What there is to plan for.
 
     Attributes:
@@ -94,7 +94,7 @@ class Session:
         """How much is remembered: poses, and pictures by camera."""
         return {"poses": len(self._ego)} | {name: len(frames) for name, frames in self._frames.items()}
 
-    def moment(self, now_us: int) -> Moment:
+    def moment(self, now_us: int) -> PlanInput:
         """The scene at ``now_us``.
 
         Raises:
@@ -105,7 +105,7 @@ class Session:
         present = self._ego.present(now_us)
         history = self._ego.history(now_us)
         scene = Scene(self.session_id, clips, history, self._route_seen_from(present))
-        return Moment(scene, present)
+        return PlanInput(scene, present)
 
     def _place_route(self) -> None:
         # Its pose may come in before the route or after it.

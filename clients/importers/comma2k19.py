@@ -17,7 +17,7 @@ import numpy as np
 from cachetools import FIFOCache
 
 from looktwice.clients.importers.recording import Array, Recording, RecordingError
-from looktwice.clients.importers.resampling import OneCamera, Source, View, fov_of
+from looktwice.clients.importers.resampling import OneCamera, RgbImage, Source, fov_of
 from looktwice.clients.importers.rotations import matrices
 from looktwice.model.driving.cameras import CameraSpec
 
@@ -33,7 +33,7 @@ _WGS84_SEMI_AXES_M: Final = np.array([6378137.0, 6378137.0, 6356752.3142])
 
 
 @dataclass(eq=False)
-class Film:
+class FilmReader:
     """A film, read forwards; what was read shortly before is remembered.
 
     Attributes:
@@ -43,11 +43,11 @@ class Film:
 
     path: Path
     times_s: Array
-    _remembered: FIFOCache[int, View] = field(default_factory=lambda: FIFOCache(_REMEMBERED))
-    _reader: Iterator[View] | None = None
+    _remembered: FIFOCache[int, RgbImage] = field(default_factory=lambda: FIFOCache(_REMEMBERED))
+    _reader: Iterator[RgbImage] | None = None
     _next: int = 0
 
-    def picture(self, number: int) -> View:
+    def picture(self, number: int) -> RgbImage:
         """One of its pictures, RGB; raises `RecordingError` where the film ends before or is damaged."""
         if number not in self._remembered:
             if self._reader is None or number < self._next:
@@ -61,7 +61,7 @@ class Film:
             raise RecordingError(f"{self.path} ends after {self._next} pictures; there are poses of more")
         return self._remembered[number]
 
-    def _read(self) -> Iterator[View]:
+    def _read(self) -> Iterator[RgbImage]:
         if not self.path.is_file():
             raise RecordingError(f"{self.path} is missing")
         try:
@@ -99,7 +99,7 @@ def _read_segment(folder: Path, specs: tuple[CameraSpec, ...]) -> Recording:
     turns = matrices(_array(folder, "frame_orientations", (4,)))
     if not len(times_s) == len(places) == len(turns) or len(times_s) < 2 or (np.diff(times_s) <= 0).any():
         raise RecordingError(f"{folder / POSES_FOLDER}: it takes a place and an orientation for each time")
-    film = Film(folder / FILM, times_s)
+    film = FilmReader(folder / FILM, times_s)
     source = _source(times_s, places, turns)
     # A segment's folder is called after its number, the folder it lies in after its route.
     name = "--".join(folder.resolve().parts[-2:]).replace("|", "_")

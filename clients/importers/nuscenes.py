@@ -36,7 +36,7 @@ Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class CalibratedCamera:
     """A camera's pictures and calibration.
 
     Attributes:
@@ -70,7 +70,7 @@ class CameraRow:
     """
 
     spec: CameraSpec
-    cameras: Mapping[str, Camera]
+    cameras: Mapping[str, CalibratedCamera]
 
     def at(self, moment_s: float) -> bytes | None:
         """What they see together, as JPEG; None where one of them took nothing near that moment."""
@@ -174,7 +174,7 @@ class _Tables:
         return np.array(order, np.float64) / 1e6, np.concatenate([places, heading[:, None]], axis=1)
 
 
-def _camera(folder: Path, tables: _Tables, rows: Sequence[Row]) -> Camera | None:
+def _camera(folder: Path, tables: _Tables, rows: Sequence[Row]) -> CalibratedCamera | None:
     """A channel in a scene; None where none of its pictures is there."""
     there = [row for row in sorted(rows, key=itemgetter("timestamp")) if (folder / row["filename"]).is_file()]
     if not there:
@@ -183,4 +183,4 @@ def _camera(folder: Path, tables: _Tables, rows: Sequence[Row]) -> Camera | None
     times_s = np.array([row["timestamp"] for row in there], np.float64) / 1e6
     files = PictureFiles(times_s, [folder / row["filename"] for row in there])
     rotation = matrices(np.array(calibrated["rotation"], np.float64))
-    return Camera(files, np.array(calibrated["camera_intrinsic"], np.float64), rotation)
+    return CalibratedCamera(files, np.array(calibrated["camera_intrinsic"], np.float64), rotation)

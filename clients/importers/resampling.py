@@ -24,18 +24,18 @@ _MOST_APART_S: Final = 0.06
 """Between a moment and the picture that stands for it."""
 JPEG_QUALITY: Final = 92
 
-View = npt.NDArray[np.uint8]
+RgbImage = npt.NDArray[np.uint8]
 """A picture, RGB [height, width, 3]."""
 
 
-class Pictures(Protocol):
+class RecordedPictures(Protocol):
     """What one camera took, in order of time."""
 
     @property
     def times_s(self) -> Array:
         """[n], ascending."""
 
-    def picture(self, number: int) -> View:
+    def picture(self, number: int) -> RgbImage:
         """One of them, RGB; raises `RecordingError` where it cannot be read."""
 
 
@@ -51,7 +51,7 @@ class PictureFiles:
     times_s: Array
     files: Sequence[Path]
 
-    def picture(self, number: int) -> View:
+    def picture(self, number: int) -> RgbImage:
         """Read one of them; raises `RecordingError`."""
         file = self.files[number]
         try:
@@ -60,7 +60,7 @@ class PictureFiles:
             raise RecordingError(f"{file}: {error}") from error
 
 
-def nearest(pictures: Pictures, moment_s: float) -> int | None:
+def nearest(pictures: RecordedPictures, moment_s: float) -> int | None:
     """The number of the picture that stands for a moment; None where there is none within 60 ms."""
     number = int(np.abs(pictures.times_s - moment_s).argmin())
     return number if abs(pictures.times_s[number] - moment_s) <= _MOST_APART_S else None
@@ -111,7 +111,7 @@ class OneCamera:
 
     spec: CameraSpec
     source: Source
-    pictures: Pictures
+    pictures: RecordedPictures
 
     def at(self, moment_s: float) -> bytes | None:
         """Its picture as JPEG; None where nothing was taken near that moment; raises `RecordingError`."""
@@ -140,7 +140,7 @@ def fov_of(extent_px: float, focal_px: float) -> float:
     return 2 * math.degrees(math.atan(extent_px / 2 / focal_px))
 
 
-def as_seen(spec: CameraSpec, source: Source, picture: View) -> bytes:
+def as_seen(spec: CameraSpec, source: Source, picture: RgbImage) -> bytes:
     """A picture as ``spec`` would have taken it, as JPEG: what it does not show is grey."""
     height, width = picture.shape[:2]
     left, top, right, bottom = _box(spec, source, (width, height))

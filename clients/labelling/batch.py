@@ -12,10 +12,10 @@ from typing import Any, Final
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from looktwice.clients.labelling.label import LabelTask, record, refused
-from looktwice.clients.labelling.ledger import Ledger, Run
+from looktwice.clients.labelling.ledger import Ledger, StageRun
 from looktwice.clients.labelling.pipeline import Job, Tally
 from looktwice.clients.labelling.teachers.openai import OpenAiSettings, completion_answer, completion_request
-from looktwice.clients.labelling.teachers.teacher import Answer, Reflection, ReflectionRefused, judge
+from looktwice.clients.labelling.teachers.teacher import Answer, CheckedReflection, ReflectionRefused, judge
 
 _URL: Final = "/v1/chat/completions"
 
@@ -46,7 +46,7 @@ def batch_requests(
             continue
         answers = ledger.answers(job.key)
         verdict = judge(job.subject.question, answers)
-        if isinstance(verdict, Reflection):
+        if isinstance(verdict, CheckedReflection):
             continue  # answered, and only not entered yet: `take_results` does that
         yield {
             "custom_id": f"{job.key}-{len(answers) + 1}",
@@ -76,7 +76,7 @@ def read_results(lines: Iterable[str], settings: OpenAiSettings) -> dict[str, An
 
 
 def take_results(
-    ledger: Ledger, run: Run, jobs: Iterable[Job[LabelTask]], results: dict[str, Answer]
+    ledger: Ledger, run: StageRun, jobs: Iterable[Job[LabelTask]], results: dict[str, Answer]
 ) -> Tally:
     """Enter answers, each once; what fails its checks for the last time is a dead letter."""
     tally = Tally()
@@ -96,7 +96,7 @@ def take_results(
             ledger.dead_letter(run, job.key, job.scene_id, str(letter), **letter.more)
             tally.dead += 1
             continue
-        if isinstance(verdict, Reflection):
+        if isinstance(verdict, CheckedReflection):
             ledger.finish(run, job.key, job.scene_id, record(job.subject, verdict))
             tally.done += 1
     return tally

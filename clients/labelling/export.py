@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from looktwice.clients import wire
-from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError, Run
+from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError, StageRun
 from looktwice.clients.labelling.outcomes import followed_plans, plans_that_hold
 from looktwice.clients.labelling.teachers.prompt import camera_line
 from looktwice.model.driving.images import media_type
@@ -28,7 +28,7 @@ _, _REFLECTS = get_args(wire.Branch)
 DATASET: Final = "looktwice"
 
 
-def reflections(ledger: Ledger, label: Run, *, by_outcome: bool = False) -> Iterator[LabelledReflection]:
+def reflections(ledger: Ledger, label: StageRun, *, by_outcome: bool = False) -> Iterator[LabelledReflection]:
     """What a teacher wrote, with its provenance, scene by scene.
 
     A reflection in phrases leads to the expert's plan in the tracks that it speaks of; the others stay as the
@@ -59,7 +59,7 @@ def reflections(ledger: Ledger, label: Run, *, by_outcome: bool = False) -> Iter
         )
 
 
-def right_plans(ledger: Ledger, label: Run, plan_iou: float) -> Iterator[LabelledReflection]:
+def right_plans(ledger: Ledger, label: StageRun, plan_iou: float) -> Iterator[LabelledReflection]:
     """The model's own plans that agree with the expert's, at least so much: nothing is to be corrected there.
 
     They come from all scenes of the labels' rollout, whatever the filter kept.
@@ -70,7 +70,7 @@ def right_plans(ledger: Ledger, label: Run, plan_iou: float) -> Iterator[Labelle
         yield from _to_act_on(rollout, entry, dict.fromkeys(right))
 
 
-def held_plans(ledger: Ledger, label: Run) -> Iterator[LabelledReflection]:
+def held_plans(ledger: Ledger, label: StageRun) -> Iterator[LabelledReflection]:
     """The model's own plans that hold when they are followed, from all scenes of the labels' rollout.
 
     Raises:
@@ -85,7 +85,7 @@ def held_plans(ledger: Ledger, label: Run) -> Iterator[LabelledReflection]:
             yield from _to_act_on(rollout, entry, held)
 
 
-def _to_act_on(rollout: Run, entry: Entry, plans: Iterable[str]) -> Iterator[LabelledReflection]:
+def _to_act_on(rollout: StageRun, entry: Entry, plans: Iterable[str]) -> Iterator[LabelledReflection]:
     """Plans of a rolled-out scene with no reflection on them."""
     expert = parse_plan(entry.record["expert_plan"])
     for plan in plans:
@@ -105,14 +105,14 @@ def _to_act_on(rollout: Run, entry: Entry, plans: Iterable[str]) -> Iterator[Lab
         )
 
 
-def _rollout_of(ledger: Ledger, label: Run) -> Run:
+def _rollout_of(ledger: Ledger, label: StageRun) -> StageRun:
     rollout = next((run for run in ledger.runs("rollout") if run.id == label.config["rollout"]), None)
     if rollout is None:
         raise LedgerError("the labels' rollout is not in the ledger")
     return rollout
 
 
-def write_messages(ledger: Ledger, label: Run, scenes: Path, folder: Path) -> int:
+def write_messages(ledger: Ledger, label: StageRun, scenes: Path, folder: Path) -> int:
     """Write a data set of messages and images, in the form of LLaMA-Factory and in TRL's; returns its length.
 
     One wants a tag in the text for each image, the other parts: it would take a tag for text.

@@ -18,7 +18,7 @@ import numpy as np
 
 from looktwice.clients import wire
 from looktwice.clients.answers import PlannedDraw
-from looktwice.clients.labelling.ledger import Entry, Ledger, Record, Run
+from looktwice.clients.labelling.ledger import Entry, Ledger, Record, StageRun
 from looktwice.clients.labelling.pipeline import CannotBeDone, Job, StageStopped
 from looktwice.clients.labelling.rollout import key_of, of_the_service
 from looktwice.clients.labelling.teachers.feedback import FeedbackTeacher, ask_feedback, question_of
@@ -79,7 +79,7 @@ class Inference:
 
 
 @dataclass(frozen=True)
-class Sample:
+class FeedbackSample:
     """Which of the responses get feedback.
 
     Attributes:
@@ -113,7 +113,7 @@ def inference_config(model: wire.ModelName, inference: Inference) -> Record:
     return {"model": model.name, "revision": model.revision, "facts": FACTS_VERSION, **given}
 
 
-def feedback_config(inference: Run, teacher: FeedbackTeacher | None, threshold: float) -> Record:
+def feedback_config(inference: StageRun, teacher: FeedbackTeacher | None, threshold: float) -> Record:
     """What decides feedback besides the response; None is the built-in teacher."""
     return {
         "inference": inference.id,
@@ -163,7 +163,7 @@ def judge(
         raise CannotBeDone(f"the scene cannot be scored: {error}") from error
 
 
-def sampled(ledger: Ledger, inference: Run, sample: Sample) -> dict[str, list[int]]:
+def sampled(ledger: Ledger, inference: StageRun, sample: FeedbackSample) -> dict[str, list[int]]:
     """The draws that get feedback, by the keys of what was inferred.
 
     Draws are taken in an order by lot that each has for itself: more scenes add to it and do not shuffle it.
@@ -181,7 +181,7 @@ def sampled(ledger: Ledger, inference: Run, sample: Sample) -> dict[str, list[in
 
 
 def feedback_jobs(
-    ledger: Ledger, inference: Run, run: Run, chosen: Mapping[str, Sequence[int]], scenes: Path
+    ledger: Ledger, inference: StageRun, run: StageRun, chosen: Mapping[str, Sequence[int]], scenes: Path
 ) -> Iterator[Job[Chosen]]:
     """Chosen responses as pieces of work, scene by scene."""
     for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None):
@@ -192,13 +192,13 @@ def feedback_jobs(
             yield Job(key, entry.scene_id, Chosen(labelled, entry, draw))
 
 
-def feedback_key(run: Run, inferred: str, draw: int, judged_by: str) -> str:
+def feedback_key(run: StageRun, inferred: str, draw: int, judged_by: str) -> str:
     """What the feedback on one response is found by."""
     return hash_of(run.id, inferred, draw, judged_by)
 
 
 def writer(
-    ledger: Ledger, run: Run, teacher: FeedbackTeacher | None, version: Version, threshold: float
+    ledger: Ledger, run: StageRun, teacher: FeedbackTeacher | None, version: Version, threshold: float
 ) -> Callable[[Job[Chosen]], Awaitable[Record]]:
     """Makes records of feedback: the verdict on what is correct, sections on what is wrong (section 7.2)."""
 
@@ -225,7 +225,7 @@ def writer(
 
 
 async def _asked(
-    ledger: Ledger, run: Run, key: str, teacher: FeedbackTeacher, judged: JudgedPlan
+    ledger: Ledger, run: StageRun, key: str, teacher: FeedbackTeacher, judged: JudgedPlan
 ) -> tuple[str, int]:
     """An outside teacher's text and how often it was asked; each answer is kept before it is read."""
     try:
@@ -248,7 +248,7 @@ async def _asked(
 
 
 def rows(
-    ledger: Ledger, inference: Run, run: Run, chosen: Mapping[str, Sequence[int]]
+    ledger: Ledger, inference: StageRun, run: StageRun, chosen: Mapping[str, Sequence[int]]
 ) -> Iterator[FeedbackRow]:
     """Feedback on the chosen responses, as the file holds it."""
     for entry in ledger.entries(run):

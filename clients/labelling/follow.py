@@ -13,8 +13,8 @@ from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
-from looktwice.clients.labelling.ledger import Entry, Ledger, Run
-from looktwice.clients.labelling.pipeline import Limits, StageStopped, Tally
+from looktwice.clients.labelling.ledger import Entry, Ledger, StageRun
+from looktwice.clients.labelling.pipeline import StageLimits, StageStopped, Tally
 from looktwice.clients.labelling.rollout import key_of, unpacked
 from looktwice.clients.metadrive.outcomes import (
     EpisodeSetting,
@@ -42,11 +42,11 @@ class _Work:
 
 def follow_all(
     ledger: Ledger,
-    run: Run,
-    rollout: Run,
+    run: StageRun,
+    rollout: StageRun,
     scenes: Path,
     workers: int,
-    limits: Limits = Limits(),
+    limits: StageLimits = StageLimits(),
     on_progress: Callable[[Tally], None] = lambda _: None,
 ) -> Tally:
     """Follow the free draws of every rolled-out scene, and enter what comes of them.
@@ -86,7 +86,7 @@ def follow_all(
     return tally
 
 
-def _enter(ledger: Ledger, run: Run, work: _Work, found: MomentOutcomes | str, tally: Tally) -> bool:
+def _enter(ledger: Ledger, run: StageRun, work: _Work, found: MomentOutcomes | str, tally: Tally) -> bool:
     """Enter what came of a scene; returns whether something went wrong."""
     if isinstance(found, str):
         ledger.dead_letter(run, work.key, work.moment.scene_id, found)
@@ -109,7 +109,7 @@ def _episodes(works: Iterator[_Work], at_most: int | None) -> Iterator[list[_Wor
 
 
 def _works(
-    ledger: Ledger, run: Run, rollout: Run, scenes: Path, setting: EpisodeSetting, tally: Tally
+    ledger: Ledger, run: StageRun, rollout: StageRun, scenes: Path, setting: EpisodeSetting, tally: Tally
 ) -> Iterator[_Work]:
     """The rolled-out scenes whose plans were not followed yet; the others are counted."""
     begun: set[str] = set()

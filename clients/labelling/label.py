@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from looktwice.clients.labelling.checks import FailedCheck
-from looktwice.clients.labelling.ledger import Entry, Ledger, Record, Run
+from looktwice.clients.labelling.ledger import Entry, Ledger, Record, StageRun
 from looktwice.clients.labelling.outcomes import Followed, failure_of, followed_entries
 from looktwice.clients.labelling.pipeline import CannotBeDone, Job, StageStopped
 from looktwice.clients.labelling.rollout import key_of
 from looktwice.clients.labelling.teachers.teacher import (
     ATTEMPTS,
+    CheckedReflection,
     NothingInView,
     Question,
-    Reflection,
     ReflectionRefused,
     Teacher,
     TeacherBusy,
@@ -44,7 +44,7 @@ class LabelTask(NamedTuple):
     annotations: str
 
 
-def config_of(rollout: Run, teacher: Teacher, seed: int) -> Record:
+def config_of(rollout: StageRun, teacher: Teacher, seed: int) -> Record:
     """What decides a label besides the scene and the predicted plan."""
     return {
         "rollout": rollout.id,
@@ -58,7 +58,7 @@ def config_of(rollout: Run, teacher: Teacher, seed: int) -> Record:
 
 def questions(
     ledger: Ledger,
-    rollout: Run,
+    rollout: StageRun,
     scenes: Path,
     *,
     plans_per_scene: int = 1,
@@ -91,7 +91,7 @@ def predicted_plans(entry: Entry, draws: Sequence[int], count: int, seed: int) -
     return texts[:count]
 
 
-def jobs(run: Run, asked: Iterator[LabelTask]) -> Iterator[Job[LabelTask]]:
+def jobs(run: StageRun, asked: Iterator[LabelTask]) -> Iterator[Job[LabelTask]]:
     """Questions as pieces of work."""
     for each in asked:
         question = each.question
@@ -103,7 +103,9 @@ def jobs(run: Run, asked: Iterator[LabelTask]) -> Iterator[Job[LabelTask]]:
         yield Job(key, each.entry.scene_id, each)
 
 
-def labeller(ledger: Ledger, run: Run, teacher: Teacher) -> Callable[[Job[LabelTask]], Awaitable[Record]]:
+def labeller(
+    ledger: Ledger, run: StageRun, teacher: Teacher
+) -> Callable[[Job[LabelTask]], Awaitable[Record]]:
     """Asks ``teacher`` and makes records of its answers, each of which is in the ledger before it is read."""
 
     async def label(job: Job[LabelTask]) -> Record:
@@ -129,7 +131,7 @@ def labeller(ledger: Ledger, run: Run, teacher: Teacher) -> Callable[[Job[LabelT
     return label
 
 
-def record(asked: LabelTask, reflection: Reflection) -> Record:
+def record(asked: LabelTask, reflection: CheckedReflection) -> Record:
     """What the ledger keeps of a label."""
     return {
         "rollout": asked.entry.key,

@@ -55,7 +55,7 @@ class LedgerError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Run:
+class StageRun:
     """A stage with everything that decides its outcomes besides the scenes.
 
     Attributes:
@@ -165,24 +165,24 @@ class Ledger:
     ) -> None:
         self.close()
 
-    def run(self, stage: Stage, config: Record) -> Run:
+    def run(self, stage: Stage, config: Record) -> StageRun:
         """The run of that configuration, begun where there is none yet."""
-        run = Run(hash_of(SCHEMA_VERSION, stage, dict(config)), stage, config)
+        run = StageRun(hash_of(SCHEMA_VERSION, stage, dict(config)), stage, config)
         self._db.execute(
             "INSERT OR IGNORE INTO runs VALUES (?, ?, ?)", (run.id, stage, json.dumps(dict(config)))
         )
         return run
 
-    def runs(self, stage: Stage) -> list[Run]:
+    def runs(self, stage: Stage) -> list[StageRun]:
         """All runs of a stage that have outcomes, the latest first."""
         rows = self._db.execute(
             "SELECT run, config FROM runs JOIN outcomes USING (run) WHERE stage = ? "
             "GROUP BY run ORDER BY max(ended_at) DESC",
             (stage,),
         )
-        return [Run(id, stage, json.loads(config)) for id, config in rows]
+        return [StageRun(id, stage, json.loads(config)) for id, config in rows]
 
-    def the_run(self, stage: Stage, beginning: str | None = None) -> Run:
+    def the_run(self, stage: Stage, beginning: str | None = None) -> StageRun:
         """The only run of a stage, or the one whose id begins so.
 
         Raises:
@@ -212,15 +212,15 @@ class Ledger:
         scene_id, record, ended_at = row
         return Entry(key, scene_id, "done", json.loads(record), ended_at)
 
-    def finish(self, run: Run, key: str, scene_id: str, record: Record) -> None:
+    def finish(self, run: StageRun, key: str, scene_id: str, record: Record) -> None:
         """A piece of work is done."""
         self._end(run, key, scene_id, "done", record)
 
-    def dead_letter(self, run: Run, key: str, scene_id: str, reason: str, **more: Any) -> None:
+    def dead_letter(self, run: StageRun, key: str, scene_id: str, reason: str, **more: Any) -> None:
         """A piece of work cannot be done."""
         self._end(run, key, scene_id, "dead", {"reason": reason, **more})
 
-    def _end(self, run: Run, key: str, scene_id: str, state: State, record: Record) -> None:
+    def _end(self, run: StageRun, key: str, scene_id: str, state: State, record: Record) -> None:
         content = json.dumps(dict(record))
         try:
             self._db.execute(
@@ -230,7 +230,7 @@ class Ledger:
         except sqlite3.IntegrityError as error:
             raise LedgerError(f"scene {scene_id} was done twice") from error
 
-    def entries(self, run: Run, state: State = "done") -> Iterator[Entry]:
+    def entries(self, run: StageRun, state: State = "done") -> Iterator[Entry]:
         """What ended in a run, by scene."""
         rows = self._db.execute(
             "SELECT key, scene_id, record, ended_at FROM outcomes WHERE run = ? AND state = ? "
@@ -240,7 +240,7 @@ class Ledger:
         for key, scene_id, record, ended_at in rows:
             yield Entry(key, scene_id, state, json.loads(record), ended_at)
 
-    def latest(self, run: Run, count: int) -> list[Entry]:
+    def latest(self, run: StageRun, count: int) -> list[Entry]:
         """What ended last in a run."""
         rows = self._db.execute(
             "SELECT key, scene_id, state, record, ended_at FROM outcomes WHERE run = ? "
@@ -251,14 +251,14 @@ class Ledger:
             Entry(key, scene_id, state, json.loads(record), at) for key, scene_id, state, record, at in rows
         ]
 
-    def count(self, run: Run, state: State = "done") -> int:
+    def count(self, run: StageRun, state: State = "done") -> int:
         """How many ended so."""
         (count,) = self._db.execute(
             "SELECT count(*) FROM outcomes WHERE run = ? AND state = ?", (run.id, state)
         ).fetchone()
         return int(count)
 
-    def forget_dead(self, run: Run) -> int:
+    def forget_dead(self, run: StageRun) -> int:
         """Make what could not be done undone, with the answers to it; returns how many there were."""
         with self._all_or_nothing():
             dead = "SELECT key FROM outcomes WHERE run = ? AND state = 'dead'"
@@ -266,7 +266,7 @@ class Ledger:
             gone = self._db.execute("DELETE FROM outcomes WHERE run = ? AND state = 'dead'", (run.id,))
         return gone.rowcount
 
-    def select(self, run: Run, draws: Iterable[tuple[str, Sequence[int]]]) -> None:
+    def select(self, run: StageRun, draws: Iterable[tuple[str, Sequence[int]]]) -> None:
         """Choose what the next stage works on: keys, each with some of its draws.
 
         What was chosen of the run before is chosen no more.
@@ -290,7 +290,7 @@ class Ledger:
         scene_id, record, ended_at, draws = row
         return Entry(key, scene_id, "done", json.loads(record), ended_at), json.loads(draws)
 
-    def selected_draws(self, run: Run, most: int) -> int:
+    def selected_draws(self, run: StageRun, most: int) -> int:
         """How many draws of a run are chosen, at most so many of each piece of work."""
         (count,) = self._db.execute(
             "SELECT coalesce(sum(min(json_array_length(draws), ?)), 0) "
@@ -309,7 +309,7 @@ class Ledger:
             raise
         self._db.execute("COMMIT")
 
-    def answered(self, run: Run, key: str, attempt: int, answer: Answer) -> None:
+    def answered(self, run: StageRun, key: str, attempt: int, answer: Answer) -> None:
         """A teacher has answered: kept before anything is made of it."""
         content = json.dumps(answer._asdict())
         self._db.execute("INSERT INTO answers VALUES (?, ?, ?, ?)", (key, run.id, attempt, content))
@@ -319,7 +319,7 @@ class Ledger:
         rows = self._db.execute("SELECT answer FROM answers WHERE key = ? ORDER BY attempt", (key,))
         return [Answer(**json.loads(answer)) for (answer,) in rows]
 
-    def begun(self, run: Run) -> Entered:
+    def begun(self, run: StageRun) -> Entered:
         """Answers to questions of a run that have no outcome yet, for a helper that goes on with them."""
         rows = self._db.execute(
             "SELECT key, attempt, answer FROM answers WHERE run = ? "
@@ -328,7 +328,7 @@ class Ledger:
         )
         return Entered([], rows.fetchall())
 
-    def entered(self, run: Run) -> Entered:
+    def entered(self, run: StageRun) -> Entered:
         """All that was entered for a run, for another ledger to take over."""
         return Entered(
             self._db.execute(
@@ -337,7 +337,7 @@ class Ledger:
             self._db.execute("SELECT key, attempt, answer FROM answers WHERE run = ?", (run.id,)).fetchall(),
         )
 
-    def take_over(self, run: Run, entered: Entered) -> None:
+    def take_over(self, run: StageRun, entered: Entered) -> None:
         """Enter what a helper has; what is there already stays as it is."""
         with self._all_or_nothing():
             self._db.executemany(
@@ -349,7 +349,7 @@ class Ledger:
                 ((key, run.id, *rest) for key, *rest in entered.outcomes),
             )
 
-    def keys_of(self, run: Run, scene_ids: Sequence[str]) -> list[str]:
+    def keys_of(self, run: StageRun, scene_ids: Sequence[str]) -> list[str]:
         """What ended in a run for some scenes."""
         marks = ",".join("?" * len(scene_ids))
         rows = self._db.execute(
@@ -357,7 +357,7 @@ class Ledger:
         )
         return [key for (key,) in rows]
 
-    def spent(self, run: Run) -> Spent:
+    def spent(self, run: StageRun) -> Spent:
         """What a run's answers took, those that were no use included."""
         row = self._db.execute(
             "SELECT count(*), coalesce(sum(answer ->> 'input_tokens'), 0), "

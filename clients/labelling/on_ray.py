@@ -18,8 +18,8 @@ import ray
 
 from looktwice.clients import wire
 from looktwice.clients.labelling import label, outcomes, rollout
-from looktwice.clients.labelling.ledger import Entered, Entry, Ledger, Run
-from looktwice.clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
+from looktwice.clients.labelling.ledger import Entered, Entry, Ledger, StageRun
+from looktwice.clients.labelling.pipeline import Job, StageLimits, StageStopped, Tally, work_through
 from looktwice.clients.labelling.rollout import RETRY_POLICY, Sampling, roll_out
 from looktwice.clients.labelling.teachers.teacher import Teacher, TeacherError
 from looktwice.clients.planner import Access, AsyncPlannerClient
@@ -50,7 +50,7 @@ class Work(Protocol):
     """What a worker does with a chunk; travels to it."""
 
     @property
-    def run(self) -> Run:
+    def run(self) -> StageRun:
         """What its outcomes belong to."""
         ...
 
@@ -63,12 +63,12 @@ class Work(Protocol):
 class RolloutWork:
     """See `looktwice.clients.labelling.rollout`."""
 
-    run: Run
+    run: StageRun
     service: str
     access: Access
     model: wire.ModelName
     sampling: Sampling
-    limits: Limits
+    limits: StageLimits
 
     async def __call__(self, book: Ledger, chunk: Chunk, unlabelled: Callable[[str], None]) -> Tally:
         """Roll the chunk's scenes out."""
@@ -89,12 +89,12 @@ class LabelWork:
     """See `looktwice.clients.labelling.label`; ``connect`` is called for every chunk, where it is worked
     on."""
 
-    run: Run
-    rollout: Run
+    run: StageRun
+    rollout: StageRun
     connect: Callable[[], Awaitable[Teacher]]
     plans_per_scene: int
     seed: int
-    limits: Limits
+    limits: StageLimits
 
     async def __call__(self, book: Ledger, chunk: Chunk, unlabelled: Callable[[str], None]) -> Tally:
         """Have the chunk's plans looked at."""
@@ -131,7 +131,7 @@ class LabelWork:
             await teacher.close()
 
 
-def chunks(ledger: Ledger, run: Run, scenes: Path, rollout: Run | None = None) -> Iterator[Chunk]:
+def chunks(ledger: Ledger, run: StageRun, scenes: Path, rollout: StageRun | None = None) -> Iterator[Chunk]:
     """The row groups of scene files; with a ``rollout`` those with kept scenes, and what is kept."""
     kept: dict[str, list[tuple[Entry, list[int]]]] = {}
     begun = ledger.begun(run)
@@ -152,7 +152,7 @@ def chunks(ledger: Ledger, run: Run, scenes: Path, rollout: Run | None = None) -
 
 def work_on_ray(
     ledger: Ledger,
-    run: Run,
+    run: StageRun,
     found: Iterator[Chunk],
     work: Work,
     address: str,

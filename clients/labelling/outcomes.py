@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError, Record, Run
+from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError, Record, StageRun
 from looktwice.model.driving.direction import wanted_changes
 from looktwice.model.driving.outcome import OUTCOMES_VERSION, Outcome
 from looktwice.model.driving.plan import parse_plan
@@ -31,12 +31,12 @@ class Followed:
         )
 
 
-def config_of(rollout: Run) -> Record:
+def config_of(rollout: StageRun) -> Record:
     """What decides outcomes besides the scene and how its episode was set."""
     return {"rollout": rollout.id, "rules": OUTCOMES_VERSION}
 
 
-def followed_plans(ledger: Ledger, rollout: Run) -> Mapping[str, Followed]:
+def followed_plans(ledger: Ledger, rollout: StageRun) -> Mapping[str, Followed]:
     """What is known of a rollout's plans, by the rollout's keys.
 
     Raises:
@@ -48,7 +48,7 @@ def followed_plans(ledger: Ledger, rollout: Run) -> Mapping[str, Followed]:
     return {key: Followed.of(entry.record) for key, entry in found.items()}
 
 
-def followed_entries(ledger: Ledger, rollout: Run) -> dict[str, Entry]:
+def followed_entries(ledger: Ledger, rollout: StageRun) -> dict[str, Entry]:
     """What is entered of a rollout's plans that were followed, by the rollout's keys; may be empty."""
     config = config_of(rollout)
     run = next((run for run in ledger.runs("outcomes") if run.config == config), None)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
 from looktwice.clients.labelling.concurrency import ConcurrencyLimit
-from looktwice.clients.labelling.ledger import Ledger, Record, Run
+from looktwice.clients.labelling.ledger import Ledger, Record, StageRun
 from looktwice.clients.retries import TryLater, with_retries
 
 _Subject = TypeVar("_Subject")
@@ -36,7 +36,7 @@ class StageStopped(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Limits:
+class StageLimits:
     """How a stage is run.
 
     Attributes:
@@ -77,10 +77,10 @@ class Tally:
 
 async def work_through(
     ledger: Ledger,
-    run: Run,
+    run: StageRun,
     jobs: Iterator[Job[_Subject]],
     do: Callable[[Job[_Subject]], Awaitable[Record]],
-    limits: Limits = Limits(),
+    limits: StageLimits = StageLimits(),
     on_progress: Callable[[Tally], None] = lambda _: None,
 ) -> Tally:
     """Do what the ledger does not have yet, several at once, and enter each outcome as it comes.
@@ -163,6 +163,6 @@ async def work_through(
     return tally
 
 
-def _last_reason(ledger: Ledger, run: Run) -> str:
+def _last_reason(ledger: Ledger, run: StageRun) -> str:
     latest = max(ledger.entries(run, "dead"), key=lambda entry: entry.ended_at)
     return str(latest.record["reason"])

@@ -20,7 +20,7 @@ from looktwice.clients.answers import (
     RequestRefused,
     ServiceBusy,
 )
-from looktwice.clients.labelling.ledger import Record, Run
+from looktwice.clients.labelling.ledger import Record, StageRun
 from looktwice.clients.labelling.pipeline import CannotBeDone, Job, StageStopped
 from looktwice.clients.planner import AsyncPlannerClient, RetryPolicy
 from looktwice.clients.retries import TryLater
@@ -71,13 +71,13 @@ def config_of(model: wire.ModelName, sampling: Sampling) -> Record:
     return {"model": model.name, "revision": model.revision, "thinking": thinking, **asdict(sampling)}
 
 
-def key_of(run: Run, labelled: LabelledScene) -> str:
+def key_of(run: StageRun, labelled: LabelledScene) -> str:
     """What the outcome of a run in a scene with its expert is found by."""
     return hash_of(run.id, scene_hash(labelled.scene), labelled.future.tobytes())
 
 
 def jobs(
-    run: Run, scenes: Path, unlabelled: Callable[[str], None], group: int | None = None
+    run: StageRun, scenes: Path, unlabelled: Callable[[str], None], group: int | None = None
 ) -> Iterator[Job[LabelledScene]]:
     """The scenes of a file or folder as pieces of work; ``unlabelled`` is told of those without a future."""
     for labelled in read_scenes(scenes, dense=False, unlabelled=unlabelled, group=group):

@@ -18,7 +18,7 @@ _OPERATORS = ("nms", "qnms")
 _SIGNATURE = "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor"
 
 
-class _Finder(importlib.abc.MetaPathFinder):
+class _TorchvisionFinder(importlib.abc.MetaPathFinder):
     """Finds torchvision as usual, and has the operators declared before it is run."""
 
     def find_spec(
@@ -52,4 +52,4 @@ def _declare_operators() -> None:
             torch.library.define(f"torchvision::{name}", _SIGNATURE)
 
 
-sys.meta_path.insert(0, _Finder())
+sys.meta_path.insert(0, _TorchvisionFinder())

@@ -19,9 +19,9 @@ from looktwice.loadtests.attacks import COSTLY, Bait, Hostility, be_hostile, cos
 from looktwice.loadtests.bad_teacher import BadTeacher
 from looktwice.loadtests.bodies import make_call, make_calls
 from looktwice.loadtests.environment import left_behind, lines_lost
-from looktwice.loadtests.loads import OpenLoop, Phase, poisson_arrivals, windows
+from looktwice.loadtests.loads import LoadPhase, OpenLoop, poisson_arrivals, windows
 from looktwice.loadtests.memory import MemoryWatch
-from looktwice.loadtests.mix import Kind
+from looktwice.loadtests.mix import RequestKind
 from looktwice.loadtests.run import WARM_UP, Result, Setup, check, run
 
 CALM, HOSTILE, AFTER = "calm", "hostile", "after"
@@ -37,8 +37,8 @@ def hostile(setup: Setup, hostility: Hostility, name: str = "hostile") -> Result
         WorkerDied: a process of the generator did.
         ValueError: there are no scenes.
     """
-    before = Phase(WARM_UP, setup.warm_up_s, setup.rate_rps)
-    phases = [before, *(Phase(name, setup.seconds, setup.rate_rps) for name in (CALM, HOSTILE, AFTER))]
+    before = LoadPhase(WARM_UP, setup.warm_up_s, setup.rate_rps)
+    phases = [before, *(LoadPhase(name, setup.seconds, setup.rate_rps) for name in (CALM, HOSTILE, AFTER))]
     load = _alike(setup, phases)
     bait = make_bait(setup, hostility)
     begins = next(window for window in windows(phases) if window.name == HOSTILE)
@@ -74,7 +74,7 @@ def hostile(setup: Setup, hostility: Hostility, name: str = "hostile") -> Result
     )
 
 
-def _alike(setup: Setup, phases: Sequence[Phase]) -> OpenLoop:
+def _alike(setup: Setup, phases: Sequence[LoadPhase]) -> OpenLoop:
     """Requests that come alike in all phases but the warm-up: as many, at the same times, of the same kinds.
 
     By chance one phase would have more second looks than another, or more at once, and p95 rests on few.
@@ -100,9 +100,9 @@ def _alike(setup: Setup, phases: Sequence[Phase]) -> OpenLoop:
 def make_bait(setup: Setup, hostility: Hostility) -> Bait:
     """What hostile clients send; made before a run begins."""
     scenes, seed = setup.scenes[:1], setup.seed
-    plan = make_call(Kind("think", max(setup.mix.draws), stream=setup.mix.stream > 0), scenes, seed)
-    dear = costly_calls(make_call(Kind("direct", 1), scenes, seed)) if hostility.costly else []
-    labels = [make_call(Kind("label", 1), scenes, seed)] if hostility.labelling else []
+    plan = make_call(RequestKind("think", max(setup.mix.draws), stream=setup.mix.stream > 0), scenes, seed)
+    dear = costly_calls(make_call(RequestKind("direct", 1), scenes, seed)) if hostility.costly else []
+    labels = [make_call(RequestKind("label", 1), scenes, seed)] if hostility.labelling else []
     return Bait(plan, dear, labels)
 
 

@@ -7,7 +7,7 @@ from typing import Final
 
 from looktwice.loadtests.accounting import Summary, summarise
 from looktwice.loadtests.bodies import make_calls, make_drives
-from looktwice.loadtests.loads import OpenLoop, Phase, Window, poisson_arrivals
+from looktwice.loadtests.loads import LoadPhase, OpenLoop, Window, poisson_arrivals
 from looktwice.loadtests.loads import fleet as make_fleet
 from looktwice.loadtests.memory import Growth, MemoryWatch, growth
 from looktwice.loadtests.run import WARM_UP, Ran, Result, Setup, check, needed, run
@@ -29,11 +29,11 @@ def run_steady(setup: Setup) -> Ran:
     return run(OpenLoop(poisson_arrivals(phases, setup.seed), calls), phases, setup)
 
 
-def steady_phases(setup: Setup) -> list[Phase]:
+def steady_phases(setup: Setup) -> list[LoadPhase]:
     """A warm-up and what is measured, both at the same rate."""
     return [
-        Phase(WARM_UP, setup.warm_up_s, setup.rate_rps),
-        Phase(MEASURED, setup.seconds, setup.rate_rps),
+        LoadPhase(WARM_UP, setup.warm_up_s, setup.rate_rps),
+        LoadPhase(MEASURED, setup.seconds, setup.rate_rps),
     ]
 
 
@@ -43,10 +43,10 @@ UNLOADED, BURST, AFTER = "unloaded", "burst", "after"
 def burst(setup: Setup, factor: float, burst_s: float) -> Result:
     """Offer ``factor`` times the rate for ``burst_s``; raises `WorkerDied`, `ValueError`."""
     phases = [
-        Phase(WARM_UP, setup.warm_up_s, setup.rate_rps),
-        Phase(UNLOADED, setup.seconds, setup.rate_rps),
-        Phase(BURST, burst_s, factor * setup.rate_rps),
-        Phase(AFTER, setup.seconds, setup.rate_rps),
+        LoadPhase(WARM_UP, setup.warm_up_s, setup.rate_rps),
+        LoadPhase(UNLOADED, setup.seconds, setup.rate_rps),
+        LoadPhase(BURST, burst_s, factor * setup.rate_rps),
+        LoadPhase(AFTER, setup.seconds, setup.rate_rps),
     ]
     calls = tuple(make_calls(setup.scenes, setup.mix.kinds(needed(phases, setup), setup.seed), setup.seed))
     ran = run(OpenLoop(poisson_arrivals(phases, setup.seed), calls), phases, setup)

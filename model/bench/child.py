@@ -18,10 +18,10 @@ from typing import Any
 
 from looktwice.model.bench.contenders import (
     SHORTCUTS,
-    Answer,
     Contender,
     EngineContender,
     PlainVllm,
+    TimedAnswer,
     Transformers,
 )
 from looktwice.model.bench.memory import forget_peaks, peak_bytes
@@ -109,12 +109,12 @@ async def _serve(job: Mapping[str, Any], replies: Any) -> None:
 
 async def _answers(
     contender: Contender, requests: Sequence[PlanRequest], arrivals_s: Sequence[float]
-) -> list[Answer]:
+) -> list[TimedAnswer]:
     """The answers to requests that arrive at once, or each so many seconds from now."""
     if not arrivals_s:
         return await contender.answer(requests)
 
-    async def later(request: PlanRequest, arrival_s: float) -> Answer:
+    async def later(request: PlanRequest, arrival_s: float) -> TimedAnswer:
         await asyncio.sleep(arrival_s)
         [answer] = await contender.answer([request])
         return answer

@@ -22,7 +22,7 @@ SHORTCUTS = ("jump", "shared_prompts", "shared_rows", "speculate", "reuse", "cap
 
 
 @dataclass(frozen=True)
-class Response:
+class CountedResponse:
     """One draw as the bench counts it: tokens, those chosen, network passes, and whether it parses."""
 
     tokens: int
@@ -32,11 +32,11 @@ class Response:
 
 
 @dataclass(frozen=True)
-class Answer:
+class TimedAnswer:
     """One request: seconds from submission to its last draw, and its draws."""
 
     latency_s: float
-    responses: tuple[Response, ...]
+    responses: tuple[CountedResponse, ...]
 
 
 class Contender(ABC):
@@ -47,7 +47,7 @@ class Contender(ABC):
         return
 
     @abstractmethod
-    async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
+    async def answer(self, requests: Sequence[PlanRequest]) -> list[TimedAnswer]:
         """Answer requests that arrive at once."""
 
     def counts(self) -> dict[str, int]:
@@ -60,12 +60,12 @@ class Contender(ABC):
 
 
 async def _each(
-    requests: Sequence[PlanRequest], respond: Callable[[PlanRequest], Awaitable[list[Response]]]
-) -> list[Answer]:
-    async def timed(request: PlanRequest) -> Answer:
+    requests: Sequence[PlanRequest], respond: Callable[[PlanRequest], Awaitable[list[CountedResponse]]]
+) -> list[TimedAnswer]:
+    async def timed(request: PlanRequest) -> TimedAnswer:
         began_s = time.perf_counter()
         responses = await respond(request)
-        return Answer(time.perf_counter() - began_s, tuple(responses))
+        return TimedAnswer(time.perf_counter() - began_s, tuple(responses))
 
     return list(await asyncio.gather(*map(timed, requests)))
 
@@ -80,10 +80,10 @@ class EngineContender(Contender):
         """Load and warm up."""
         await self._engine.start()
 
-    async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
+    async def answer(self, requests: Sequence[PlanRequest]) -> list[TimedAnswer]:
         """Answer requests that arrive at once."""
 
-        async def respond(request: PlanRequest) -> list[Response]:
+        async def respond(request: PlanRequest) -> list[CountedResponse]:
             events = [event async for event in self._engine.submit(request)]
             return [_counted(event.draw) for event in events if isinstance(event, DrawFinished)]
 
@@ -99,8 +99,8 @@ class EngineContender(Contender):
         await self._engine.stop()
 
 
-def _counted(draw: Draw) -> Response:
-    return Response(sum(draw.tokens.values()), draw.chosen, draw.passes, valid=True)
+def _counted(draw: Draw) -> CountedResponse:
+    return CountedResponse(sum(draw.tokens.values()), draw.chosen, draw.passes, valid=True)
 
 
 class PlainVllm(Contender):
@@ -120,12 +120,12 @@ class PlainVllm(Contender):
             name: CompiledFormat(each.format, self._vocabulary) for name, each in families.items()
         }
 
-    async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
+    async def answer(self, requests: Sequence[PlanRequest]) -> list[TimedAnswer]:
         """Answer requests that arrive at once."""
         from vllm import SamplingParams
         from vllm.sampling_params import RequestOutputKind
 
-        async def respond(request: PlanRequest) -> list[Response]:
+        async def respond(request: PlanRequest) -> list[CountedResponse]:
             controls = request.controls
             parameters = SamplingParams(
                 n=controls.n,
@@ -136,7 +136,7 @@ class PlainVllm(Contender):
                 output_kind=RequestOutputKind.FINAL_ONLY,
             )
             prompt = await asyncio.to_thread(self._engine.prompt, request.scene, request.format)
-            responses: list[Response] = []
+            responses: list[CountedResponse] = []
             async for output in self._engine.llm.generate(prompt.then([]), parameters, request.request_id):
                 format = self._formats[request.format]
                 responses += [
@@ -164,7 +164,7 @@ class Transformers(Contender):
         }
         self._max_tokens, self._cache = max_tokens, cache
 
-    async def answer(self, requests: Sequence[PlanRequest]) -> list[Answer]:
+    async def answer(self, requests: Sequence[PlanRequest]) -> list[TimedAnswer]:
         """Answer requests as one batch, on this thread: torch gets slower where a second one uses it."""
         import torch
 
@@ -200,17 +200,18 @@ class Transformers(Contender):
         ]
         latency_s = time.perf_counter() - began_s
         return [
-            Answer(latency_s, tuple(responses[first : first + n])) for first in range(0, len(responses), n)
+            TimedAnswer(latency_s, tuple(responses[first : first + n]))
+            for first in range(0, len(responses), n)
         ]
 
 
 def _read(
     ids: list[int], format: CompiledFormat, vocabulary: Vocabulary, steps: int | None = None
-) -> Response:
+) -> CountedResponse:
     """A response written without a grammar; each token was chosen, and took a pass."""
     try:
         parse(format, vocabulary.decode(ids))
         valid = True
     except FormatError:
         valid = False
-    return Response(len(ids), len(ids), steps or len(ids), valid)
+    return CountedResponse(len(ids), len(ids), steps or len(ids), valid)

@@ -81,7 +81,7 @@ class _Nothing:
         return _Nothing
 
 
-class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+class _NavsimFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def find_spec(self, name: str, path: object, target: object = None) -> Any:
         if name.split(".")[0] in _UNUSED:
             return importlib.machinery.ModuleSpec(name, self, is_package=True)
@@ -103,7 +103,7 @@ class NavsimScorer:
 
     def __init__(self, version: Version, folders: Sequence[Path]) -> None:
         sys.path[:0] = [str(folder) for folder in folders]
-        finder = _Finder()
+        finder = _NavsimFinder()
         sys.meta_path.insert(0, finder)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

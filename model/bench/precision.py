@@ -14,7 +14,7 @@ from looktwice.model.engines.engine import Controls, PlanRequest
 from looktwice.model.engines.sampling import probabilities, uniform
 from looktwice.model.engines.torch.batch import Batch, Feed
 from looktwice.model.engines.torch.offline import draws_of
-from looktwice.model.engines.torch.runner import Prompt, PromptRequest, Runner
+from looktwice.model.engines.torch.runner import PromptPrefill, PromptRequest, Runner
 from looktwice.model.network.checkpoint import load
 
 _AT_ONCE = 8
@@ -89,7 +89,7 @@ def _margin(exact: Runner, request: PlanRequest, draw: int, written: Sequence[in
     for token in written:
         cursor = cursor.advance(token)
     [prompt] = exact.begin_prompts([PromptRequest(request.scene, request.format, 0)])
-    assert isinstance(prompt, Prompt)
+    assert isinstance(prompt, PromptPrefill)
     exact.feed_prompts([(prompt, exact.prompt_tokens)])
     feed = Feed(0, prompt, 0, [prompt.last_token, *written], [(len(written), cursor.allowed().ids)])
     [[logits]] = exact.feed(Batch.of([feed], exact.memory()))

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from looktwice.model.bench.roofline import Machine, Work
-from looktwice.model.bench.run import Deadlines, Planner, Row
+from looktwice.model.bench.roofline import Machine, PlanCost
+from looktwice.model.bench.run import BenchRow, Deadlines, PlannerLatency
 from looktwice.model.driving.columns import aligned, interval_cell
 
 
@@ -18,7 +18,7 @@ class Roofline:
     machine: Machine
     scenes: int
     n: int
-    work: Work
+    work: PlanCost
     least_s: float
     measured_s: float
 
@@ -40,10 +40,10 @@ class BenchReport:
         deadlines: the torch engine at a steady load.
     """
 
-    rows: tuple[Row, ...]
-    shortcuts: tuple[Row, ...]
+    rows: tuple[BenchRow, ...]
+    shortcuts: tuple[BenchRow, ...]
     rooflines: tuple[Roofline, ...]
-    planners: tuple[Planner, ...] = ()
+    planners: tuple[PlannerLatency, ...] = ()
     deadlines: tuple[Deadlines, ...] = ()
 
     def ratios(self) -> list[dict[str, Any]]:
@@ -125,11 +125,11 @@ class BenchReport:
         return "\n\n".join(parts)
 
 
-def _load(row: Row) -> tuple[int, int, str, float]:
+def _load(row: BenchRow) -> tuple[int, int, str, float]:
     return row.scenes, row.n, row.thinking, row.temperature
 
 
-def _rows(row: Row) -> str:
+def _rows(row: BenchRow) -> str:
     """Rows that were fed, of those that a row for every draw would have come to."""
     fan_out = row.counts.get("fan_out_row_passes")
     return f"{row.counts['row_passes'] / fan_out:.2f}" if fan_out else "-"
@@ -141,7 +141,7 @@ _TITLES: Final = (
 )
 
 
-def _table(rows: Sequence[Row]) -> str:
+def _table(rows: Sequence[BenchRow]) -> str:
     lines = [
         (
             row.engine,

@@ -24,7 +24,7 @@ class Machine:
 
 
 @dataclass(frozen=True)
-class Work:
+class PlanCost:
     """What a plan takes: floating-point operations, and bytes moved.
 
     Weights are moved once a pass and shared by all scenes in it; a scene's keys and values are moved once
@@ -77,7 +77,7 @@ def work_of_plan(
     scene_passes: float,
     together: int,
     dtype: torch.dtype,
-) -> Work:
+) -> PlanCost:
     """A plan's work.
 
     Args:
@@ -105,4 +105,4 @@ def work_of_plan(
     )
     held = text.num_hidden_layers * kv * prompt_tokens
     moved = (tower + decoder) / together + decoder * passes + held * scene_passes
-    return Work(flops, float(size * moved))
+    return PlanCost(flops, float(size * moved))

@@ -27,7 +27,7 @@ a load is not kept up with."""
 
 
 @dataclass(frozen=True)
-class Job:
+class BenchJob:
     """What is compared.
 
     Attributes:
@@ -49,7 +49,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Row:
+class BenchRow:
     """Figures of one contender at one workload; a plan is a request with all its draws.
 
     ``latency_p50_s_spread`` and ``plans_per_s_spread`` are the least and the most of a round; ``valid_share``
@@ -82,7 +82,7 @@ def can_do(contender: str, workload: Workload) -> bool:
     return free or not (contender == "vllm" or contender.startswith("transformers"))
 
 
-def run(job: Job, tell: Callable[[str], None]) -> list[Row]:
+def run(job: BenchJob, tell: Callable[[str], None]) -> list[BenchRow]:
     """Run a job; ``tell`` hears what is being done.
 
     Raises:
@@ -115,7 +115,7 @@ def run(job: Job, tell: Callable[[str], None]) -> list[Row]:
 
 
 @dataclass(frozen=True)
-class Planner:
+class PlannerLatency:
     """Latency of a planner's first request for a scene, and of the next ones: same pictures, moved on."""
 
     n: int
@@ -128,7 +128,7 @@ class Planner:
         return self.next_p50_s / self.cold_p50_s
 
 
-def run_planner(job: Job, load: Workload, steps: int = 4) -> Planner:
+def run_planner(job: BenchJob, load: Workload, steps: int = 4) -> PlannerLatency:
     """Ask the torch engine as a 10 Hz planner does, whose pictures change twice a second."""
     cold: list[float] = []
     next_: list[float] = []
@@ -138,7 +138,7 @@ def run_planner(job: Job, load: Workload, steps: int = 4) -> Planner:
                 [answer] = process.ask("torch", load, number, step=step)["answers"]
                 if number >= job.repeats:  # those before warm it up
                     (next_ if step else cold).append(answer["latency_s"])
-    return Planner(load.n, statistics.median(cold), statistics.median(next_))
+    return PlannerLatency(load.n, statistics.median(cold), statistics.median(next_))
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ class Deadlines:
     latency_p99_s: float
 
 
-def run_deadlines(job: Job, alone: Workload, deadline_ms: int, requests: int = 500) -> Deadlines:
+def run_deadlines(job: BenchJob, alone: Workload, deadline_ms: int, requests: int = 500) -> Deadlines:
     """Ask the torch engine by a Poisson process, at the knee of its load curve.
 
     ``alone`` is what each request asks for.
@@ -235,7 +235,7 @@ class _Process:
 
 
 @contextmanager
-def _process(job: Job, names: Sequence[str]) -> Iterator[_Process]:
+def _process(job: BenchJob, names: Sequence[str]) -> Iterator[_Process]:
     python = job.vllm_python if names[0].startswith("vllm") else sys.executable
     settings = {
         "contenders": list(names),
@@ -269,7 +269,7 @@ def _process(job: Job, names: Sequence[str]) -> Iterator[_Process]:
                 process.wait()
 
 
-def _row(name: str, load: Workload, replies: Sequence[Mapping[str, Any]]) -> Row:
+def _row(name: str, load: Workload, replies: Sequence[Mapping[str, Any]]) -> BenchRow:
     answers = [answer for reply in replies for answer in reply["answers"]]
     latencies = [answer["latency_s"] for answer in answers]
     responses = [response for answer in answers for response in answer["responses"]]
@@ -277,7 +277,7 @@ def _row(name: str, load: Workload, replies: Sequence[Mapping[str, Any]]) -> Row
     rates = [load.scenes / reply["wall_s"] for reply in replies]
     plans, tokens = len(answers), sum(each["tokens"] for each in responses)
     keys = replies[0]["counts"]
-    return Row(
+    return BenchRow(
         engine=name,
         scenes=load.scenes,
         n=load.n,

@@ -46,7 +46,7 @@ def decoding_while(wanted: Callable[[], bool]) -> Generator[None]:
         _wanted.reset(token)
 
 
-class _Reader(io.BytesIO):
+class _GuardedBytes(io.BytesIO):
     """Bytes that can be read so many times, while they are wanted, and no longer than a picture may take."""
 
     def __init__(self, encoded: bytes) -> None:
@@ -127,7 +127,7 @@ def _open(encoded: bytes) -> Image.Image:
     if encoded.startswith(_RIFF) and encoded.count(_FRAME) > MAX_FRAMES:
         raise ImageError(f"the picture has more than {MAX_FRAMES} frames; send one")
     try:
-        image = Image.open(_Reader(encoded), formats=ALLOWED_FORMATS)
+        image = Image.open(_GuardedBytes(encoded), formats=ALLOWED_FORMATS)
     except ImageError:
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:

@@ -140,7 +140,7 @@ def joined(texts: tuple[str, ...]) -> str:
 
 def decisions(text: str) -> tuple[str, ...]:
     """The texts of the decisions of a text, the inverse of `joined`; raises `ThoughtError`."""
-    reader, found = _Reader(text), list[str]()
+    reader, found = _SentenceReader(text), list[str]()
     for number, sentence in enumerate(SENTENCES):
         reader.expect((SPACE if number else "") + sentence.start)
         for words in sentence.words:
@@ -197,7 +197,7 @@ def _meant(words: Words, left: Iterator[str]) -> Iterator[Meaning]:
         yield from _meant(more, left)
 
 
-class _Reader:
+class _SentenceReader:
     def __init__(self, text: str) -> None:
         self._text, self.place = text, 0
 

@@ -27,7 +27,7 @@ BOUND_IOU: Final = FOLLOWS_IOU
 _FIRST_STAGE: Final = 0
 
 
-class Vocabulary(Protocol):
+class BindingVocabulary(Protocol):
     """What a binding needs to know about a tokenizer."""
 
     def decode(self, ids: Sequence[int]) -> str:
@@ -39,7 +39,7 @@ class Vocabulary(Protocol):
         ...
 
 
-def binding_of(request: PlanRequest, codec: TrajectoryCodec, vocabulary: Vocabulary) -> Binding | None:
+def binding_of(request: PlanRequest, codec: TrajectoryCodec, vocabulary: BindingVocabulary) -> Binding | None:
     """The binding of a request that asks for one."""
     return Binding(request.scene.history, codec, vocabulary) if request.controls.bind else None
 
@@ -53,7 +53,7 @@ class Binding:
         history: float32 [16, 4] of the scene.
     """
 
-    def __init__(self, history: FloatArray, codec: TrajectoryCodec, vocabulary: Vocabulary) -> None:
+    def __init__(self, history: FloatArray, codec: TrajectoryCodec, vocabulary: BindingVocabulary) -> None:
         self._vocabulary = vocabulary
         self._ids = vocabulary.code_ids(_FIRST_STAGE)
         trajectories = codec.first_trajectories(history)

@@ -17,7 +17,7 @@ from looktwice.model.driving.next_view import Motion
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import CAMERAS, Scene
 from looktwice.model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S, FloatArray, at_10_hz
-from looktwice.model.families.family import Attempt, Foreseen, View
+from looktwice.model.families.family import Attempt, Foreseen, PictureRequest
 from looktwice.model.formats.pieces import Plain, Value
 from looktwice.model.network.model_card import ModelCard
 
@@ -148,9 +148,9 @@ class Controls:
         return None if self.imagine == "auto" else self.imagine == "always"
 
     @property
-    def view(self) -> View | None:
+    def view(self) -> PictureRequest | None:
         """The picture that is asked for, if one is."""
-        return None if self.camera is None else View(self.camera, self.motion)
+        return None if self.camera is None else PictureRequest(self.camera, self.motion)
 
     def second_look(self, think_probability: float) -> bool | None:
         """Whether these controls decide for a second look; None leaves it to the draw."""
@@ -312,7 +312,7 @@ Event = Started | TextWritten | CodesWritten | SectionFinished | DraftFinished |
 
 
 @dataclass(frozen=True)
-class Load:
+class EngineLoad:
     """How full an engine is.
 
     Attributes:
@@ -335,7 +335,7 @@ class Engine(Protocol):
         ...
 
     @property
-    def load(self) -> Load:
+    def load(self) -> EngineLoad:
         """How full it is now."""
         ...
 

@@ -25,7 +25,7 @@ from looktwice.model.formats.phrases import in_phrases
 BoolArray = npt.NDArray[np.bool_]
 
 
-class Vocabulary(Protocol):
+class MaskVocabulary(Protocol):
     """What a mask needs to know about a tokenizer."""
 
     def decode(self, ids: Sequence[int]) -> str:
@@ -34,7 +34,7 @@ class Vocabulary(Protocol):
 
 
 def reason_mask_of(
-    request: PlanRequest, family: Family, vocabulary: Vocabulary, facts: FloatArray | None
+    request: PlanRequest, family: Family, vocabulary: MaskVocabulary, facts: FloatArray | None
 ) -> ReasonMask | None:
     """The mask of a request; None where anything may be stated, or nobody knows what is in view.
 
@@ -66,7 +66,7 @@ class ReasonMask:
     """
 
     def __init__(
-        self, reasons: Callable[[], Iterable[Statement]], section: str, vocabulary: Vocabulary
+        self, reasons: Callable[[], Iterable[Statement]], section: str, vocabulary: MaskVocabulary
     ) -> None:
         self._reasons, self._section, self._vocabulary = reasons, section, vocabulary
 

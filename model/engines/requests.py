@@ -21,7 +21,7 @@ from looktwice.model.engines.engine import (
 )
 from looktwice.model.engines.reason_mask import ReasonMask
 from looktwice.model.engines.response import Response, SectionText
-from looktwice.model.families.family import Attempt, Branch, Family, View
+from looktwice.model.families.family import Attempt, Branch, Family, PictureRequest
 from looktwice.model.formats.cursor import CompiledFormat, Cursor
 from looktwice.model.formats.pieces import NOTHING, FormatError
 from looktwice.model.formats.said import Said
@@ -157,7 +157,7 @@ def told(
 
 
 def inputs_of(
-    builder: InputBuilder, scene: Scene, format: str, attempt: Attempt | None, view: View | None
+    builder: InputBuilder, scene: Scene, format: str, attempt: Attempt | None, view: PictureRequest | None
 ) -> ModelInputs:
     """A scene as the network takes it.
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from looktwice.model.driving.hashing import hash_of, scene_hash
 from looktwice.model.driving.perceived import Perceived, PerceivedAgent
 from looktwice.model.driving.plan import Plan, parse_plan
-from looktwice.model.engines.engine import Draw, DrawFinished, Engine, Event, Load, PlanRequest, Started
+from looktwice.model.engines.engine import Draw, DrawFinished, Engine, EngineLoad, Event, PlanRequest, Started
 from looktwice.model.families.family import Foreseen, NextPicture
 from looktwice.model.network.model_card import ModelCard
 
@@ -51,7 +51,7 @@ class DrawStore:
         return self._engine.card
 
     @property
-    def load(self) -> Load:
+    def load(self) -> EngineLoad:
         """The engine's."""
         return self._engine.load
 

@@ -114,7 +114,7 @@ MEASURES: Final = tuple(each.name for each in fields(StageResult) if not each.na
 
 
 @dataclass(frozen=True)
-class Stage:
+class MeasuredStage:
     """A checkpoint, measured.
 
     Attributes:
@@ -134,7 +134,7 @@ class Stage:
     scores: Mapping[Version, Sequence[SceneScore]]
 
 
-class _Answer(NamedTuple):
+class _JudgedAnswer(NamedTuple):
     """The answer of one seed to one scene, judged with and without ground truth."""
 
     draw: Draw
@@ -156,7 +156,7 @@ async def evaluate_stage(
     judges: Sequence[SceneJudge],
     concurrency: int = 16,
     on_result: Callable[[Variant, SceneResult], None] | None = None,
-) -> Stage:
+) -> MeasuredStage:
     """Evaluate a started engine of one stage.
 
     Args:
@@ -201,7 +201,7 @@ async def evaluate_stage(
             ]
         )
     threshold, feedback = _refined_in_training(engine.card)
-    return Stage(
+    return MeasuredStage(
         name,
         threshold,
         feedback,
@@ -214,7 +214,7 @@ async def evaluate_stage(
     )
 
 
-def _answer(judge: SceneJudge, draws: Sequence[Draw]) -> _Answer:
+def _answer(judge: SceneJudge, draws: Sequence[Draw]) -> _JudgedAnswer:
     """The agreed draw, and what automatic feedback goes by."""
     chosen = agreed(np.stack([draw.at_10_hz for draw in draws]))
     worth = judge.scores(plans_of(np.stack([draw.scored for draw in draws])), VERSION).partial_score
@@ -223,7 +223,7 @@ def _answer(judge: SceneJudge, draws: Sequence[Draw]) -> _Answer:
     plan = plans_of(draws[chosen].scored[None])
     foreseen = score(world, plan, VERSION, centre=True)
     [judged] = judged_plans(world, plan, foreseen, Others(), centre=True)
-    return _Answer(draws[chosen], float(worth[chosen]), float(worth.mean()), judged)
+    return _JudgedAnswer(draws[chosen], float(worth[chosen]), float(worth.mean()), judged)
 
 
 async def _refined(
@@ -231,7 +231,7 @@ async def _refined(
     judges: Sequence[SceneJudge],
     variant: Variant,
     refining: Family,
-    answers: Mapping[str, _Answer],
+    answers: Mapping[str, _JudgedAnswer],
     concurrency: int,
 ) -> dict[str, float]:
     """PDMS of one refinement of each answer that fails or seems to, by automatic feedback."""
@@ -260,7 +260,7 @@ async def _refined(
 
 def _result(
     labelled: LabelledScene,
-    answer: _Answer,
+    answer: _JudgedAnswer,
     pdms: SceneScore,
     epdms: SceneScore,
     refining: Family | None,

@@ -11,7 +11,7 @@ from looktwice.model.driving.pdm.comfort import Version
 from looktwice.model.driving.pdm.judged import THRESHOLD
 from looktwice.model.driving.pdm.judging import SceneJudge
 from looktwice.model.evaluation.bootstrap import Comparison, compare
-from looktwice.model.evaluation.failures import MEASURES, Stage
+from looktwice.model.evaluation.failures import MEASURES, MeasuredStage
 from looktwice.model.evaluation.figures import FigureRow, figure_table
 from looktwice.model.evaluation.scores import (
     SceneScore,
@@ -35,7 +35,7 @@ class FailuresReport:
     """
 
     scores: ScoreTable
-    stages: Sequence[Stage]
+    stages: Sequence[MeasuredStage]
     comparisons: Sequence[Comparison]
 
     @property
@@ -82,7 +82,7 @@ class FailuresReport:
             yield [comparison_cells(comparison) for comparison in self.comparisons]
 
 
-def failures_report(judges: Sequence[SceneJudge], stages: Sequence[Stage]) -> FailuresReport:
+def failures_report(judges: Sequence[SceneJudge], stages: Sequence[MeasuredStage]) -> FailuresReport:
     """The report of stages that were evaluated on the scenes of ``judges``, in the order of learning.
 
     Raises:
@@ -96,7 +96,7 @@ def failures_report(judges: Sequence[SceneJudge], stages: Sequence[Stage]) -> Fa
     return FailuresReport(table_of(judges, found), stages, list(_comparisons(stages)))
 
 
-def _comparisons(stages: Sequence[Stage]) -> Iterator[Comparison]:
+def _comparisons(stages: Sequence[MeasuredStage]) -> Iterator[Comparison]:
     pairs = list(zip(stages[1:], stages[:-1], strict=True))
     if len(stages) > 2:
         pairs.append((stages[-1], stages[0]))
@@ -115,7 +115,7 @@ def _comparisons(stages: Sequence[Stage]) -> Iterator[Comparison]:
             yield compare(f"{stage.name}, all: refined where noticed : draft", driven, stage.results, "pdms")
 
 
-def _shared(one: Stage, other: Stage, measure: str) -> bool:
+def _shared(one: MeasuredStage, other: MeasuredStage, measure: str) -> bool:
     """Whether some scene has a measure in both."""
     has = [
         {each.scene_id for each in stage.results if getattr(each, measure) is not None}

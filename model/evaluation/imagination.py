@@ -17,8 +17,8 @@ from looktwice.model.evaluation.bootstrap import Comparison, compare
 from looktwice.model.evaluation.entering import EnteringResult, evaluate_entering
 from looktwice.model.evaluation.figures import FigureRow, figure_table
 from looktwice.model.evaluation.next_frames import (
+    NextFrameResults,
     Painter,
-    Pictures,
     TowerFeatures,
     copied,
     imagined_codes,
@@ -310,7 +310,7 @@ def _kept(pictures: Mapping[str, Frame], labelled: LabelledScene, camera: str) -
     return pictures[labelled.scene.scene_id]
 
 
-def _picture_row(name: str, pictures: Pictures) -> FigureRow:
+def _picture_row(name: str, pictures: NextFrameResults) -> FigureRow:
     row = FigureRow.of(name, pictures.results, _PICTURE_MEASURES)
     return replace(
         row,
@@ -322,7 +322,7 @@ def _picture_row(name: str, pictures: Pictures) -> FigureRow:
 def _comparisons(
     waypoints: _Waypoints,
     responses: Mapping[str, Sequence[ResponseResult]],
-    pictures: Mapping[str, Pictures],
+    pictures: Mapping[str, NextFrameResults],
 ) -> Iterator[Comparison]:
     """What should differ. The difference of passes is what a picture takes."""
     told = (UNTHINKING, GIVEN_CAME, GIVEN_UNCHANGED, GIVEN_OTHER)

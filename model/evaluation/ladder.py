@@ -15,7 +15,7 @@ from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.engines.engine import Controls, Draw, Thinking
 from looktwice.model.evaluation.bootstrap import Comparison, compare
 from looktwice.model.evaluation.open_loop import SceneResult, evaluate_draws
-from looktwice.model.evaluation.report import Report, variant_rows
+from looktwice.model.evaluation.report import EvaluationReport, variant_rows
 from looktwice.model.evaluation.variants import Variant
 
 META_ACT: Final = "meta-act"
@@ -181,7 +181,7 @@ class LadderReport:
         difficulty: by adaptive row, from easy to hard.
     """
 
-    report: Report
+    report: EvaluationReport
     difficulty: Mapping[str, Sequence[Difficulty]]
 
     def to_json(self) -> dict[str, Any]:
@@ -217,7 +217,7 @@ def ladder_report(results: Results) -> LadderReport:
                 difficulty[adaptive] = by_difficulty(of[adaptive], of[never])
             if adaptive in of and any(result.thought_iou_first is not None for result in of[adaptive]):
                 comparisons.append(revision(adaptive, of[adaptive]))
-    return LadderReport(Report(tuple(rows), tuple(comparisons)), difficulty)
+    return LadderReport(EvaluationReport(tuple(rows), tuple(comparisons)), difficulty)
 
 
 def write_scenes(results: Results, path: Path) -> None:

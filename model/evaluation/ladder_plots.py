@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from looktwice.model.evaluation.ladder import Difficulty
-from looktwice.model.evaluation.table import Row
+from looktwice.model.evaluation.table import VariantRow
 
 _THINK: Final = "#c9772b"
 _ERROR: Final = "#2b6cb0"
@@ -36,7 +36,7 @@ def difficulty_plot(groups: Sequence[Difficulty], picture: Path) -> None:
     figure.savefig(picture, format="png")
 
 
-def temperature_plot(points: Sequence[tuple[float, Row]], picture: Path) -> None:
+def temperature_plot(points: Sequence[tuple[float, VariantRow]], picture: Path) -> None:
     """CF-VLA's figure 8: think rate and minADE over the sampling temperature; a PNG."""
     figure, axes = _axes("temperature")
     temperatures = [value for value, _ in points]
@@ -49,7 +49,7 @@ def temperature_plot(points: Sequence[tuple[float, Row]], picture: Path) -> None
     figure.savefig(picture, format="png")
 
 
-def threshold_plot(points: Sequence[tuple[float, Row]], picture: Path) -> None:
+def threshold_plot(points: Sequence[tuple[float, VariantRow]], picture: Path) -> None:
     """Risk over compute: errors and collisions over the tokens that each think threshold costs; a PNG."""
     figure, axes = _axes("tokens a draw")
     tokens = [_of(row, "output_tokens") for _, row in points]
@@ -82,7 +82,7 @@ def _axes(x_label: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _of(row: Row, measure: str) -> float:
+def _of(row: VariantRow, measure: str) -> float:
     value = row.values[measure]
     if value is None:
         raise ValueError(f"row {row.name!r} has no {measure}")

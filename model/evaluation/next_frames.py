@@ -18,7 +18,7 @@ from looktwice.model.driving.intervals import Interval
 from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.engines.engine import Draw
-from looktwice.model.families.family import View
+from looktwice.model.families.family import PictureRequest
 from looktwice.model.network.checkpoint import Loaded
 from looktwice.model.network.inputs import moved_pictures
 from looktwice.model.network.patches import resize
@@ -48,7 +48,7 @@ class PictureResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class NextFrameResults:
     """Some pictures of as many scenes, against what came.
 
     Attributes:
@@ -88,7 +88,7 @@ def measure_pictures(
     cameras: Mapping[str, str],
     painters: Mapping[str, Painter],
     features: Callable[[Frame], Array],
-) -> dict[str, Pictures]:
+) -> dict[str, NextFrameResults]:
     """Hold the pictures of some painters against what came.
 
     Args:
@@ -115,7 +115,7 @@ def measure_pictures(
     episodes = [labelled.episode_id for labelled in scenes]
     there = np.stack(came_seen)
     return {
-        name: Pictures(tuple(results[name]), *frechet_interval(np.stack(of), there, episodes))
+        name: NextFrameResults(tuple(results[name]), *frechet_interval(np.stack(of), there, episodes))
         for name, of in seen.items()
     }
 
@@ -154,7 +154,7 @@ def through_codes(visual_codes: VisualCodes, shown: Painter) -> Painter:
     """
 
     def paint(labelled: LabelledScene, camera: str) -> Frame:
-        moved = moved_pictures(labelled.scene, View(camera))
+        moved = moved_pictures(labelled.scene, PictureRequest(camera))
         return visual_codes.decode(visual_codes.encode(shown(labelled, camera)), moved)
 
     return paint

@@ -33,7 +33,7 @@ Array = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
+class FactReadings:
     """Facts [n, len(FACTS)] of n scenes with a route.
 
     Attributes:
@@ -55,7 +55,7 @@ def read_facts(
     loaded: Loaded,
     scenes: Iterable[LabelledScene],
     on_done: Callable[[int], None] | None = None,
-) -> Reading:
+) -> FactReadings:
     """Look at scenes through a checkpoint; those without a route are left out.
 
     Args:
@@ -68,7 +68,7 @@ def read_facts(
     """
     if loaded.model.resampler is None:
         raise ValueError(f"{loaded.card.name} has no resampler: its perception cannot be read")
-    parts: list[Reading] = []
+    parts: list[FactReadings] = []
     done = 0
     for batch in _batches(labelled for labelled in scenes if labelled.scene.route is not None):
         parts.append(_reading(loaded, batch))
@@ -77,12 +77,12 @@ def read_facts(
             on_done(done)
     if not parts:
         raise ValueError("no scene has a route: facts are relative to one")
-    columns = [[getattr(part, field.name) for part in parts] for field in fields(Reading)]
-    return Reading(*(np.concatenate(column) for column in columns))
+    columns = [[getattr(part, field.name) for part in parts] for field in fields(FactReadings)]
+    return FactReadings(*(np.concatenate(column) for column in columns))
 
 
-def _reading(loaded: Loaded, batch: list[LabelledScene]) -> Reading:
-    return Reading(
+def _reading(loaded: Loaded, batch: list[LabelledScene]) -> FactReadings:
+    return FactReadings(
         read=_read(loaded, batch),
         true=np.stack([scene_facts(labelled) for labelled in batch]),
         history=np.stack([labelled.scene.history for labelled in batch]),
@@ -116,7 +116,7 @@ def _read(loaded: Loaded, batch: list[LabelledScene]) -> Array:
     return values
 
 
-def perception_rows(reading: Reading) -> list[dict[str, Any]]:
+def perception_rows(reading: FactReadings) -> list[dict[str, Any]]:
     """What a table of perception tells, a row for each fact: ``fact``, ``scenes``, and its measures.
 
     ``auc`` is for facts that are or are not so, ``error`` the median in the fact's unit, ``r2`` the share of
@@ -151,7 +151,7 @@ def perception_rows(reading: Reading) -> list[dict[str, Any]]:
     return rows
 
 
-def _stacked(reading: Reading, prefixes: list[str]) -> dict[str, tuple[Array, Array]]:
+def _stacked(reading: FactReadings, prefixes: list[str]) -> dict[str, tuple[Array, Array]]:
     """Fields of facts with any of the prefixes, (read, true), one prefix after the other."""
     told = [name.removeprefix(f"{prefixes[0]}_") for name in FACTS if name.startswith(f"{prefixes[0]}_")]
     places = {field: [FACTS.index(f"{prefix}_{field}") for prefix in prefixes] for field in told}

@@ -21,7 +21,7 @@ from looktwice.model.evaluation.open_loop import (
     evaluate_baselines,
     evaluate_trajectories,
 )
-from looktwice.model.evaluation.table import Row, format_table, to_json
+from looktwice.model.evaluation.table import VariantRow, format_table, to_json
 from looktwice.model.evaluation.variants import Variant, evaluate_engine
 from looktwice.model.families.registry import family_named
 
@@ -30,7 +30,7 @@ SOON_SUBGROUP = f"lead within {LEAD_WITHIN_S:.0f} s"
 
 
 @dataclass(frozen=True)
-class Report:
+class EvaluationReport:
     """Rows and comparisons of one evaluation.
 
     Attributes:
@@ -39,7 +39,7 @@ class Report:
             copies it, 0 does not mind.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[VariantRow, ...]
     comparisons: tuple[Comparison, ...]
     speed_response: Mapping[str, Mapping[float, float]] = field(default_factory=dict)
 
@@ -68,7 +68,7 @@ async def evaluate_checkpoint(
     concurrency: int = 16,
     on_result: Callable[[Variant, SceneResult], None] | None = None,
     planners: Mapping[str, Callable[[LabelledScene], FloatArray]] = MappingProxyType({}),
-) -> Report:
+) -> EvaluationReport:
     """Evaluate a started engine in every variant, the expert and all baselines, on the same scenes.
 
     Args:
@@ -88,11 +88,13 @@ async def evaluate_checkpoint(
     results = await evaluate_variants(engine, scenes, variants, concurrency=concurrency, on_result=on_result)
     rows = [row for name, of in baselines.items() for row in _rows(name, of)]
     rows += [row for variant, of in results.items() for row in variant_rows(variant, of)]
-    return Report(tuple(rows), tuple(compare_variants(baselines, results)), speed_responses(results))
+    return EvaluationReport(
+        tuple(rows), tuple(compare_variants(baselines, results)), speed_responses(results)
+    )
 
 
 def speed_responses(results: Mapping[Variant, Sequence[SceneResult]]) -> dict[str, dict[float, float]]:
-    """How much of a change of speed the paths of variants follow; see `Report.speed_response`."""
+    """How much of a change of speed the paths of variants follow; see `EvaluationReport.speed_response`."""
     path_m = {variant: sum(result.path_m for result in of) for variant, of in results.items()}
     responses: dict[str, dict[float, float]] = {}
     for variant, length_m in path_m.items():
@@ -126,18 +128,18 @@ async def evaluate_variants(
     return results
 
 
-def variant_rows(variant: Variant, results: Sequence[SceneResult]) -> list[Row]:
+def variant_rows(variant: Variant, results: Sequence[SceneResult]) -> list[VariantRow]:
     """A variant's rows: over all scenes, and over those with a lead vehicle close by."""
     controls = variant.controls
     return _rows(variant.name, results, thinking=controls.thinking, n=controls.n, route=variant.route)
 
 
-def _rows(name: str, results: Sequence[SceneResult], **about: Any) -> list[Row]:
+def _rows(name: str, results: Sequence[SceneResult], **about: Any) -> list[VariantRow]:
     """A variant's row over all scenes, and those over scenes with a lead vehicle close by or soon met."""
-    rows = [Row.of(name, results, MEASURES, **about)]
+    rows = [VariantRow.of(name, results, MEASURES, **about)]
     for subgroup, of in ((LEAD_SUBGROUP, _with_lead(results)), (SOON_SUBGROUP, _soon(results))):
         if of:
-            rows.append(Row.of(name, of, MEASURES, subgroup=subgroup, **about))
+            rows.append(VariantRow.of(name, of, MEASURES, subgroup=subgroup, **about))
     return rows
 
 

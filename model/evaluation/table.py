@@ -13,7 +13,7 @@ from looktwice.model.evaluation.figures import FigureRow
 
 
 @dataclass(frozen=True)
-class Row(FigureRow):
+class VariantRow(FigureRow):
     """A variant's row, with all `MEASURES`.
 
     Attributes:
@@ -29,7 +29,7 @@ class Row(FigureRow):
     subgroup: str | None = None
 
 
-def to_json(rows: Sequence[Row], comparisons: Sequence[Comparison] = ()) -> dict[str, Any]:
+def to_json(rows: Sequence[VariantRow], comparisons: Sequence[Comparison] = ()) -> dict[str, Any]:
     """The whole report: ``scenes``, ``episodes``, ``rows`` and ``comparisons``."""
     return {
         "scenes": max((row.scenes for row in rows), default=0),
@@ -63,7 +63,7 @@ _WITH_INTERVAL: Final = ("agreed_ade_m",)
 """The ADE that is driven by; JSON has all intervals."""
 
 
-def format_table(rows: Sequence[Row], comparisons: Sequence[Comparison] = ()) -> str:
+def format_table(rows: Sequence[VariantRow], comparisons: Sequence[Comparison] = ()) -> str:
     """The table as plain text; the ADE that is driven by carries its 95 % interval, comparisons follow."""
     lines = [["", "scenes", "n", *titles(_COLUMNS, _WITH_INTERVAL)]]
     for row in rows:

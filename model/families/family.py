@@ -15,9 +15,9 @@ from looktwice.model.driving.scene import CAMERAS
 from looktwice.model.driving.thoughts import Thoughts
 from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, check_times
 from looktwice.model.families.prompts import Attempt as Attempt
+from looktwice.model.families.prompts import PictureRequest as PictureRequest
 from looktwice.model.families.prompts import Situation as Situation
 from looktwice.model.families.prompts import TextInputs as TextInputs
-from looktwice.model.families.prompts import View as View
 from looktwice.model.formats.pieces import (
     Format,
     FormatError,
@@ -232,7 +232,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Reflection:
+class Counterfactual:
     """A counterfactual example's own parts: a plan of the model's own, and why it is to be corrected.
 
     ``thinking`` is empty where it is not: such a plan is acted on. ``revised_plan`` is what the reasoning
@@ -278,7 +278,7 @@ class Lesson:
     plan: Plan
     codes: tuple[int, ...]
     future: FloatArray
-    reflection: Reflection | None = None
+    reflection: Counterfactual | None = None
     thoughts: Thoughts | None = None
     perceived: Perceived | None = None
     next_picture: NextPicture | None = None

@@ -24,7 +24,7 @@ class Attempt:
     feedback: str
 
 
-class View(NamedTuple):
+class PictureRequest(NamedTuple):
     """A picture that is asked for: what a camera will see in half a second.
 
     Attributes:

@@ -1,7 +1,7 @@
 """Walking a response format token by token: what is forced, what is allowed, where we are.
 
 A `Cursor` is immutable: draws that have written the same tokens may share one, and forking is free.
-No torch here; a vocabulary is anything that satisfies `Vocabulary`.
+No torch here; a vocabulary is anything that satisfies `FormatVocabulary`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from looktwice.model.formats.writing import Token as Token
 from looktwice.model.formats.writing import write
 
 
-class Vocabulary(Protocol):
+class FormatVocabulary(Protocol):
     """What a format needs to know about a tokenizer."""
 
     @property
@@ -63,7 +63,7 @@ class Vocabulary(Protocol):
         ...
 
 
-class Run(NamedTuple):
+class ForcedRun(NamedTuple):
     """Within forced tokens."""
 
     ids: tuple[int, ...]
@@ -97,7 +97,7 @@ class Ways(NamedTuple):
     ways: tuple[tuple[Active, Rest], ...]
 
 
-Active = Run | AtChoice | InText | AtCode | Ways
+Active = ForcedRun | AtChoice | InText | AtCode | Ways
 Rest = tuple[Piece, str, "Rest"] | None
 """What comes behind the active piece: a linked list of pieces with the section each stands in."""
 Written = tuple[Token, "Written"] | None
@@ -132,7 +132,7 @@ class CompiledFormat:
             two ways.
     """
 
-    def __init__(self, format: Format, vocabulary: Vocabulary) -> None:
+    def __init__(self, format: Format, vocabulary: FormatVocabulary) -> None:
         self.format = format
         self._vocabulary = vocabulary
         self._literals: dict[str, tuple[int, ...]] = {}
@@ -273,7 +273,7 @@ class CompiledFormat:
             match piece:
                 case Literal(text):
                     if ids := self.literal(text):
-                        return Cursor(self, Run(ids, 0), section, after, written)
+                        return Cursor(self, ForcedRun(ids, 0), section, after, written)
                     rest = after
                 case Sequence(parts):
                     for part in reversed(parts):
@@ -336,14 +336,14 @@ class Cursor:
     @property
     def ending(self) -> bool:
         """Whether only forced tokens are left."""
-        return isinstance(self.active, Run) and self.rest is None
+        return isinstance(self.active, ForcedRun) and self.rest is None
 
     def allowed(self) -> Allowed:
         """What may come next; a single id means the token is forced. Not to be called when done."""
         name: str | None = None
         ranks: npt.NDArray[np.int64] | None = None
         match self.active:
-            case Run(ids, position):
+            case ForcedRun(ids, position):
                 allowed = np.array([ids[position]], np.int64)
             case AtChoice(choice, node):
                 allowed, name = node.ids, choice.name
@@ -364,7 +364,7 @@ class Cursor:
         run: list[Token] = []
         cursor = self
         while not cursor.done:
-            if isinstance(cursor.active, Run):
+            if isinstance(cursor.active, ForcedRun):
                 ids, position = cursor.active
                 run += [Token(token, cursor.section) for token in ids[position:]]
                 written = self.compiled.noted(cursor.written, cursor.section, ids[position:])
@@ -381,9 +381,9 @@ class Cursor:
         """The cursor behind ``token``; raises `FormatError` when it is not allowed here."""
         written = self.compiled.noted(self.written, self.section, (token,))
         match self.active:
-            case Run(ids, position) if ids[position] == token:
+            case ForcedRun(ids, position) if ids[position] == token:
                 if position + 1 < len(ids):
-                    return self._at(Run(ids, position + 1), written)
+                    return self._at(ForcedRun(ids, position + 1), written)
                 return self.compiled._enter(self.rest, written)
             case AtChoice(choice, node) if token in node.children:
                 then = node.children[token]
@@ -395,7 +395,7 @@ class Cursor:
                     if behind.matched < rules.end:
                         return self._at(InText(piece, behind), written)
                     if rules.end < len(rules.stop):
-                        return self._at(Run(rules.stop, rules.end), written)
+                        return self._at(ForcedRun(rules.stop, rules.end), written)
                     return self.compiled._enter(self.rest, written)
             case AtCode(piece, place) if _holds(self.compiled.codes(piece, place), token):
                 if place + 1 < piece.count:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from looktwice.model.formats.cursor import Active, AtChoice, AtCode, Cursor, InText, Rest, Run, Ways
+from looktwice.model.formats.cursor import Active, AtChoice, AtCode, Cursor, ForcedRun, InText, Rest, Ways
 from looktwice.model.formats.free_text import BEGUN, TextState
 from looktwice.model.formats.pieces import (
     Choice,
@@ -26,7 +26,7 @@ from looktwice.model.formats.pieces import (
     Sequence,
     Shorthand,
 )
-from looktwice.model.formats.plan_tracks import MAX_SEGMENTS, Track, TrackWord
+from looktwice.model.formats.plan_tracks import MAX_SEGMENTS, TrackRest, TrackWord
 from looktwice.model.formats.trie import Node
 
 
@@ -63,7 +63,7 @@ class _Exporter:
 
     def _active(self, active: Active | None) -> str:
         match active:
-            case Run(ids, position):
+            case ForcedRun(ids, position):
                 return self._tokens(ids[position:])
             case AtChoice(choice, node):
                 # An option that may end at this node is another of the cursor's ways.
@@ -91,7 +91,7 @@ class _Exporter:
                 return self._text(piece, BEGUN)
             case Codes(_, count):
                 return self._codes(piece, range(count))
-            case Track() | TrackWord():
+            case TrackRest() | TrackWord():
                 free = replace(piece, segments_left=MAX_SEGMENTS, previous=None, aim=None)
                 return self._later(replace(free, start=0) if isinstance(free, TrackWord) else free)
             case Shorthand():
@@ -100,7 +100,7 @@ class _Exporter:
                     self._shorthands[piece] = text and self._named(text)
                 return self._shorthands[piece]
 
-    def _later(self, piece: Track | TrackWord) -> str:
+    def _later(self, piece: TrackRest | TrackWord) -> str:
         if piece not in self._names:
             name = self._names[piece] = f"track_{len(self._names)}"
             self._open.append((name, piece.expand()))

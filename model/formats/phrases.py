@@ -49,7 +49,7 @@ _ALL: Final = frozenset(CHANGES)
 
 
 @dataclass(frozen=True)
-class Reflection(Narrowing):
+class ReflectionPhrases(Narrowing):
     """A reflection on the first plan: statements of changes that this plan leaves room for, or none.
 
     Attributes:
@@ -75,7 +75,7 @@ class Reflection(Narrowing):
 
 def in_phrases(format: Format) -> bool:
     """Whether a format writes reflections in phrases."""
-    return any(isinstance(each, Reflection | Phrases) for each in walk(format.body))
+    return any(isinstance(each, ReflectionPhrases | Phrases) for each in walk(format.body))
 
 
 @dataclass(frozen=True)

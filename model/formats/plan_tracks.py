@@ -80,7 +80,7 @@ class PlanTracks(Compound):
             if group in kept:
                 parts += _written_out(group, kept[group])
             else:
-                start = Track(group, start=0, segments_left=MAX_SEGMENTS, aim=aims.get(group))
+                start = TrackRest(group, start=0, segments_left=MAX_SEGMENTS, aim=aims.get(group))
                 parts += [Literal(f"- {group}\n"), start]
         return Sequence(tuple(parts))
 
@@ -216,7 +216,7 @@ def _most(change: Change, previous: str, left: int, segments_left: int) -> int:
 
 
 @dataclass(frozen=True)
-class Track(Shorthand):
+class TrackRest(Shorthand):
     """The rest of one track from the tick ``start`` on, in at most ``segments_left`` meta-actions.
 
     No word follows itself: ``previous`` is the word before ``start``. ``aim`` is what the rest has to reach.
@@ -260,7 +260,9 @@ class TrackWord(Shorthand):
         words = []
         for word in self.words():
             aim = self.aim and self.aim.behind(word, self.start, self.end)
-            rest = (Track(self.group, self.end, self.segments_left, word, aim),) if self.end < TICKS else ()
+            rest = (
+                (TrackRest(self.group, self.end, self.segments_left, word, aim),) if self.end < TICKS else ()
+            )
             words.append(Option(f" {word}", Sequence((Literal("\n"), *rest))))
         return Sequence((Literal("s:"), Choice(tuple(words))))
 

@@ -22,7 +22,7 @@ from looktwice.model.formats.pieces import (
     Value,
     walk,
 )
-from looktwice.model.formats.writing import ByName, InOrder, Source
+from looktwice.model.formats.writing import ByName, InOrder, ValueSource
 
 Decided: TypeAlias = "Value | tuple[int | None, ...]"
 """A value; of codes, some places may be left open."""
@@ -49,7 +49,7 @@ def with_said(body: Piece, said: Said) -> Piece:
     return found
 
 
-def _decided(piece: Piece, values: Source | None, sources: Mapping[str, Source]) -> Piece:
+def _decided(piece: Piece, values: ValueSource | None, sources: Mapping[str, ValueSource]) -> Piece:
     """``piece`` as it writes the values that it takes, and as it is where there are none left."""
     match piece:
         case Section(name, body):

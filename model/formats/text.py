@@ -41,7 +41,7 @@ def parse(compiled: CompiledFormat, text: str, given: Mapping[str, Plan] | None 
     Raises:
         FormatError: with line and column; also for text behind the response's end.
     """
-    reader = _Reader(compiled, text)
+    reader = _TextReader(compiled, text)
     reader.read(compiled.body(given), reader.section(""))
     if reader.position != len(text):
         raise reader.error("expected the end of the response")
@@ -58,14 +58,14 @@ def parse_beginning(compiled: CompiledFormat, text: str, given: Mapping[str, Pla
         compiled, given: as of `parse`.
         text: the response so far.
     """
-    reader = _Reader(compiled, text)
+    reader = _TextReader(compiled, text)
     # What is not written yet cannot be read.
     with suppress(FormatError):
         reader.read(compiled.body(given), reader.section(""))
     return reader.values()
 
 
-class _Reader:
+class _TextReader:
     def __init__(self, compiled: CompiledFormat, text: str) -> None:
         self._compiled, self._text, self.position = compiled, text, 0
         self._section, self._texts = "", dict[str, str]()

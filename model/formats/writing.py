@@ -48,7 +48,7 @@ def write(compiled: CompiledFormat, body: Piece, values: Values) -> list[Token]:
     return writer.tokens
 
 
-class Source(Protocol):
+class ValueSource(Protocol):
     """Values that pieces take."""
 
     def take(self, name: str | None) -> Value:
@@ -120,7 +120,7 @@ class _Writer:
             self._sections[name] = InOrder(self._values.all(name), f"section {name!r}")
         return self._sections[name]
 
-    def write(self, piece: Piece, section: str, source: Source) -> None:
+    def write(self, piece: Piece, section: str, source: ValueSource) -> None:
         match piece:
             case Literal(text):
                 self._emit(self._compiled.literal(text), section)

@@ -17,7 +17,7 @@ from looktwice.model.driving.images import ImageError, decode_image
 from looktwice.model.driving.next_view import expected_views
 from looktwice.model.driving.scene import Clip, Scene
 from looktwice.model.driving.trajectory import FloatArray
-from looktwice.model.families.family import Attempt, Situation, TextInputs, View
+from looktwice.model.families.family import Attempt, PictureRequest, Situation, TextInputs
 from looktwice.model.families.registry import family_named
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.network.composer import SEEN_PICTURES
@@ -76,7 +76,7 @@ class ModelInputs:
         return normalise(self.patches)
 
 
-def moved_pictures(scene: Scene, view: View, count: int = SEEN_PICTURES) -> Seen | None:
+def moved_pictures(scene: Scene, view: PictureRequest, count: int = SEEN_PICTURES) -> Seen | None:
     """What a view would show if only the ego moved, as each of its last ``count`` pictures tells it.
 
     Takes some ms each. None where the scene has no clip of its camera, or a picture is damaged.
@@ -94,7 +94,7 @@ def moved_pictures(scene: Scene, view: View, count: int = SEEN_PICTURES) -> Seen
     return None
 
 
-def _shown(scene: Scene, view: View) -> Clip | None:
+def _shown(scene: Scene, view: PictureRequest) -> Clip | None:
     return next((clip for clip in scene.clips if clip.camera == view.camera), None)
 
 
@@ -125,7 +125,7 @@ class InputBuilder:
         return np.array([self.settings.grid] * len(self.settings.cameras), np.int64)
 
     def build(
-        self, scene: Scene, format: str, attempt: Attempt | None = None, view: View | None = None
+        self, scene: Scene, format: str, attempt: Attempt | None = None, view: PictureRequest | None = None
     ) -> ModelInputs:
         """The inputs of ``scene`` for a response in ``format``, which may refine an attempt.
 
@@ -147,7 +147,7 @@ class InputBuilder:
         )
 
     def prompt_for(
-        self, scene: Scene, format: str, attempt: Attempt | None = None, view: View | None = None
+        self, scene: Scene, format: str, attempt: Attempt | None = None, view: PictureRequest | None = None
     ) -> Prompt:
         """The prompt alone of what `build` gives; raises `FamilyError` and `FormatError` as it does."""
         camera = None if view is None else view.camera
@@ -155,7 +155,7 @@ class InputBuilder:
         tracks = self.settings.with_tracks and scene.tracks is not None
         return self.prompt(format, situation, tracks=tracks)
 
-    def expected(self, scene: Scene, view: View | None) -> tuple[int, ...] | None:
+    def expected(self, scene: Scene, view: PictureRequest | None) -> tuple[int, ...] | None:
         """The 98 codes of a view if only the ego moved; takes some ms, once for a picture.
 
         None where no view is asked for, the scene has no clip of its camera, or the checkpoint no such codes.

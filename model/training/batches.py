@@ -20,7 +20,7 @@ kept in little memory (on CPUs every new shape costs megabytes)."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class ResponseSample:
     """One prompt and its responses, rendered for the network.
 
     Attributes:
@@ -44,7 +44,7 @@ class Sample:
     code_errors_m: Array
 
 
-def collate(samples: list[Sample]) -> Batch:
+def collate(samples: list[ResponseSample]) -> Batch:
     """Stack samples, padded on the right to a multiple of `WIDTH_STEP`.
 
     ``parts`` says what a token belongs to: 0 the prompt, k its k-th response, -1 padding.

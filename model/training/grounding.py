@@ -71,7 +71,7 @@ class GroundingSample(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Look:
+class GroundingItem:
     """Which example to look at, and how.
 
     Attributes:
@@ -97,9 +97,11 @@ class GroundingDataset(Dataset[GroundingSample]):
 
     def __getitem__(self, index: int) -> GroundingSample:
         chance = self.random.random(2)
-        return self.look(Look(index, bool(chance[0] < _MIRROR_SHARE), bool(chance[1] < _ROUTE_SHARE)))
+        return self.look(
+            GroundingItem(index, bool(chance[0] < _MIRROR_SHARE), bool(chance[1] < _ROUTE_SHARE))
+        )
 
-    def look(self, look: Look) -> GroundingSample:
+    def look(self, look: GroundingItem) -> GroundingSample:
         """One example as it is asked for."""
         examples, index = self._examples, look.index
         has_route = look.route and bool(np.isfinite(examples.route[index]).all())

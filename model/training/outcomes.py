@@ -35,7 +35,7 @@ from looktwice.model.families.registry import family_named
 from looktwice.model.families.trajectory_codes import TRAJECTORY
 from looktwice.model.formats.replay import Decision, decisions
 from looktwice.model.network.checkpoint import Loaded
-from looktwice.model.training.batches import Sample, collate
+from looktwice.model.training.batches import ResponseSample, collate
 from looktwice.model.training.learner import ResponseLearner
 from looktwice.model.training.policy import advantages, divergence, policy_loss
 from looktwice.model.training.recipes import FeedbackWriter, OutcomeSettings
@@ -235,7 +235,7 @@ class OutcomeLearner(nn.Module):
 
     def _policy(
         self,
-        samples: Sequence[Sample],
+        samples: Sequence[ResponseSample],
         draws: Sequence[Sequence[Draw]],
         refined: Sequence[Sequence[Draw]],
         worth: Sequence[Tensor],

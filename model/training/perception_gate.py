@@ -15,7 +15,7 @@ import torch
 
 from looktwice.model.driving.intervals import ratio_interval
 from looktwice.model.driving.tracks import MAX_TRACKS
-from looktwice.model.evaluation.perception import Reading
+from looktwice.model.evaluation.perception import FactReadings
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.fact_reader import weighed
 from looktwice.model.network.small_planner import SmallInputs, SmallKind
@@ -27,7 +27,7 @@ GATES: Final[tuple[Gate, ...]] = ("none", "read", "true")
 
 
 def perception_gate(
-    learned_on: Reading, measured_on: Reading, codec: TrajectoryCodec, settings: SmallSettings
+    learned_on: FactReadings, measured_on: FactReadings, codec: TrajectoryCodec, settings: SmallSettings
 ) -> list[dict[str, Any]]:
     """A row for each of `GATES`: ``facts``, ``ade_m``, ``against_none`` (metres), and intervals."""
     errors: dict[Gate, npt.NDArray[np.float64]] = {}
@@ -57,7 +57,7 @@ def format_gate(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _examples(reading: Reading, gate: Gate) -> SmallExamples:
+def _examples(reading: FactReadings, gate: Gate) -> SmallExamples:
     nobody = torch.zeros(len(reading.read), MAX_TRACKS, len(TRACK_FEATURES))
     facts = None if gate == "none" else weighed(torch.from_numpy(getattr(reading, gate)))
     inputs = SmallInputs(torch.from_numpy(reading.history), torch.from_numpy(reading.route), nobody, facts)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from looktwice.model.driving.phrases import facts_of, read_facts
 from looktwice.model.driving.reflection_store import LabelledReflection
-from looktwice.model.families.family import Reflection
+from looktwice.model.families.family import Counterfactual
 from looktwice.model.training.examples import Examples
 
 _PLAIN: Final = str.maketrans(
@@ -28,7 +28,7 @@ _PLAIN: Final = str.maketrans(
 """Typographic quotes, dashes and dots as ASCII: small tokenizers have no tokens for them."""
 
 
-def mirrored(reflection: Reflection) -> Reflection:
+def mirrored(reflection: Counterfactual) -> Counterfactual:
     """A reflection with left and right swapped; raises `PhraseError` where it is not in phrases."""
     revised = reflection.revised_plan
     return replace(
@@ -43,7 +43,7 @@ class OnExamples(NamedTuple):
     """Reflections, and the place of the example that each is on, int64 [m]."""
 
     examples: npt.NDArray[np.int64]
-    reflections: list[Reflection]
+    reflections: list[Counterfactual]
 
 
 def plain(text: str) -> str:
@@ -82,5 +82,5 @@ def reflections_on(examples: Examples, found: Iterable[LabelledReflection]) -> O
     for each in labelled:
         thinking = plain(each.reflection)
         revised = None if facts_of(thinking) is None else each.expert_plan
-        reflections.append(Reflection(each.predicted_plan, thinking, revised, each.judged))
+        reflections.append(Counterfactual(each.predicted_plan, thinking, revised, each.judged))
     return OnExamples(places, reflections)

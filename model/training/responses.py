@@ -13,11 +13,11 @@ from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import mirrored_camera
 from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, present_speed
 from looktwice.model.families.family import (
+    Counterfactual,
     FamilyError,
     JudgedAttempt,
     Lesson,
     NextPicture,
-    Reflection,
     Situation,
 )
 from looktwice.model.families.registry import families_of
@@ -31,7 +31,7 @@ from looktwice.model.network.prompts import motion_text
 from looktwice.model.network.track_features import MIRRORED, without_route
 from looktwice.model.network.visual_codes import Frame, VisualCodes, frame_of
 from looktwice.model.network.vocabulary import Vocabulary
-from looktwice.model.training.batches import Array, Sample
+from looktwice.model.training.batches import Array, ResponseSample
 from looktwice.model.training.examples import Examples, example_frames
 from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.reflections import mirrored
@@ -44,7 +44,7 @@ _MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
 """Of poses (x, y, z, heading)."""
 
 
-class ResponseDataset(Dataset[Sample]):
+class ResponseDataset(Dataset[ResponseSample]):
     """Renders `Item`s; the items of an epoch come from `TaskSampler`.
 
     Attributes:
@@ -80,7 +80,7 @@ class ResponseDataset(Dataset[Sample]):
         *,
         pictures: bool,
         vision: VisionCache | None = None,
-        reflections: Sequence[Reflection] = (),
+        reflections: Sequence[Counterfactual] = (),
         attempts: Sequence[JudgedAttempt] = (),
         attempting: str | None = None,
         own_plans: OwnPlans | None = None,
@@ -127,7 +127,7 @@ class ResponseDataset(Dataset[Sample]):
     def __len__(self) -> int:
         return len(self._examples)
 
-    def __getitem__(self, item: Item) -> Sample:
+    def __getitem__(self, item: Item) -> ResponseSample:
         examples, index, pictures = self._examples, item.index, self._pictures and item.pictures
         history, future = examples.history[index], examples.future[index]
         route, tracks = np.nan_to_num(examples.route[index]), examples.tracks[index]
@@ -147,13 +147,13 @@ class ResponseDataset(Dataset[Sample]):
         found = [self._reflections[place] for place in item.reflections]
         if item.mirror:
             found = [mirrored(each) for each in found]
-        reflections: list[Reflection | None] = [*found] or [None]
+        reflections: list[Counterfactual | None] = [*found] or [None]
         if not found and self._own_plans is not None and item.task == self.reflecting:
             # Nobody knows whether it deserves a second look: nothing but the trajectory is taught behind it.
             own = self._own_plans.draw(
                 index, self.random, mirror=item.mirror, route=item.route, tracks=item.tracks
             )
-            reflections.append(Reflection(own, "", judged=False))
+            reflections.append(Counterfactual(own, "", judged=False))
         tried = None if item.attempt is None else self._attempts[item.attempt]
         soft = [self._soft.draw(vector, self.random) for _ in reflections]
         camera = picture.camera if picture is not None and item.asked else None
@@ -169,7 +169,7 @@ class ResponseDataset(Dataset[Sample]):
             for drawn, reflection in zip(soft, reflections, strict=True)
         ]
         situation = Situation(history, route if item.route else None, attempt, camera)
-        return Sample(
+        return ResponseSample(
             prompt=self._prompt(item, situation),
             responses=[self._target(item.task, lesson) for lesson in lessons],
             seen=self._vision.tokens(index, item.mirror) if pictures and self._vision is not None else None,

@@ -13,14 +13,14 @@ from looktwice.model.driving.trajectory import FUTURE_STEPS, ROUTE_POINTS
 from looktwice.model.engines.engine import Draw
 from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.track_features import track_features
-from looktwice.model.training.batches import Sample
+from looktwice.model.training.batches import ResponseSample
 from looktwice.model.training.targets import Target
 
 _ROW_TOKENS: Final = 1536
 """Of a prompt and the responses behind it: what attention takes grows with the square of a row."""
 
 
-def rollout(scene: Scene, format: str, draws: Sequence[Draw], inputs: InputBuilder) -> list[Sample]:
+def rollout(scene: Scene, format: str, draws: Sequence[Draw], inputs: InputBuilder) -> list[ResponseSample]:
     """The prompt that an engine read and what it wrote behind it, see `with_draws`.
 
     `ResponseLearner.log_probabilities` of it are those that the draws tell. It has no expert's future.
@@ -30,7 +30,7 @@ def rollout(scene: Scene, format: str, draws: Sequence[Draw], inputs: InputBuild
     """
     built = inputs.build(scene, format)
     nothing = np.zeros((0, 0, 0), np.float32)
-    prompt = Sample(
+    prompt = ResponseSample(
         prompt=built.prompt.ids.tolist(),
         responses=[],
         seen=None,
@@ -45,7 +45,7 @@ def rollout(scene: Scene, format: str, draws: Sequence[Draw], inputs: InputBuild
     return with_draws(prompt, draws)
 
 
-def with_draws(sample: Sample, draws: Sequence[Draw]) -> list[Sample]:
+def with_draws(sample: ResponseSample, draws: Sequence[Draw]) -> list[ResponseSample]:
     """A prompt with what an engine wrote behind it, instead of its own responses; all tokens weigh 1.
 
     Draws keep their order. Long ones stand behind a prompt of their own.

@@ -25,7 +25,7 @@ from looktwice.service.cli.options import (
 
 if TYPE_CHECKING:
     from looktwice.model.bench.report import Roofline
-    from looktwice.model.bench.run import Row
+    from looktwice.model.bench.run import BenchRow
 
 bench = typer.Typer(help="Measure speed, as ratios within one run.", no_args_is_help=True)
 
@@ -65,7 +65,7 @@ def engine(
     """Our engine, transformers and vLLM on the same checkpoint, scenes and controls."""
     with reported_errors(), tempfile.TemporaryDirectory() as folder:
         from looktwice.model.bench.report import BenchReport
-        from looktwice.model.bench.run import Job, run, run_deadlines, run_planner
+        from looktwice.model.bench.run import BenchJob, run, run_deadlines, run_planner
         from looktwice.model.bench.workload import Workload
         from looktwice.model.families.registry import family_named
         from looktwice.model.network.checkpoint import read_parts
@@ -97,15 +97,15 @@ def engine(
         def tell(what: str) -> None:
             typer.echo(what, err=True)
 
-        job = Job(names, loads, checkpoint, scenes, repeats, device, python)
+        job = BenchJob(names, loads, checkpoint, scenes, repeats, device, python)
         rows = run(job, tell)
-        steps: list[Row] = []
+        steps: list[BenchRow] = []
         ladder = tuple(load for load in loads if load.n > 1 and load.thinking == "adaptive")
         if shortcuts and ladder and "torch" in names:
             entries = _ladder(device)
             # On a GPU one after the other: large models do not fit side by side.
             for together in [entries] if device == "cpu" else [(each,) for each in entries]:
-                steps += run(Job(together, ladder, checkpoint, scenes, repeats, device), tell)
+                steps += run(BenchJob(together, ladder, checkpoint, scenes, repeats, device), tell)
         alone = [Workload(1, _whole(n), "adaptive", written, camera=camera) for n in draws.split(",")]
         planners = [run_planner(job, load) for load in alone if "torch" in names]
         rooflines = _rooflines(rows, checkpoint, written, device)
@@ -292,7 +292,7 @@ def _random_checkpoint(preset: str, words_of: Path, folder: Path, device: str, a
     return folder / preset
 
 
-def _rooflines(rows: list[Row], checkpoint: Path, format: str, device: str) -> list[Roofline]:
+def _rooflines(rows: list[BenchRow], checkpoint: Path, format: str, device: str) -> list[Roofline]:
     from looktwice.model.bench.report import Roofline
     from looktwice.model.bench.roofline import measure, work_of_plan
     from looktwice.model.network.checkpoint import read_config, read_parts

@@ -16,7 +16,7 @@ from looktwice.service.cli.stages import do_jobs, progress_bar, report_run, run_
 
 if TYPE_CHECKING:
     from looktwice.clients.labelling.label import LabelTask
-    from looktwice.clients.labelling.ledger import Ledger, Run
+    from looktwice.clients.labelling.ledger import Ledger, StageRun
     from looktwice.clients.labelling.pipeline import Job, Tally
     from looktwice.clients.labelling.teachers.openai import OpenAiSettings
     from looktwice.clients.labelling.teachers.teacher import Teacher
@@ -65,16 +65,16 @@ def rollout(
     as_json: Json = False,
 ) -> None:
     """Roll a served model out over scenes: what it plans alone, and with the expert's plan given."""
-    from looktwice.clients.labelling.pipeline import Limits
+    from looktwice.clients.labelling.pipeline import StageLimits
     from looktwice.clients.labelling.rollout import RETRY_POLICY, Sampling, config_of, jobs, roll_out
     from looktwice.clients.planner import Access, AsyncPlannerClient, PlannerError
     from looktwice.clients.wire import ModelName
 
     sampling, access = Sampling(n, temperature, top_p, seed, route, tracks), Access.from_environment()
-    limits = Limits(at_once, give_up_after, max_error_rate, dry_run or limit)
+    limits = StageLimits(at_once, give_up_after, max_error_rate, dry_run or limit)
     unlabelled: list[str] = []
 
-    async def roll(ledger: Ledger) -> tuple[Run, Tally]:
+    async def roll(ledger: Ledger) -> tuple[StageRun, Tally]:
         async with AsyncPlannerClient(service, RETRY_POLICY, access=access) as planner:
             try:
                 (card, *_) = await planner.models()
@@ -128,12 +128,12 @@ def outcomes(
 
     from looktwice.clients.labelling.follow import follow_all
     from looktwice.clients.labelling.outcomes import Followed, config_of
-    from looktwice.clients.labelling.pipeline import Limits
+    from looktwice.clients.labelling.pipeline import StageLimits
 
-    limits = Limits(max_error_rate=max_error_rate, at_most=dry_run or limit)
+    limits = StageLimits(max_error_rate=max_error_rate, at_most=dry_run or limit)
     counts: dict[str, Any] = {}
 
-    async def follow(ledger: Ledger) -> tuple[Run, Tally]:
+    async def follow(ledger: Ledger) -> tuple[StageRun, Tally]:
         rollout = ledger.the_run("rollout", run)
         begun = ledger.run("outcomes", config_of(rollout))
         if retry_dead:
@@ -237,7 +237,7 @@ def label(
 ) -> None:
     """Have a teacher say, for every scene kept, what is less good about the model's plan."""
     from looktwice.clients.labelling.label import config_of, jobs, labeller, questions
-    from looktwice.clients.labelling.pipeline import Limits
+    from looktwice.clients.labelling.pipeline import StageLimits
     from looktwice.clients.labelling.teachers.service import ServiceTeacher
     from looktwice.clients.labelling.teachers.teacher import TeacherError
     from looktwice.clients.planner import Access
@@ -249,7 +249,7 @@ def label(
     )
     spent: dict[str, Any] = {}
 
-    async def ask_all(ledger: Ledger) -> tuple[Run, Tally]:
+    async def ask_all(ledger: Ledger) -> tuple[StageRun, Tally]:
         rollout = ledger.the_run("rollout", run)
         if not ledger.selected_draws(rollout, 1):
             raise RuntimeError("no scene is kept: run `looktwice build filter` first")
@@ -262,7 +262,7 @@ def label(
             if retry_dead:
                 ledger.forget_dead(begun)
             before = ledger.spent(begun)
-            limits = Limits(at_once, give_up_after, max_error_rate, dry_run or limit)
+            limits = StageLimits(at_once, give_up_after, max_error_rate, dry_run or limit)
             if on_ray is not None:
                 from looktwice.clients.labelling.on_ray import LabelWork, chunks, work_on_ray
 
@@ -389,7 +389,7 @@ def take(
 
 def _batch(
     ledger: Ledger, scenes: Path, plans_per_scene: int, seed: int, run: str | None
-) -> tuple[OpenAiSettings, Run, Iterator[Job[LabelTask]]]:
+) -> tuple[OpenAiSettings, StageRun, Iterator[Job[LabelTask]]]:
     """The questions for the endpoint that the settings name."""
     from looktwice.clients.labelling.label import config_of, jobs, questions
     from looktwice.clients.labelling.teachers.openai import OpenAiTeacher

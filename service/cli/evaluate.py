@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from looktwice.model.evaluation.imagination import ImaginationReport
     from looktwice.model.evaluation.ladder import LadderReport
     from looktwice.model.evaluation.open_loop import SceneResult
-    from looktwice.model.evaluation.report import Report
+    from looktwice.model.evaluation.report import EvaluationReport
     from looktwice.model.evaluation.variants import Variant
 
 _Found = TypeVar("_Found")
@@ -163,7 +163,7 @@ def evaluate(
             typer.echo(json.dumps(told_as) if as_json else text)
             return
 
-        report: Report | LadderReport | ImaginationReport | FailuresReport
+        report: EvaluationReport | LadderReport | ImaginationReport | FailuresReport
         if preset == "ladder":
             report = _ladder(
                 labelled,

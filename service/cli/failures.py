@@ -13,9 +13,9 @@ from looktwice.service.cli.options import Json, reported_errors
 from looktwice.service.cli.stages import do_jobs, report_run, run_stage, scenes_in
 
 if TYPE_CHECKING:
-    from looktwice.clients.labelling.failures import Inference, Sample
-    from looktwice.clients.labelling.ledger import Ledger, Run
-    from looktwice.clients.labelling.pipeline import Limits, Tally
+    from looktwice.clients.labelling.failures import FeedbackSample, Inference
+    from looktwice.clients.labelling.ledger import Ledger, StageRun
+    from looktwice.clients.labelling.pipeline import StageLimits, Tally
 
 
 def failures(
@@ -46,15 +46,15 @@ def failures(
     as_json: Json = False,
 ) -> None:
     """Infer, score, sample correct and wrong responses, have feedback written: docs/feedback.md."""
-    from looktwice.clients.labelling.failures import Inference, Sample, rows, sampled
+    from looktwice.clients.labelling.failures import FeedbackSample, Inference, rows, sampled
     from looktwice.clients.labelling.ledger import Ledger
-    from looktwice.clients.labelling.pipeline import Limits
+    from looktwice.clients.labelling.pipeline import StageLimits
     from looktwice.model.driving.feedback_store import write_feedback
 
     inference = Inference(n, temperature, top_p, seed, route=route, tracks=tracks, format=format)
-    limits = Limits(at_once, give_up_after, max_error_rate, limit)
+    limits = StageLimits(at_once, give_up_after, max_error_rate, limit)
     with reported_errors():
-        sample = Sample(threshold, correct, wrong, seed)
+        sample = FeedbackSample(threshold, correct, wrong, seed)
         inferred, tally = run_stage(
             folder,
             lambda ledger: _infer(ledger, scenes, service, inference, limits, every, retry_dead, as_json),
@@ -86,11 +86,11 @@ async def _infer(
     scenes: Path,
     service: str,
     inference: Inference,
-    limits: Limits,
+    limits: StageLimits,
     every: int,
     retry_dead: bool,
     quiet: bool,
-) -> tuple[Run, Tally]:
+) -> tuple[StageRun, Tally]:
     from looktwice.clients.labelling.failures import infer, inference_config
     from looktwice.clients.labelling.rollout import RETRY_POLICY, jobs
     from looktwice.clients.planner import Access, AsyncPlannerClient, PlannerError
@@ -119,13 +119,13 @@ async def _infer(
 async def _write(
     ledger: Ledger,
     scenes: Path,
-    inferred: Run,
+    inferred: StageRun,
     inference: Inference,
-    sample: Sample,
-    limits: Limits,
+    sample: FeedbackSample,
+    limits: StageLimits,
     retry_dead: bool,
     quiet: bool,
-) -> tuple[Run, Tally]:
+) -> tuple[StageRun, Tally]:
     from looktwice.clients.labelling.failures import feedback_config, feedback_jobs, sampled, writer
     from looktwice.clients.labelling.teachers.feedback import FeedbackTeacher
     from looktwice.service.operations.settings import TeacherSettings

@@ -90,12 +90,12 @@ def loadtest(
         from looktwice.loadtests.bad_teacher import bad_teacher
         from looktwice.loadtests.environment import describe_client, describe_service, versions
         from looktwice.loadtests.mix import parse_mix
-        from looktwice.loadtests.report import Report
+        from looktwice.loadtests.report import LoadReport
         from looktwice.loadtests.run import Result, Setup
         from looktwice.loadtests.scenarios.hostile import OwnService, costly, hostile
         from looktwice.loadtests.scenarios.steady import burst, fleet, poisson, soak
         from looktwice.loadtests.scenarios.sweep import KneeSearch, sweep
-        from looktwice.loadtests.sending import Target
+        from looktwice.loadtests.sending import ServiceTarget
         from looktwice.model.driving.scene_store import read_scenes
         from looktwice.service.cli.serving import served
         from looktwice.service.operations.settings import Settings
@@ -127,7 +127,7 @@ def loadtest(
             own = OwnService(process, teacher, Settings().drain_s)
         goal_s = (1 / hz if scenario == "fleet" else 1.0) if goal_ms is None else goal_ms / 1000
         setup = Setup(
-            target=Target(service.rstrip("/"), api_key, timeout_s),
+            target=ServiceTarget(service.rstrip("/"), api_key, timeout_s),
             scenes=tuple(read_scenes(scenes, dense=False)),
             mix=parse_mix(mix, n, payload, deadline_ms, stream),
             rate_rps=rate,
@@ -142,7 +142,7 @@ def loadtest(
         )
         models, client = describe_service(setup.target, setup.mix), describe_client()
         began = datetime.now(UTC).isoformat(timespec="seconds")
-        made = Report(setup, run[scenario](), began, client, models, versions())
+        made = LoadReport(setup, run[scenario](), began, client, models, versions())
         if report is not None:
             from looktwice.loadtests.page import page
 

@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import count_scenes, read_scenes
-from looktwice.model.evaluation.perception import Reading, format_perception, perception_rows, read_facts
+from looktwice.model.evaluation.perception import FactReadings, format_perception, perception_rows, read_facts
 from looktwice.model.network.checkpoint import load
 from looktwice.model.training.perception_gate import format_gate, perception_gate
 from looktwice.model.training.small import SmallSettings
@@ -32,7 +32,7 @@ def tell_perception(
     """
     loaded = load(checkpoint)
 
-    def reading(what: str, of: Iterable[LabelledScene], count: int) -> Reading:
+    def reading(what: str, of: Iterable[LabelledScene], count: int) -> FactReadings:
         # Progress goes to stderr, so that stdout holds nothing but the table.
         with Progress(console=Console(stderr=True, quiet=quiet)) as progress:
             task = progress.add_task(what, total=count)

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 if TYPE_CHECKING:
-    from looktwice.clients.labelling.ledger import Ledger, Record, Run
-    from looktwice.clients.labelling.pipeline import Job, Limits, Tally
+    from looktwice.clients.labelling.ledger import Ledger, Record, StageRun
+    from looktwice.clients.labelling.pipeline import Job, StageLimits, Tally
 
 
 def run_stage(
-    folder: Path, work: Callable[[Ledger], Coroutine[Any, Any, tuple[Run, Tally]]], *, dry: bool
-) -> tuple[Run, Tally]:
+    folder: Path, work: Callable[[Ledger], Coroutine[Any, Any, tuple[StageRun, Tally]]], *, dry: bool
+) -> tuple[StageRun, Tally]:
     """Run a stage on a folder's ledger, or on a copy that is thrown away."""
     from looktwice.clients.labelling.dead_letters import write_dead_letters
     from looktwice.clients.labelling.ledger import FILE, Ledger
@@ -42,10 +42,10 @@ def run_stage(
 
 async def do_jobs(
     ledger: Ledger,
-    run: Run,
+    run: StageRun,
     jobs: Iterator[Job[Any]],
     do: Callable[[Job[Any]], Awaitable[Record]],
-    limits: Limits,
+    limits: StageLimits,
     *,
     total: int,
     quiet: bool,
@@ -58,7 +58,7 @@ async def do_jobs(
 
 
 @contextmanager
-def progress_bar(run: Run, total: int | None, *, quiet: bool) -> Iterator[Callable[[Tally], None]]:
+def progress_bar(run: StageRun, total: int | None, *, quiet: bool) -> Iterator[Callable[[Tally], None]]:
     """A bar on stderr, moved by what it is told; it also says who is waited for."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -93,7 +93,7 @@ def scenes_in(scenes: Path) -> int:
     return count_scenes(scenes)
 
 
-def report_run(run: Run, tally: Tally, as_json: bool, **more: Any) -> None:
+def report_run(run: StageRun, tally: Tally, as_json: bool, **more: Any) -> None:
     """Print what a stage did, with ``more`` of its own."""
     result = {
         "run": run.id,

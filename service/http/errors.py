@@ -39,8 +39,8 @@ from looktwice.service.problems import (
     UNKNOWN_CAMERA,
     UNKNOWN_FIELD,
     UNSUPPORTED_MEDIA_TYPE,
-    Kind,
     ProblemError,
+    ProblemKind,
 )
 
 _Model = TypeVar("_Model", bound=BaseModel)
@@ -49,7 +49,7 @@ _MAX_QUOTED: Final = 200
 """Characters."""
 
 # The kind of a schema violation is that of the first place that fits.
-_KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], Kind]]] = (
+_KIND_BY_PLACE: Final[Sequence[tuple[tuple[str, ...], ProblemKind]]] = (
     (("scene", "clips"), INVALID_CLIP),
     (("scene", "history"), INVALID_HISTORY),
     (("scene", "route"), INVALID_ROUTE),
@@ -144,7 +144,7 @@ def problem_document(error: ProblemError, request_id: str) -> Problem:
     )
 
 
-def _http_detail(kind: Kind, request: Request, error: HTTPException) -> str:
+def _http_detail(kind: ProblemKind, request: Request, error: HTTPException) -> str:
     path = request.url.path
     if kind is METHOD_NOT_ALLOWED:
         allowed = (error.headers or {}).get("Allow", "")
@@ -186,7 +186,7 @@ def validated(model: type[_Model], document: object) -> _Model:
         raise from_validation(RequestValidationError(found, body=document)) from None
 
 
-def _kind(fault: dict[str, Any]) -> Kind:
+def _kind(fault: dict[str, Any]) -> ProblemKind:
     place = tuple(part for part in fault["loc"][1:] if isinstance(part, str))
     if place[:1] == ("requests",):
         place = place[1:]

@@ -43,7 +43,7 @@ class NotCached(Exception):
 
 
 @dataclass(frozen=True)
-class _Made:
+class _StoredAnswer:
     fingerprint: bytes
     until_s: float
     answer: asyncio.Task[Response]
@@ -64,7 +64,7 @@ class Idempotency:
     def __init__(self, kept_s: float, clock: Callable[[], float]) -> None:
         self._kept_s, self._clock = kept_s, clock
         # No cachetools here: what is being made has no size yet, and must not go.
-        self._made: dict[tuple[str, str], _Made] = {}
+        self._made: dict[tuple[str, str], _StoredAnswer] = {}
 
     def knows(self, owner: str, key: str) -> bool:
         """Whether an answer was made, or is being made, for ``owner``'s ``key``."""
@@ -96,7 +96,7 @@ class Idempotency:
                 answer.body, answer.status_code, {REPLAYED_HEADER: "true"}, media_type=answer.media_type
             )
         task = asyncio.ensure_future(_ensure_coroutine(work))
-        self._made[place] = _Made(fingerprint, self._clock() + self._kept_s, task)
+        self._made[place] = _StoredAnswer(fingerprint, self._clock() + self._kept_s, task)
         task.add_done_callback(lambda done: self._keep_only_success(place, done))
         return await asyncio.shield(task)
 
@@ -122,7 +122,7 @@ def _succeeded(done: asyncio.Task[Response]) -> bool:
     return not done.cancelled() and done.exception() is None
 
 
-def _size(made: _Made) -> int:
+def _size(made: _StoredAnswer) -> int:
     return len(made.answer.result().body) if _succeeded(made.answer) else 0
 
 

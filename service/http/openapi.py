@@ -21,7 +21,7 @@ from looktwice.clients.wire import (
 )
 from looktwice.service.http.auth import OPEN_PATHS
 from looktwice.service.http.dialect import dialect_error, dialect_status
-from looktwice.service.problems import INTERNAL, MISDIRECTED, Kind, ProblemError
+from looktwice.service.problems import INTERNAL, MISDIRECTED, ProblemError, ProblemKind
 
 Responses = dict[int | str, dict[str, Any]]
 
@@ -59,14 +59,14 @@ def answers_and_stream(*names: str) -> Responses:
     return {200: {"content": PACKED[200]["content"] | stream}}
 
 
-def problems(*kinds: Kind, dialect: bool = False) -> Responses:
+def problems(*kinds: ProblemKind, dialect: bool = False) -> Responses:
     """What a route declares about its errors; 421 and 500 can occur anywhere.
 
     Args:
         kinds: that it may answer with.
         dialect: whether it tells them as OpenAI's clients expect.
     """
-    by_status: dict[int, list[Kind]] = {}
+    by_status: dict[int, list[ProblemKind]] = {}
     for kind in (*kinds, MISDIRECTED, INTERNAL):
         status = dialect_status(kind.status) if dialect else kind.status
         by_status.setdefault(status, []).append(kind)
@@ -146,7 +146,7 @@ def _move_problems(responses: dict[str, dict[str, Any]]) -> None:
             del responses[status]
 
 
-def _example(kind: Kind, *, dialect: bool) -> dict[str, Any]:
+def _example(kind: ProblemKind, *, dialect: bool) -> dict[str, Any]:
     document = {
         "type": kind.type,
         "title": kind.title,

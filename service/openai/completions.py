@@ -9,7 +9,7 @@ from typing import Any, Final
 import looktwice.clients.wire as wire
 from looktwice.service.openai.requests import ChatRequest
 from looktwice.service.planning.answers import plan_answer, wire_branch
-from looktwice.service.planning.events import Planned
+from looktwice.service.planning.events import PlannedScene
 
 THINKING: Final = f"{wire_branch(looked_twice=True)} "
 _EVERY: Final = 5
@@ -35,7 +35,7 @@ class Completion:
         }
         self._request_id = completion_id
 
-    def whole(self, planned: Planned) -> dict[str, Any]:
+    def whole(self, planned: PlannedScene) -> dict[str, Any]:
         """The answer at once."""
         answer = plan_answer(planned, self._request_id)
         choices = [
@@ -58,7 +58,7 @@ class Completion:
         self._told[index] = content
         return self._chunk([{"index": index, "delta": role | {"content": content}}])
 
-    def last(self, planned: Planned) -> list[dict[str, Any]]:
+    def last(self, planned: PlannedScene) -> list[dict[str, Any]]:
         """What ends a stream."""
         answer = plan_answer(planned, self._request_id)
         choices = [
@@ -78,7 +78,7 @@ class Completion:
         assumed = [] if self._chat.looktwice.history is not None else ["history"]
         return {"looktwice": draw.model_dump() | {"assumed": assumed}}
 
-    def _usage(self, planned: Planned) -> dict[str, int]:
+    def _usage(self, planned: PlannedScene) -> dict[str, int]:
         written = sum(sum(draw.tokens.values()) for draw in planned.draws)
         prompt = planned.prompt_tokens()
         return {"prompt_tokens": prompt, "completion_tokens": written, "total_tokens": prompt + written}

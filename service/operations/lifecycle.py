@@ -9,7 +9,7 @@ from typing import Final
 
 import structlog
 
-from looktwice.model.engines.engine import Engine, Load
+from looktwice.model.engines.engine import Engine, EngineLoad
 from looktwice.model.network.model_card import ModelCard
 from looktwice.service.operations.metrics import Metrics
 from looktwice.service.problems import (
@@ -54,7 +54,7 @@ class Lifecycle:
         return self._engine.card
 
     @property
-    def load(self) -> Load:
+    def load(self) -> EngineLoad:
         """Of the engine that answers."""
         return self._engine.load
 

@@ -18,11 +18,11 @@ from prometheus_client.registry import Collector
 
 from looktwice.model.driving.agreement import PARTS, Agreement
 from looktwice.model.driving.plan import plan_iou
-from looktwice.model.engines.engine import Draw, Load, Thinking
+from looktwice.model.engines.engine import Draw, EngineLoad, Thinking
 from looktwice.model.network.model_card import ModelCard
 from looktwice.service.admission.places import Admission
 from looktwice.service.operations.logs import lines_lost
-from looktwice.service.problems import REJECTIONS, Kind
+from looktwice.service.problems import REJECTIONS, ProblemKind
 
 LATENCY_BUCKETS_S: Final = (
     *(0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.75),
@@ -198,7 +198,7 @@ class Metrics:
         self._requests.labels(endpoint, method, str(status)).inc()
         self._latency.labels(endpoint, f"{status // 100}xx").observe(seconds)
 
-    def watch(self, engine_load: Callable[[], Load], admission: Admission) -> None:
+    def watch(self, engine_load: Callable[[], EngineLoad], admission: Admission) -> None:
         """Read what is full, and of what, whenever Prometheus asks."""
 
         def gauge(name: str, text: str, value: Callable[[], float]) -> None:
@@ -232,12 +232,12 @@ class Metrics:
         )
         self.registry.register(_LinesLost())
 
-    def count_problem(self, kind: Kind) -> None:
+    def count_problem(self, kind: ProblemKind) -> None:
         """Count a request, or a scene of a batch, that may have been right and was not served."""
         if kind in REJECTIONS:
             self._rejections.labels(kind.slug).inc()
 
-    def count_problem_within(self, kind: Kind) -> None:
+    def count_problem_within(self, kind: ProblemKind) -> None:
         """Count a problem that no status shows, since it is told in a stream or in a batch's answer."""
         self.count_problem(kind)
         if kind.status >= 500 and kind.status != 503:

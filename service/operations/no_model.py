@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from looktwice.model.engines.engine import EngineError, Event, Load, PlanRequest, RequestError
+from looktwice.model.engines.engine import EngineError, EngineLoad, Event, PlanRequest, RequestError
 from looktwice.model.network.model_card import ModelCard
 
 CARD: Final = ModelCard(
@@ -38,9 +38,9 @@ class NoModel:
         return CARD
 
     @property
-    def load(self) -> Load:
+    def load(self) -> EngineLoad:
         """Nothing."""
-        return Load(0, 0)
+        return EngineLoad(0, 0)
 
     async def start(self) -> None:
         """There is nothing to load."""

@@ -16,14 +16,14 @@ from looktwice.model.engines.engine import Draw
 from looktwice.model.families.registry import family_named
 from looktwice.model.formats.pieces import Plain
 from looktwice.model.network.model_card import ModelCard
-from looktwice.service.planning.events import Planned
+from looktwice.service.planning.events import PlannedScene
 from looktwice.service.problems import REFUSED, ProblemError
 
 _DECIMALS: Final = 4
 """Of poses on the wire: a tenth of a millimetre."""
 
 
-def plan_answer(planned: Planned, request_id: str) -> wire.PlanResponse:
+def plan_answer(planned: PlannedScene, request_id: str) -> wire.PlanResponse:
     """The answer of POST /v1/plan."""
     return wire.PlanResponse(
         request_id=request_id,
@@ -38,7 +38,7 @@ def plan_answer(planned: Planned, request_id: str) -> wire.PlanResponse:
     )
 
 
-def reflect_answer(planned: Planned, request_id: str) -> wire.ReflectResponse:
+def reflect_answer(planned: PlannedScene, request_id: str) -> wire.ReflectResponse:
     """The answer of POST /v1/reflect; raises `ProblemError` where the format has no plan."""
     first = planned.draws[0]
     if first.plan is None or first.think_probability is None:

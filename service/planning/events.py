@@ -40,7 +40,7 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedScene:
     """A scene that was planned for.
 
     Attributes:
@@ -69,11 +69,11 @@ class Begun:
     """The engine has begun with a scene.
 
     Attributes:
-        paint: as of `Planned`.
+        paint: as of `PlannedScene`.
     """
 
     paint: Paint
 
 
-SceneEvent = Event | Begun | Judged | Planned
+SceneEvent = Event | Begun | Judged | PlannedScene
 """What a scene's events are here: the engine's, and what is made of them."""

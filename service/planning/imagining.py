@@ -18,7 +18,7 @@ from looktwice.model.engines.engine import CodesWritten, Draw, SectionFinished
 from looktwice.model.families.family import Imagination, Predicted
 from looktwice.model.families.registry import family_named
 from looktwice.model.network.model_card import ModelCard
-from looktwice.service.planning.events import Arrival, Begun, Paint, Planned, SceneEvent
+from looktwice.service.planning.events import Arrival, Begun, Paint, PlannedScene, SceneEvent
 from looktwice.service.problems import (
     CANNOT_IMAGINE,
     INVALID_CONTROLS,
@@ -121,7 +121,9 @@ def _motion(asked: wire_imagine.ImagineRequest) -> wire.Motion | None:
     return wire.Motion(x_m=motion.x_m, y_m=motion.y_m, heading_rad=motion.heading_rad)
 
 
-def imagine_answer(imagining: Imagining, planned: Planned, arrival: Arrival) -> wire_imagine.ImagineResponse:
+def imagine_answer(
+    imagining: Imagining, planned: PlannedScene, arrival: Arrival
+) -> wire_imagine.ImagineResponse:
     """The answer of POST /v1/imagine; pictures are painted here, which takes some ms each."""
     pictures = [_picture(imagining.imagination, planned, draw) for draw in planned.draws]
     total_ms = round(1000 * (time.monotonic() - arrival.since_s), 2)
@@ -186,7 +188,7 @@ def _png(paint: Paint, codes: Sequence[int]) -> str:
     return base64.b64encode(encode_png(paint(codes))).decode()
 
 
-def _picture(imagination: Imagination, planned: Planned, draw: Draw) -> wire_imagine.ImaginedPicture:
+def _picture(imagination: Imagination, planned: PlannedScene, draw: Draw) -> wire_imagine.ImaginedPicture:
     foreseen = draw.foreseen
     assert foreseen is not None
     assert foreseen.picture is not None, "a picture was asked for"

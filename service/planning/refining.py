@@ -34,7 +34,7 @@ from looktwice.model.engines.engine import Draw
 from looktwice.model.families.registry import family_named
 from looktwice.model.network.model_card import ModelCard
 from looktwice.service.planning.answers import plan_answer
-from looktwice.service.planning.events import Arrival, Begun, Planned, SceneEvent
+from looktwice.service.planning.events import Arrival, Begun, PlannedScene, SceneEvent
 from looktwice.service.planning.telling import PlanTeller, Written
 from looktwice.service.planning.validation import Geometry, geometry_of
 from looktwice.service.problems import (
@@ -129,7 +129,7 @@ def refining_format(card: ModelCard) -> str:
     return found
 
 
-def refine_answer(refining: Refining, planned: Planned, arrival: Arrival) -> wire_refine.RefineResponse:
+def refine_answer(refining: Refining, planned: PlannedScene, arrival: Arrival) -> wire_refine.RefineResponse:
     """The answer of POST /v1/refine, once the refinements are there; they are scored here."""
     answer = plan_answer(planned, arrival.request_id)
     after = list[TrajectoryScore | None]([None] * len(answer.draws))

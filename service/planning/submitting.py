@@ -35,7 +35,7 @@ from looktwice.service.admission.rates import RateLimited, Rates
 from looktwice.service.operations.lifecycle import Lifecycle
 from looktwice.service.operations.metrics import Metrics
 from looktwice.service.operations.traces import Traces
-from looktwice.service.planning.events import Arrival, Begun, Judged, Planned, SceneEvent
+from looktwice.service.planning.events import Arrival, Begun, Judged, PlannedScene, SceneEvent
 from looktwice.service.planning.validation import Geometry, engine_request
 from looktwice.service.problems import (
     DECODE_TIMEOUT,
@@ -56,14 +56,14 @@ log = structlog.stdlib.get_logger()
 
 
 @dataclass(frozen=True)
-class Limits:
+class TimeLimits:
     """How long a scene may take, in s: until it begins, and from then on."""
 
     queue_s: float
     decode_s: float
 
 
-class Planning:
+class SceneSubmitter:
     """Takes scenes to the engine; one for the whole service."""
 
     def __init__(
@@ -73,7 +73,7 @@ class Planning:
         rates: Rates,
         metrics: Metrics,
         traces: Traces,
-        limits: Limits,
+        limits: TimeLimits,
     ) -> None:
         self._lifecycle, self._admission, self._rates = lifecycle, admission, rates
         self._metrics, self._traces, self._limits = metrics, traces, limits
@@ -119,7 +119,7 @@ class Planning:
                 async for event in events:
                     yield event
 
-    async def in_turn(self, asked: AnyPlanRequest, arrival: Arrival) -> Planned:
+    async def in_turn(self, asked: AnyPlanRequest, arrival: Arrival) -> PlannedScene:
         """A scene of a batch that was let in, which waits for its place; raises `ProblemError`."""
         async with self._admission.place_in_turn(asked.controls.n) as place:
             return await last(self._plan(asked, arrival, place))
@@ -177,7 +177,7 @@ class Planning:
             if deadline_met is not None:
                 cut = [draw.index for draw in draws if draw.cut is not None]
                 deadline = wire.Deadline(met=deadline_met, cut=cut)
-            yield Planned(
+            yield PlannedScene(
                 *(tuple(draws), agreements, drafts, engine.card, timing, deadline, paint),
                 prompt_tokens=partial(engine.prompt_tokens, request),
             )
@@ -220,11 +220,11 @@ class Planning:
             raise ProblemError(ENGINE_FAILED, "decoding failed; the log has why") from error
 
 
-async def last(events: AsyncGenerator[SceneEvent]) -> Planned:
+async def last(events: AsyncGenerator[SceneEvent]) -> PlannedScene:
     """The whole of a scene, once it is there."""
     async with aclosing(events):
         async for event in events:
-            if isinstance(event, Planned):
+            if isinstance(event, PlannedScene):
                 return event
     raise AssertionError("a scene ended without its draws")
 

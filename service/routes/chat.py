@@ -19,7 +19,7 @@ from looktwice.service.http.payloads import payload_route
 from looktwice.service.openai.completions import THINKING, Completion, trajectory_text
 from looktwice.service.openai.requests import ChatPlaces, ChatRequest, check_model, plan_document
 from looktwice.service.planning.answers import wire_branch
-from looktwice.service.planning.events import Planned
+from looktwice.service.planning.events import PlannedScene
 from looktwice.service.planning.submitting import last
 from looktwice.service.planning.telling import PlanTeller, Written
 from looktwice.service.planning.validation import format_of
@@ -98,12 +98,12 @@ def chat_router(deps: Dependencies) -> APIRouter:
 
 
 async def _chunks(
-    told: AsyncGenerator[tuple[str, Written] | Planned], completion: Completion, places: ChatPlaces
+    told: AsyncGenerator[tuple[str, Written] | PlannedScene], completion: Completion, places: ChatPlaces
 ) -> AsyncGenerator[bytes]:
     async with aclosing(told):
         try:
             async for event in told:
-                if isinstance(event, Planned):
+                if isinstance(event, PlannedScene):
                     for chunk in completion.last(event):
                         yield _data(chunk)
                 elif (text := _text(*event)) is not None:

@@ -19,7 +19,7 @@ from looktwice.service.operations.lifecycle import Lifecycle
 from looktwice.service.operations.metrics import Metrics
 from looktwice.service.operations.pulse import Pulse
 from looktwice.service.operations.settings import Settings
-from looktwice.service.planning.submitting import Planning
+from looktwice.service.planning.submitting import SceneSubmitter
 from looktwice.service.problems import ProblemError, unforeseen
 from looktwice.service.scoring.process import Scorer
 
@@ -39,7 +39,7 @@ class Dependencies:
     settings: Settings
     metrics: Metrics
     lifecycle: Lifecycle
-    planning: Planning
+    planning: SceneSubmitter
     idempotency: Idempotency
     teacher: Teacher
     load: Callable[[Path], Engine] | None

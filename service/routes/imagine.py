@@ -13,7 +13,7 @@ from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
 from looktwice.service.http.callers import while_connected
 from looktwice.service.http.openapi import answers_and_stream, payloads, problems
 from looktwice.service.http.payloads import payload_route, respond
-from looktwice.service.planning.events import Planned
+from looktwice.service.planning.events import PlannedScene
 from looktwice.service.planning.imagining import ImagineTeller, imagine_answer, imagining_of
 from looktwice.service.planning.submitting import last
 from looktwice.service.problems import CANNOT_IMAGINE, INVALID_TRAJECTORY
@@ -57,7 +57,7 @@ def imagine_router(deps: Dependencies) -> APIRouter:
         imagining = imagining_of(asked, deps.lifecycle.card)
         events = deps.planning.events(imagining.planning, arrival)
 
-        async def answer(planned: Planned) -> wire_imagine.ImagineResponse:
+        async def answer(planned: PlannedScene) -> wire_imagine.ImagineResponse:
             # On a thread: painting must not hold up the answers of others.
             return await asyncio.to_thread(imagine_answer, imagining, planned, arrival)
 

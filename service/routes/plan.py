@@ -19,7 +19,7 @@ from looktwice.service.http.idempotency import IdempotencyKey, NotCached, once, 
 from looktwice.service.http.openapi import PACKED, answers_and_stream, payloads, problems
 from looktwice.service.http.payloads import payload_route, respond
 from looktwice.service.planning.answers import plan_answer, reflect_answer
-from looktwice.service.planning.events import Arrival, Planned
+from looktwice.service.planning.events import Arrival, PlannedScene
 from looktwice.service.planning.submitting import AnyPlanRequest, last
 from looktwice.service.planning.telling import PlanTeller
 from looktwice.service.planning.validation import format_of
@@ -151,17 +151,17 @@ async def _one(
     deps: Dependencies,
     asked: AnyPlanRequest,
     idempotency_key: str | None,
-    made: Callable[[Planned, str], BaseModel],
+    made: Callable[[PlannedScene, str], BaseModel],
 ) -> Response:
     arrival = arrival_of(request)
 
-    def answer(planned: Planned) -> BaseModel:
+    def answer(planned: PlannedScene) -> BaseModel:
         return made(planned, arrival.request_id)
 
     if asked.stream:
         refuse_key(idempotency_key)
 
-        async def done(planned: Planned) -> BaseModel:
+        async def done(planned: PlannedScene) -> BaseModel:
             return answer(planned)
 
         return await streamed(

@@ -15,7 +15,7 @@ from looktwice.service.http.callers import while_connected
 from looktwice.service.http.idempotency import IdempotencyKey, once, refuse_key
 from looktwice.service.http.openapi import answers_and_stream, payloads, problems
 from looktwice.service.http.payloads import payload_route, respond
-from looktwice.service.planning.events import Planned
+from looktwice.service.planning.events import PlannedScene
 from looktwice.service.planning.refining import RefineTeller, Refining, refine_answer, refining_of
 from looktwice.service.planning.submitting import last
 from looktwice.service.problems import INVALID_FEEDBACK, INVALID_TRAJECTORY, NEEDS_TRACKS
@@ -55,7 +55,7 @@ def refine_router(deps: Dependencies) -> APIRouter:
             # On a thread: numbers of a few ms must not hold up the answers of others.
             return await asyncio.to_thread(refining_of, asked, deps.lifecycle.card, arrival.request_id)
 
-        async def answer(refining: Refining, planned: Planned) -> wire_refine.RefineResponse:
+        async def answer(refining: Refining, planned: PlannedScene) -> wire_refine.RefineResponse:
             told = refining.judged.feedback
             if told.correct is not None:
                 deps.metrics.count_feedback(told.written_by, correct=told.correct)

@@ -16,7 +16,7 @@ import looktwice.clients.wire as wire
 from looktwice.service.http.callers import CallerLeft, while_connected
 from looktwice.service.http.errors import problem_document
 from looktwice.service.operations.metrics import Metrics
-from looktwice.service.planning.events import Planned, SceneEvent
+from looktwice.service.planning.events import PlannedScene, SceneEvent
 from looktwice.service.problems import ProblemError, unforeseen
 
 log = structlog.stdlib.get_logger()
@@ -31,7 +31,7 @@ Tell = Callable[[SceneEvent], Awaitable[Sequence[tuple[str, Data]]]]
 
 async def told_events(
     first: SceneEvent, events: AsyncGenerator[SceneEvent], tell: Tell[Data], metrics: Metrics
-) -> AsyncGenerator[tuple[str, Data] | Planned]:
+) -> AsyncGenerator[tuple[str, Data] | PlannedScene]:
     """What happens to a scene, told; at last the whole of it. Closing it early frees everything.
 
     Args:
@@ -47,7 +47,7 @@ async def told_events(
         try:
             event: SceneEvent | None = first
             while event is not None:
-                if isinstance(event, Planned):
+                if isinstance(event, PlannedScene):
                     yield event
                     return
                 for each in await tell(event):
@@ -64,15 +64,15 @@ async def told_events(
 
 
 async def server_sent(
-    told: AsyncGenerator[tuple[str, Data] | Planned],
-    answer: Callable[[Planned], Awaitable[BaseModel]],
+    told: AsyncGenerator[tuple[str, Data] | PlannedScene],
+    answer: Callable[[PlannedScene], Awaitable[BaseModel]],
     request_id: str,
 ) -> AsyncGenerator[bytes]:
     """The bytes of a stream; ``answer`` makes the last event's data."""
     async with aclosing(told):
         try:
             async for event in told:
-                if isinstance(event, Planned):
+                if isinstance(event, PlannedScene):
                     yield _event("done", await answer(event))
                 else:
                     yield _event(*event)
@@ -84,7 +84,7 @@ async def streamed(
     request: Request,
     events: AsyncGenerator[SceneEvent],
     tell: Tell[Data],
-    sent: Callable[[AsyncGenerator[tuple[str, Data] | Planned]], AsyncGenerator[bytes]],
+    sent: Callable[[AsyncGenerator[tuple[str, Data] | PlannedScene]], AsyncGenerator[bytes]],
     metrics: Metrics,
 ) -> StreamingResponse:
     """A scene's events as they come, in the words of ``tell`` and the bytes that ``sent`` makes of these.

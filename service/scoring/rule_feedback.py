@@ -13,7 +13,7 @@ from looktwice.model.driving.hashing import hash_of
 from looktwice.model.driving.pdm.course import Course
 from looktwice.model.driving.pdm.failures import Fact
 from looktwice.model.driving.pdm.feedback import Feedback, FeedbackError, RuleFeedback, parse_feedback
-from looktwice.model.driving.pdm.judged import JudgedPlan, Number
+from looktwice.model.driving.pdm.judged import JudgedPlan, Measurement
 from looktwice.model.driving.pdm.judging import Said, judged_plans
 from looktwice.model.driving.pdm.rule_teacher import NAME, REVISION, feedback_on
 from looktwice.model.driving.pdm.world import ScoreError
@@ -50,7 +50,7 @@ class Given:
 
 
 def _question(prompt: str, numbers: list[list[object]], names: list[str]) -> FeedbackQuestion:
-    return FeedbackQuestion(prompt, tuple(Number(*each) for each in numbers), tuple(names))  # type: ignore[arg-type]
+    return FeedbackQuestion(prompt, tuple(Measurement(*each) for each in numbers), tuple(names))  # type: ignore[arg-type]
 
 
 def feedback_given(asked: wire_feedback.FeedbackRequest, bundled: BundledScenes, request_id: str) -> Given:

@@ -30,11 +30,11 @@ from looktwice.model.driving.pdm.world import (
     Area,
     Array,
     BoolArray,
+    EgoVehicle,
     Lane,
     RedLight,
     ScoreError,
     TrackedBox,
-    Vehicle,
     World,
 )
 from looktwice.service.problems import INVALID_LABELS, INVALID_TRAJECTORY, at
@@ -172,14 +172,14 @@ def _check_length(asked: list[list[float]], pointer: str) -> None:
         raise at(INVALID_TRAJECTORY, pointer, f"has {len(asked)} poses; 8 at 0.5 s or 64 at 0.1 s are scored")
 
 
-def _vehicle(asked: wire_scores.VehicleShape) -> Vehicle:
+def _vehicle(asked: wire_scores.VehicleShape) -> EgoVehicle:
     try:
-        return Vehicle(**asked.model_dump())
+        return EgoVehicle(**asked.model_dump())
     except ScoreError as error:
         raise at(INVALID_LABELS, "/vehicle", error.detail) from None
 
 
-def _ego(asked: wire_scores.EgoMotion, vehicle: Vehicle, *, centre: bool) -> Array:
+def _ego(asked: wire_scores.EgoMotion, vehicle: EgoVehicle, *, centre: bool) -> Array:
     state = np.zeros(STATE_SIZE)
     state[0] = -vehicle.centre_m if centre else 0.0
     state[SPEED], state[ACCELERATION] = asked.speed_mps, asked.acceleration_mps2
@@ -188,7 +188,7 @@ def _ego(asked: wire_scores.EgoMotion, vehicle: Vehicle, *, centre: bool) -> Arr
     return state
 
 
-def _previous(asked: wire_scores.PreviousPlan, vehicle: Vehicle, *, centre: bool) -> Array:
+def _previous(asked: wire_scores.PreviousPlan, vehicle: EgoVehicle, *, centre: bool) -> Array:
     pointer = "/previous/trajectory"
     plan, ego = trajectory_of(asked.trajectory, pointer), _ego(asked.ego, vehicle, centre=centre)
     try:
@@ -198,7 +198,7 @@ def _previous(asked: wire_scores.PreviousPlan, vehicle: Vehicle, *, centre: bool
     return states
 
 
-def _world(asked: wire_scores.Labels, vehicle: Vehicle, *, centre: bool) -> World:
+def _world(asked: wire_scores.Labels, vehicle: EgoVehicle, *, centre: bool) -> World:
     past = None
     if asked.past is not None:
         past = np.zeros((len(asked.past), STATE_SIZE))

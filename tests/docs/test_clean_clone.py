@@ -12,7 +12,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from looktwice.clients.importers.comma2k19 import Film
+from looktwice.clients.importers.comma2k19 import FilmReader
 from looktwice.clients.importers.recording import RecordingError
 from looktwice.service.cli.commands import app
 from tests.comma2k19 import SEGMENT
@@ -79,7 +79,7 @@ def test_every_command_that_is_listed_is_run_or_it_is_said_why_not() -> None:
 
 def test_the_real_minute_is_followed_wherever_its_film_can_be_read() -> None:
     try:
-        readable = Film(SEGMENT / "video.hevc", np.zeros(1)).picture(0).ndim == 3
+        readable = FilmReader(SEGMENT / "video.hevc", np.zeros(1)).picture(0).ndim == 3
     except RecordingError:
         readable = False
     assert (left_out().keys() & set(MINUTE) == set()) is readable

@@ -17,7 +17,7 @@ from looktwice.model.driving.scene import FRONT_WIDE, Scene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.trajectory import TEN_HZ_S, at_times, constant_velocity
 from looktwice.model.engines.torch.engine import TorchEngine
-from looktwice.model.families.family import View
+from looktwice.model.families.family import PictureRequest
 from looktwice.model.network.inputs import moved_pictures
 from looktwice.model.network.visual_codes import Frame, frame_of, load_visual_codes, psnr
 from tests.end_to_end.test_bundled import looktwice
@@ -58,7 +58,7 @@ def test_its_pictures_are_of_the_scene(planner: PlannerClient) -> None:
     # A picture of its own, too: that of the codes of what is expected comes nearer.
     codes = load_visual_codes(CHECKPOINT)
     unchanged = [
-        psnr(codes.decode(codes.encode(frame), moved_pictures(scene, View(FRONT_WIDE))), frame)
+        psnr(codes.decode(codes.encode(frame), moved_pictures(scene, PictureRequest(FRONT_WIDE))), frame)
         for scene, frame in zip(scenes, expected, strict=True)
     ]
     assert np.mean(own) < np.mean(unchanged)

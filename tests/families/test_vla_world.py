@@ -31,7 +31,7 @@ from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.engines.torch.shortcuts import Shortcuts
 from looktwice.model.evaluation.open_loop import evaluate_draws
 from looktwice.model.families.cf_vla import CF_VLA
-from looktwice.model.families.family import FamilyError, Lesson, NextPicture, View
+from looktwice.model.families.family import FamilyError, Lesson, NextPicture, PictureRequest
 from looktwice.model.families.picture_codes import BLANK, PICTURE_CODES
 from looktwice.model.families.vla_world import VLA_WORLD
 from looktwice.model.families.vla_world.format import TIMES_S, UNSEEN
@@ -272,7 +272,7 @@ def test_a_motion_that_is_given_is_predicted_and_seen(world: Loaded, painting: L
     wide = scene.clips[0].camera
 
     def shown(motion: Motion | None) -> tuple[int, ...] | None:
-        return painting.inputs.expected(scene, View(wide, motion))
+        return painting.inputs.expected(scene, PictureRequest(wide, motion))
 
     x_m, y_m, heading_rad = INERTIA.ego(scene.history, None).tolist()
     assert shown(Motion(x_m, y_m, heading_rad)) == shown(None) != shown(motion)
@@ -295,12 +295,12 @@ def test_the_expected_picture_is_what_the_asked_camera_shows_last_moved_as_the_e
     assert np.hypot(*pose[:2]) > 0.5
     moved = moved_view(frame_of(wide.images[-1]), CAMERA_SPECS[wide.camera], pose)
     codes = painting.visual_codes.encode(moved).tolist()
-    assert painting.inputs.expected(scene, View(wide.camera)) == tuple(codes)
-    assert painting.inputs.expected(scene, View("back")) is None
+    assert painting.inputs.expected(scene, PictureRequest(wide.camera)) == tuple(codes)
+    assert painting.inputs.expected(scene, PictureRequest("back")) is None
     assert painting.inputs.expected(scene, None) is None
-    assert world.inputs.expected(scene, View(wide.camera)) is None
+    assert world.inputs.expected(scene, PictureRequest(wide.camera)) is None
     broken = replace(scene, clips=(*scene.clips, Clip("back", (wide.images[0][:200],) * 4)))
-    assert painting.inputs.expected(broken, View("back")) is None
+    assert painting.inputs.expected(broken, PictureRequest("back")) is None
     with torch.inference_mode():
         for camera, expected in ((wide.camera, codes), ("back", list(BLANK))):
             asked = PlanRequest("a", scene, "vla_world", Controls(n=1, imagine="always", camera=camera))
@@ -320,7 +320,7 @@ def test_pictures_are_painted_with_what_the_asked_camera_shows() -> None:
         controls = Controls(imagine="always", camera=camera, motion=motion)
         return painted(codes, PlanRequest("a", scene, "vla_world", controls), written).tobytes()
 
-    moved = moved_pictures(scene, View(camera))
+    moved = moved_pictures(scene, PictureRequest(camera))
     assert moved is not None
     assert paint(camera) == codes.decode(written, moved).tobytes()
     assert paint(camera) != paint(camera, Motion(20.0, 0.0, 0.0))
@@ -353,9 +353,9 @@ def test_training_shows_what_the_asked_camera_may_see_as_the_engine_does(paintin
             clips = (*plain.scene.clips, Clip("front_right", (flipped,) * 4))
             seen = mirrored_scene(replace(labelled, scene=replace(scene, clips=clips)))
         asked = mirrored_camera(camera) if mirror else camera
-        built = painting.inputs.build(seen.scene, "vla_world", view=View(asked))
+        built = painting.inputs.build(seen.scene, "vla_world", view=PictureRequest(asked))
         assert data[item].prompt == built.prompt.ids.tolist(), camera
-        expected = painting.inputs.expected(seen.scene, View(asked))
+        expected = painting.inputs.expected(seen.scene, PictureRequest(asked))
         assert (expected is None) == (camera == "back")
         [response] = data[item].responses
         codes = painting.vocabulary.alphabets["visual"][0]

@@ -6,7 +6,7 @@ from functools import cache
 
 from looktwice.loadtests.mix import Mix
 from looktwice.loadtests.run import Setup
-from looktwice.loadtests.sending import Target
+from looktwice.loadtests.sending import ServiceTarget
 from looktwice.model.bundled import SCENES
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import read_scenes
@@ -22,7 +22,7 @@ def setup(
 ) -> Setup:
     """With a lag limit that even a busy machine keeps: tests are not about its speed."""
     return Setup(
-        target=Target(url, timeout_s=10),
+        target=ServiceTarget(url, timeout_s=10),
         scenes=labelled_scenes(),
         mix=mix,
         rate_rps=rate_rps,

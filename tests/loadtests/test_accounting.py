@@ -9,17 +9,19 @@ from hypothesis import strategies as st
 from looktwice.loadtests.accounting import Summary, faults, summarise
 from looktwice.loadtests.exchange import MISSED, Branch, Exchange, Outcome, Verdict
 from looktwice.loadtests.loads import Window
-from looktwice.loadtests.mix import Kind
+from looktwice.loadtests.mix import RequestKind
 
 WINDOW = Window("measured", 10, 20)
 
 
-def answered(due_s: float, latency_s: float, branch: Branch = "direct", kind: Kind = Kind()) -> Exchange:
+def answered(
+    due_s: float, latency_s: float, branch: Branch = "direct", kind: RequestKind = RequestKind()
+) -> Exchange:
     return Exchange(kind, due_s, due_s, due_s + latency_s, Verdict("answered", branch=branch))
 
 
 def refused(due_s: float, outcome: Outcome, problem: str) -> Exchange:
-    return Exchange(Kind(), due_s, due_s, due_s + 0.01, Verdict(outcome, problem))
+    return Exchange(RequestKind(), due_s, due_s, due_s + 0.01, Verdict(outcome, problem))
 
 
 def summary(*exchanges: Exchange, goal_s: float = 1.0) -> Summary:
@@ -33,7 +35,7 @@ def test_a_request_belongs_to_the_window_it_was_due_in() -> None:
 
 
 def test_latency_counts_from_when_a_request_was_due() -> None:
-    late = Exchange(Kind(), 10, 12, 12.5, Verdict("answered", branch="direct"))
+    late = Exchange(RequestKind(), 10, 12, 12.5, Verdict("answered", branch="direct"))
     assert summary(late).latencies().percentile_s("p50") == pytest.approx(2.5, rel=2e-3)
     assert summary(late).lags().percentile_s("p50") == pytest.approx(2, rel=2e-3)
 
@@ -51,7 +53,7 @@ def test_rejections_and_failures_are_told_apart_and_none_is_good() -> None:
 
 
 def test_goodput_is_measured_at_each_requests_own_deadline() -> None:
-    hurried = Kind(deadline_ms=200)
+    hurried = RequestKind(deadline_ms=200)
     told = summary(answered(11, 0.5), answered(12, 0.5, kind=hurried), answered(13, 0.1, kind=hurried))
     assert told.good == 2
     assert summary(answered(11, 0.5), goal_s=0.4).good == 0
@@ -77,7 +79,7 @@ def test_what_is_under_way_at_the_end_was_achieved() -> None:
 
 
 def test_planners_that_still_wait_count_as_offered_and_not_as_sent() -> None:
-    missed = Exchange(Kind(), 11, math.nan, 12, MISSED)
+    missed = Exchange(RequestKind(), 11, math.nan, 12, MISSED)
     told = summary(answered(10.9, 1.1), missed)
     assert told.achieved_share == 0.5
     assert len(told.lags()) == 1
@@ -85,7 +87,8 @@ def test_planners_that_still_wait_count_as_offered_and_not_as_sent() -> None:
 
 def test_a_client_that_is_late_makes_the_run_invalid() -> None:
     late = [
-        Exchange(Kind(), 10 + i / 10, 10.3 + i / 10, 10.4 + i / 10, Verdict("answered")) for i in range(99)
+        Exchange(RequestKind(), 10 + i / 10, 10.3 + i / 10, 10.4 + i / 10, Verdict("answered"))
+        for i in range(99)
     ]
     assert "the client was the bottleneck" in faults(summary(*late), 0.025)[0]
     assert faults(summary(*late), 0.5) == []
@@ -103,7 +106,13 @@ def test_a_client_that_is_late_makes_the_run_invalid() -> None:
 def test_every_request_is_counted_once(ended: list[tuple[float, float, Outcome]]) -> None:
     told = summary(
         *(
-            Exchange(Kind(), due, due, due + took, Verdict(outcome, "" if outcome == "answered" else outcome))
+            Exchange(
+                RequestKind(),
+                due,
+                due,
+                due + took,
+                Verdict(outcome, "" if outcome == "answered" else outcome),
+            )
             for due, took, outcome in ended
         )
     )

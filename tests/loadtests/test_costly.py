@@ -10,7 +10,7 @@ import pytest
 
 from looktwice.loadtests.attacks import costly_calls, never_seen
 from looktwice.loadtests.bodies import make_call
-from looktwice.loadtests.mix import Kind
+from looktwice.loadtests.mix import RequestKind
 from looktwice.loadtests.scenarios.hostile import missed_goals
 from looktwice.model.driving.images import decode_image
 from tests.model.driving.drives import labelled_scene
@@ -49,7 +49,7 @@ def test_a_goal_that_is_missed_is_told(change: dict[str, Any], told: str) -> Non
 
 
 def test_pictures_of_dear_requests_were_never_seen_before() -> None:
-    polite = make_call(Kind("direct", 1), [labelled_scene(8.0, pictures=1)], seed=1)
+    polite = make_call(RequestKind("direct", 1), [labelled_scene(8.0, pictures=1)], seed=1)
     large = costly_calls(polite)[2]
     bodies = [json.loads(never_seen(large.body)) for _ in range(2)]
     pictures = [

@@ -15,9 +15,17 @@ import numpy as np
 from looktwice.loadtests.accounting import summarise
 from looktwice.loadtests.bodies import make_calls
 from looktwice.loadtests.exchange import Exchange
-from looktwice.loadtests.loads import Fleet, OpenLoop, Phase, Planner, Window, poisson_arrivals, run_load
+from looktwice.loadtests.loads import (
+    Fleet,
+    LoadPhase,
+    OpenLoop,
+    PlanningCar,
+    Window,
+    poisson_arrivals,
+    run_load,
+)
 from looktwice.loadtests.mix import Mix
-from looktwice.loadtests.sending import Target
+from looktwice.loadtests.sending import ServiceTarget
 from tests.loadtests.scenes import labelled_scenes
 from tests.loadtests.stand_in import StandIn, standing_in
 from tests.waiting import until
@@ -29,14 +37,14 @@ GOAL_S = 0.2
 def test_stalls_are_reported_by_the_clock_of_when_requests_were_due() -> None:
     """The service stalls for 1 s in every 4 s, so no request that is due there can be in time."""
     seconds, every_s, stall_s = 8.0, 4.0, 1.0
-    opened = OpenLoop(poisson_arrivals([Phase("all", seconds, 25)], 3), CALLS)
+    opened = OpenLoop(poisson_arrivals([LoadPhase("all", seconds, 25)], 3), CALLS)
     # It asks again as soon as it has its answer, as closed loops commonly do.
-    closed = Fleet((Planner(CALLS, period_s=0.02, offset_s=0.0),), seconds)
+    closed = Fleet((PlanningCar(CALLS, period_s=0.02, offset_s=0.0),), seconds)
     service = StandIn(stall_every_s=every_s, stall_s=stall_s)
     with standing_in(service) as url:
 
         async def both() -> tuple[float, list[Exchange], list[Exchange]]:
-            target, starts_at = Target(url), time.monotonic() + 0.2
+            target, starts_at = ServiceTarget(url), time.monotonic() + 0.2
             exchanges = await asyncio.gather(
                 run_load(opened, target, starts_at), run_load(closed, target, starts_at)
             )
@@ -67,16 +75,16 @@ def test_an_open_loop_does_not_wait_for_answers() -> None:
     service = StandIn(service_s=5.0)  # long enough for a machine that others keep busy
     load = OpenLoop(np.linspace(0, 0.3, 20), CALLS)
     with standing_in(service) as url:
-        exchanges = asyncio.run(run_load(load, Target(url), time.monotonic() + 0.1))
+        exchanges = asyncio.run(run_load(load, ServiceTarget(url), time.monotonic() + 0.1))
     assert len(exchanges) == 20
     last_sent_s = max(each.sent_s for each in exchanges)
     assert last_sent_s < min(each.ended_s for each in exchanges)
 
 
 def test_a_planner_waits_and_counts_the_ticks_that_went_by() -> None:
-    planner = Planner(CALLS, period_s=0.05, offset_s=0.0)
+    planner = PlanningCar(CALLS, period_s=0.05, offset_s=0.0)
     with standing_in(StandIn(service_s=0.12)) as url:
-        exchanges = asyncio.run(run_load(Fleet((planner,), 1.5), Target(url), time.monotonic() + 0.1))
+        exchanges = asyncio.run(run_load(Fleet((planner,), 1.5), ServiceTarget(url), time.monotonic() + 0.1))
     np.testing.assert_allclose([each.due_s for each in exchanges], 0.05 * np.arange(30), atol=1e-9)
     sent = [each for each in exchanges if each.verdict.outcome == "answered"]
     assert 0 < len(sent) <= 10
@@ -91,7 +99,7 @@ def test_work_split_between_workers_is_the_same_work() -> None:
         (due_s, part.calls[place].body) for part in parts for place, due_s in enumerate(part.due_s.tolist())
     )
     assert again == [(due_s, CALLS[(4 + due_s) % 10].body) for due_s in range(7)]
-    fleet = Fleet(tuple(Planner(CALLS, 0.1, offset) for offset in (0.0, 0.01, 0.02)), 1)
+    fleet = Fleet(tuple(PlanningCar(CALLS, 0.1, offset) for offset in (0.0, 0.01, 0.02)), 1)
     assert {planner.offset_s for part in fleet.split(2) for planner in part.planners} == {0.0, 0.01, 0.02}
 
 

@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import pytest
 
-from looktwice.loadtests.memory import Reading, growth
+from looktwice.loadtests.memory import MemoryReading, growth
 
 
 def test_growth_is_the_slope_of_what_was_read() -> None:
-    readings = [Reading(10.0 * step, 1_000_000 + 500 * step) for step in range(100)]
+    readings = [MemoryReading(10.0 * step, 1_000_000 + 500 * step) for step in range(100)]
     grown = growth(readings)
     assert grown is not None
     assert grown.bytes_per_hour == pytest.approx(500 / 10 * 3600)
@@ -15,14 +15,14 @@ def test_growth_is_the_slope_of_what_was_read() -> None:
 
 
 def test_what_fills_up_in_the_first_half_is_no_growth_of_the_second() -> None:
-    grown = growth([Reading(float(step), 1_000_000 + 20_000 * min(step, 40)) for step in range(100)])
+    grown = growth([MemoryReading(float(step), 1_000_000 + 20_000 * min(step, 40)) for step in range(100)])
     assert grown is not None
     assert grown.last_bytes > 1.5 * grown.first_bytes
     assert grown.late == 0
 
 
 def test_one_peak_is_no_growth() -> None:
-    readings = [Reading(float(step), 9_000_000 if step == 50 else 1_000_000) for step in range(101)]
+    readings = [MemoryReading(float(step), 9_000_000 if step == 50 else 1_000_000) for step in range(101)]
     grown = growth(readings)
     assert grown is not None
     assert grown.first_bytes == grown.last_bytes
@@ -30,4 +30,4 @@ def test_one_peak_is_no_growth() -> None:
 
 
 def test_one_reading_says_nothing() -> None:
-    assert growth([Reading(0, 1)]) is None
+    assert growth([MemoryReading(0, 1)]) is None

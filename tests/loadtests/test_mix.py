@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 
-from looktwice.loadtests.mix import Kind, Mix, parse_mix, parse_weights
+from looktwice.loadtests.mix import Mix, RequestKind, parse_mix, parse_weights
 
 
 def test_choices_occur_as_often_as_they_weigh() -> None:
@@ -20,13 +20,13 @@ def test_choices_occur_as_often_as_they_weigh() -> None:
 
 def test_labels_and_batches_do_not_stream() -> None:
     kinds = parse_mix("label,batch", "6", "json", "300", 1.0).kinds(50, seed=0)
-    assert set(kinds) == {Kind("label", 1), Kind("batch", 6, deadline_ms=300)}
+    assert set(kinds) == {RequestKind("label", 1), RequestKind("batch", 6, deadline_ms=300)}
     pictures = parse_mix("imagine", "2", "json", "300", 1.0).kinds(5, seed=0)
-    assert set(pictures) == {Kind("imagine", 2, stream=True)}
+    assert set(pictures) == {RequestKind("imagine", 2, stream=True)}
     with pytest.raises(ValueError, match="no deadline"):
-        Kind("imagine", deadline_ms=300)
+        RequestKind("imagine", deadline_ms=300)
     with pytest.raises(ValueError, match="no stream"):
-        Kind("batch", stream=True)
+        RequestKind("batch", stream=True)
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_a_mix_that_means_nothing_is_refused(text: str) -> None:
 def test_kinds_stay_within_the_contract() -> None:
     for wrong in ({"n": 0}, {"n": 65}, {"deadline_ms": 0}):
         with pytest.raises(ValueError, match=str(next(iter(wrong.values())))):
-            Kind(**wrong)  # type: ignore[arg-type]
+            RequestKind(**wrong)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="share"):
         Mix(stream=1.5)
 
@@ -50,5 +50,5 @@ def test_weights_default_to_one() -> None:
 
 
 def test_kinds_tell_what_they_are() -> None:
-    assert str(Kind("think", 6, "msgpack", True, 300)) == "think n=6 msgpack stream within 300 ms"
-    assert str(Kind("label", 1)) == "label json"
+    assert str(RequestKind("think", 6, "msgpack", True, 300)) == "think n=6 msgpack stream within 300 ms"
+    assert str(RequestKind("label", 1)) == "label json"

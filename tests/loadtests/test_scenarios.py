@@ -12,7 +12,7 @@ import pytest
 from looktwice.loadtests.attacks import Hostility
 from looktwice.loadtests.mix import Mix
 from looktwice.loadtests.page import page
-from looktwice.loadtests.report import Report
+from looktwice.loadtests.report import LoadReport
 from looktwice.loadtests.run import Result, Setup
 from looktwice.loadtests.scenarios.hostile import hostile
 from looktwice.loadtests.scenarios.steady import burst, fleet, poisson, soak
@@ -41,7 +41,7 @@ class Page(HTMLParser):
 def written(result: Result, used: Setup) -> Page:
     card = {"name": "<stand-in>", "revision": "1", "engine": "none"}
     read = Page()
-    read.feed(page(Report(used, result, "2026-01-01", {"cores": 2}, {"models": [card]}, {"python": "3"})))
+    read.feed(page(LoadReport(used, result, "2026-01-01", {"cores": 2}, {"models": [card]}, {"python": "3"})))
     assert "script" not in read.tags
     assert read.fetched == []
     return read

@@ -29,8 +29,8 @@ from looktwice.model.engines.engine import (
     Draw,
     DrawFinished,
     EngineError,
+    EngineLoad,
     Event,
-    Load,
     PlanRequest,
     RequestError,
     SectionFinished,
@@ -110,8 +110,8 @@ class ScriptedEngine:
         return self.card_shown
 
     @property
-    def load(self) -> Load:
-        return Load(rows=64, rows_used=len(self.submitted) - self.finished)
+    def load(self) -> EngineLoad:
+        return EngineLoad(rows=64, rows_used=len(self.submitted) - self.finished)
 
     async def wait(self) -> None:
         raise await self.breaks.get()

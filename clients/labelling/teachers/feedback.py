@@ -13,7 +13,14 @@ from looktwice.clients.labelling.checks import FailedCheck
 from looktwice.clients.labelling.teachers.teacher import ATTEMPTS, Answer, ReflectionRefused
 from looktwice.model.driving.pdm.failures import Fact
 from looktwice.model.driving.pdm.feedback import BEGIN, END, SECTIONS, Feedback, FeedbackError, parse_feedback
-from looktwice.model.driving.pdm.judged import JudgedPlan, Number, Waypoint, called, foreign_numbers, numbers
+from looktwice.model.driving.pdm.judged import (
+    JudgedPlan,
+    Measurement,
+    Waypoint,
+    called,
+    foreign_numbers,
+    numbers,
+)
 from looktwice.model.driving.pdm.rule_teacher import SHORT
 from looktwice.model.driving.pdm.scoring import FACTORS, WEIGHTS
 
@@ -52,7 +59,7 @@ class FeedbackQuestion:
     """
 
     prompt: str
-    numbers: tuple[Number, ...]
+    numbers: tuple[Measurement, ...]
     names: tuple[str, ...]
 
 

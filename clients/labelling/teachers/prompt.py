@@ -68,13 +68,13 @@ class Text:
 
 
 @dataclass(frozen=True)
-class Picture:
+class PicturePart:
     """A picture, encoded, between parts of text."""
 
     image: bytes
 
 
-Part = Text | Picture
+Part = Text | PicturePart
 
 
 def camera_line(clip: Clip) -> str:
@@ -91,7 +91,7 @@ def user_message(
     parts: list[Part] = []
     for clip in question.scene.clips:
         parts.append(Text(camera_line(clip)))
-        parts += [Picture(image) for image in clip.images]
+        parts += [PicturePart(image) for image in clip.images]
     parts.append(
         Text(f"The better plan, for you alone:\n{question.expert}\nYour plan:\n{question.predicted}")
     )

@@ -118,7 +118,7 @@ class Teacher(Protocol):
 
 
 @dataclass(frozen=True)
-class Reflection:
+class CheckedReflection:
     """An answer that passed all checks; ``failed`` are those that earlier answers did not pass."""
 
     text: str
@@ -131,7 +131,7 @@ async def ask(
     question: Question,
     answers: list[Answer],
     keep: Callable[[int, Answer], None] = lambda attempt, answer: None,
-) -> Reflection:
+) -> CheckedReflection:
     """A teacher's checked answer; it is asked again with what was wrong, `ATTEMPTS` times in all.
 
     Args:
@@ -145,13 +145,13 @@ async def ask(
         TeacherError: it cannot answer.
         ReflectionRefused: none of its answers passed the checks.
     """
-    while not isinstance(verdict := judge(question, answers), Reflection):
+    while not isinstance(verdict := judge(question, answers), CheckedReflection):
         answers.append(await teacher.reflect(question, verdict))
         keep(len(answers), answers[-1])
     return verdict
 
 
-def judge(question: Question, answers: Sequence[Answer]) -> Reflection | tuple[FailedCheck, ...]:
+def judge(question: Question, answers: Sequence[Answer]) -> CheckedReflection | tuple[FailedCheck, ...]:
     """The first answer that passes all checks, or what to tell the teacher when it is asked again.
 
     Raises:
@@ -165,7 +165,7 @@ def judge(question: Question, answers: Sequence[Answer]) -> Reflection | tuple[F
             else check_reflection(answer.text, question.predicted, question.expert)
         )
         if not failed:
-            return Reflection(answer.text, attempt, tuple(complaints))
+            return CheckedReflection(answer.text, attempt, tuple(complaints))
         complaints += failed
         if attempt == ATTEMPTS:
             raise ReflectionRefused(answer.text, failed, complaints, ATTEMPTS)

@@ -10,14 +10,14 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from looktwice.clients.metadrive.closed_loop.pilots import Pilot, Planned
-from looktwice.clients.metadrive.drawing.rig import Picture, Rig
+from looktwice.clients.metadrive.drawing.rig import RenderedPicture, Rig
 from looktwice.clients.metadrive.drawing.stage import Stage
 from looktwice.clients.metadrive.result_store import ResultStore
 from looktwice.clients.metadrive.scenes.annotate import route_ahead
 from looktwice.clients.metadrive.scenes.tracks import tracks_at
 from looktwice.clients.metadrive.scenes.windows import PICTURE_STEPS, blank_clips, history_at
 from looktwice.clients.metadrive.world.actors import STEP_S, Body
-from looktwice.clients.metadrive.world.episode import World, make_world
+from looktwice.clients.metadrive.world.episode import EpisodeWorld, make_world
 from looktwice.clients.metadrive.world.episode_log import EpisodeLog
 from looktwice.clients.metadrive.world.fork import kind_of
 from looktwice.clients.metadrive.world.roads import Array
@@ -84,7 +84,7 @@ class Shot:
     driver: str
     log: EpisodeLog
     step: int
-    pictures: Sequence[Picture]
+    pictures: Sequence[RenderedPicture]
     planned: Planned | None
 
 
@@ -110,7 +110,7 @@ def drive(
     rig: Rig | None,
     config: DriveConfig = DriveConfig(),
     on_shot: Callable[[Shot], None] | None = None,
-    on_plan: Callable[[World, Scene], None] | None = None,
+    on_plan: Callable[[EpisodeWorld, Scene], None] | None = None,
     look: bool = False,
 ) -> Drive:
     """Drive one episode; the world around is the same for every driver until it has to react to it.
@@ -134,7 +134,7 @@ def drive(
         if rig is None:
             raise ValueError("pictures are wanted, and there is no rig to take them")
         stage = Stage(world.live, rig)
-    plans, shots = _Plans(), dict[int, list[Picture]]()
+    plans, shots = _Plans(), dict[int, list[RenderedPicture]]()
     way: Array | None = None
     planned_at, outside, left_road = 0, 0, False
     every = round(config.replan_s / STEP_S)
@@ -183,14 +183,16 @@ def drive(
     )
 
 
-def _driver(world: World, way: Array | None, age_s: float) -> Callable[[list[Body]], None]:
+def _driver(world: EpisodeWorld, way: Array | None, age_s: float) -> Callable[[list[Body]], None]:
     ego = world.ego
     if way is None or not isinstance(ego, FreeVehicle):
         return world.drive_as_expert
     return lambda _: ego.follow(way, age_s, world.live.road_map)
 
 
-def _scene(world: World, step: int, shots: dict[int, list[Picture]], cameras: Sequence[CameraSpec]) -> Scene:
+def _scene(
+    world: EpisodeWorld, step: int, shots: dict[int, list[RenderedPicture]], cameras: Sequence[CameraSpec]
+) -> Scene:
     """What the car sees now; nothing of the world but through its cameras, its motion and its way."""
     times = [step - PICTURE_STEPS * k for k in reversed(range(CLIP_FRAMES))]
     clips = blank_clips(cameras)

@@ -11,7 +11,7 @@ import shapely
 
 from looktwice.clients.metadrive import simulator
 from looktwice.clients.metadrive.drawing.meshes import Mesh, box, flat_mesh, joined, spike, strip
-from looktwice.clients.metadrive.world.roads import Lane, RoadMap
+from looktwice.clients.metadrive.world.roads import RoadLane, RoadMap
 
 _MARK_M: Final = 0.16
 _DASH_M: Final = (3.0, 6.0)
@@ -155,7 +155,7 @@ def marking_mesh(road_map: RoadMap) -> Mesh:
     return joined(pieces)
 
 
-def _line(lane: Lane, offset: float, dashed: bool, colour: tuple[float, float, float]) -> list[Mesh]:
+def _line(lane: RoadLane, offset: float, dashed: bool, colour: tuple[float, float, float]) -> list[Mesh]:
     left, right = lane.edge(offset + _MARK_M / 2), lane.edge(offset - _MARK_M / 2)
     if not dashed:
         return [strip(left, right, colour)]

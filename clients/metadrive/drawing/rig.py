@@ -17,7 +17,7 @@ FAR_M: Final = 320.0
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class RenderedPicture:
     """One camera's view: JPEG bytes, and float32 [h, w] metric depth along the axis (inf for the sky)."""
 
     camera: str
@@ -87,7 +87,7 @@ class Rig:
         for buffer, _, _ in self._cameras:
             buffer.setClearColor((*colour, 1.0))
 
-    def shoot(self) -> list[Picture]:
+    def shoot(self) -> list[RenderedPicture]:
         """Render all cameras from where the ego stands."""
         self._engine.renderFrame()
         pictures = []
@@ -97,7 +97,7 @@ class Rig:
             raw = np.frombuffer(memoryview(depth.getRamImage()), np.float32).reshape(shape)[::-1]
             linear = NEAR_M * FAR_M / (FAR_M - raw.astype(np.float64) * (FAR_M - NEAR_M))
             metres = np.where(raw >= 0.999999, np.inf, linear).astype(np.float32)
-            pictures.append(Picture(spec.name, encode_jpeg(image), metres))
+            pictures.append(RenderedPicture(spec.name, encode_jpeg(image), metres))
         return pictures
 
     def close(self) -> None:

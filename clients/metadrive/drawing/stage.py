@@ -12,7 +12,7 @@ from looktwice.clients.metadrive import simulator
 from looktwice.clients.metadrive.drawing import map_meshes
 from looktwice.clients.metadrive.drawing.meshes import box
 from looktwice.clients.metadrive.drawing.models import GAIT_CYCLE_M, GAIT_POSES, model_meshes
-from looktwice.clients.metadrive.drawing.rig import Picture, Rig
+from looktwice.clients.metadrive.drawing.rig import RenderedPicture, Rig
 from looktwice.clients.metadrive.world.actors import BODY_SIZES
 from looktwice.clients.metadrive.world.episode_log import (
     BRAKE_LIGHT,
@@ -81,7 +81,7 @@ class Stage:
         haze.setLinearRange(60, 420)
         self._world.setFog(haze)
 
-    def shoot(self, step: int) -> list[Picture]:
+    def shoot(self, step: int) -> list[RenderedPicture]:
         """The pictures at ``step`` of the episode."""
         x, y, heading, _ = self._log.ego[step]
         self._rig.ego.setPos(x, y, 0)

@@ -240,7 +240,7 @@ def write_block(
     write_scenes(block_file(out_dir, seeds), scenes, {_EPISODES_KEY: described})
 
 
-class _Made(NamedTuple):
+class _EpisodeScenes(NamedTuple):
     """Scenes of an episode; how it ended, on a road of which blocks, and how many scenes there might be."""
 
     scenes: list[LabelledScene]
@@ -262,20 +262,20 @@ def run_seed(
     return made.scenes, EpisodeOutcome(seed, made.ended, made.blocks, count, made.possible - count, seconds)
 
 
-def _of_expert(seed: int, rig: Rig | None, config: GenerateConfig) -> _Made:
+def _of_expert(seed: int, rig: Rig | None, config: GenerateConfig) -> _EpisodeScenes:
     log = run_episode(seed, config.duration_s, drifts=config.drifts, lapses=config.lapses)
     if rig is None:
         scenes = list(unpictured_scenes(log, config.stride_s))
     else:
         scenes = list(labelled_scenes(log, rig, config.stride_s, config.dense, with_next=config.next_frames))
-    return _Made(scenes, log.outcome, log.road_map.blocks, len(window_steps(log, config.stride_s)))
+    return _EpisodeScenes(scenes, log.outcome, log.road_map.blocks, len(window_steps(log, config.stride_s)))
 
 
-def _of_pilot(seed: int, pilot: Pilot, rig: Rig | None, config: GenerateConfig) -> _Made:
+def _of_pilot(seed: int, pilot: Pilot, rig: Rig | None, config: GenerateConfig) -> _EpisodeScenes:
     every = max(1, round(config.stride_s / DriveConfig().replan_s))
     driver = Careless(pilot, seed) if config.careless else pilot
     scenes, drove = own_states(seed, driver, rig, DriveConfig(config.duration_s), every)
-    return _Made(scenes, drove.ended, "", drove.plans // every)
+    return _EpisodeScenes(scenes, drove.ended, "", drove.plans // every)
 
 
 def write_manifest(out_dir: Path, config: GenerateConfig) -> dict[str, Any]:

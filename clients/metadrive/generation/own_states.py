@@ -12,7 +12,7 @@ from looktwice.clients.metadrive.closed_loop.pilots import Pilot
 from looktwice.clients.metadrive.drawing.rig import Rig
 from looktwice.clients.metadrive.scenes.lane_maps import LaneMaps
 from looktwice.clients.metadrive.scenes.windows import labelled_scene
-from looktwice.clients.metadrive.world.episode import World
+from looktwice.clients.metadrive.world.episode import EpisodeWorld
 from looktwice.clients.metadrive.world.fork import ForkError, fork_expert
 from looktwice.model.driving.scene import LabelledScene, Scene
 from looktwice.model.driving.trajectory import FUTURE_STEPS
@@ -41,7 +41,7 @@ def own_states(
     lane_maps: LaneMaps | None = None
     plans = 0
 
-    def label(world: World, scene: Scene) -> None:
+    def label(world: EpisodeWorld, scene: Scene) -> None:
         nonlocal plans, lane_maps
         plans += 1
         if plans % every:

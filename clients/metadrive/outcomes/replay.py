@@ -20,7 +20,7 @@ from looktwice.clients.metadrive import simulator
 from looktwice.clients.metadrive.generation.blocks import GENERATOR_VERSION, GenerateConfig
 from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes, outcomes_at
 from looktwice.clients.metadrive.scenes.windows import history_at
-from looktwice.clients.metadrive.world.episode import World, worlds_of_episode
+from looktwice.clients.metadrive.world.episode import EpisodeWorld, worlds_of_episode
 from looktwice.clients.metadrive.world.fork import fork_expert
 from looktwice.clients.metadrive.world.maps import MapError
 from looktwice.model.driving.scene import LabelledScene
@@ -120,7 +120,7 @@ def setting_of(scenes: Path) -> EpisodeSetting:
 
 def replayed(
     seed: int, setting: EpisodeSetting, moments: Sequence[Moment]
-) -> Iterator[tuple[Moment, World | ReplayError]]:
+) -> Iterator[tuple[Moment, EpisodeWorld | ReplayError]]:
     """Drive an episode once more and stop at some moments of it, in the order of time.
 
     Yields each moment with the world as it is then, which must not be moved; or with what keeps it from being
@@ -170,7 +170,7 @@ def outcomes_of_episode(
         yield moment.scene_id, outcomes_at(world, plans[moment.scene_id], driven)
 
 
-def _is_same(world: World, moment: Moment) -> bool:
+def _is_same(world: EpisodeWorld, moment: Moment) -> bool:
     return world.now >= len(moment.history) - 1 and _near(history_at(world.live, world.now), moment.history)
 
 

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from looktwice.clients.metadrive.world.episode import World
+from looktwice.clients.metadrive.world.episode import EpisodeWorld
 from looktwice.clients.metadrive.world.fork import Forked, fork_along, fork_expert
 from looktwice.clients.metadrive.world.tracking import WHEELBASE_M
 from looktwice.model.driving.outcome import FailureName, Outcome, metres_behind
@@ -31,7 +31,7 @@ AHEAD_RATIO: Final = 1.25
 LEAST_GAP_M: Final = 5.0
 """... if at least so many metres are between them, as in NAVSIM's progress."""
 
-_BODY: Final = pdm.Vehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2, EGO_LENGTH_M / 2, WHEELBASE_M)
+_BODY: Final = pdm.EgoVehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2, EGO_LENGTH_M / 2, WHEELBASE_M)
 """Measured from its centre, as all our poses are."""
 
 
@@ -49,7 +49,7 @@ class MomentOutcomes:
 
 
 def outcomes_at(
-    world: World, trajectories: Sequence[FloatArray], driven: Forked | None = None
+    world: EpisodeWorld, trajectories: Sequence[FloatArray], driven: Forked | None = None
 ) -> MomentOutcomes:
     """Follow each of some trajectories [64, 4] of the ego frame of now, each in a fork of its own.
 

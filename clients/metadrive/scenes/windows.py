@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 import shapely.affinity
 
-from looktwice.clients.metadrive.drawing.rig import Picture, Rig
+from looktwice.clients.metadrive.drawing.rig import RenderedPicture, Rig
 from looktwice.clients.metadrive.drawing.stage import Stage
 from looktwice.clients.metadrive.scenes.annotate import Tagger, dense_target, route_ahead, to_ego
 from looktwice.clients.metadrive.scenes.lane_maps import LaneMaps
@@ -69,7 +69,7 @@ def labelled_scenes(
     stage = Stage(log, rig)
     tagger = Tagger(log)
     lane_maps = LaneMaps(log)
-    shots: dict[int, list[Picture]] = {}
+    shots: dict[int, list[RenderedPicture]] = {}
     try:
         for step, moment in usable:
             wanted = [step - PICTURE_STEPS * k for k in reversed(range(CLIP_FRAMES))]

@@ -46,7 +46,7 @@ class Body:
 
 
 @dataclass
-class Obstacle(Body):
+class StillBody(Body):
     """A cone or a barrier."""
 
 

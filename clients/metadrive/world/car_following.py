@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from looktwice.clients.metadrive.world.actors import STEP_S, Body, Obstacle, Pedestrian, Vehicle
+from looktwice.clients.metadrive.world.actors import STEP_S, Body, Pedestrian, StillBody, Vehicle
 from looktwice.clients.metadrive.world.roads import RAIL_SPACING_M, Array, Rail, RoadMap
 
 COMFORT_BRAKE: Final = 3.5
@@ -37,7 +37,7 @@ class Style:
 
 
 @dataclass
-class View:
+class RailView:
     """The others as arrays in the coordinates of one rail."""
 
     bodies: list[Body]
@@ -54,7 +54,7 @@ class View:
     person: npt.NDArray[np.bool_]
 
 
-def look(me: Vehicle, rail: Rail, bodies: list[Body]) -> View:
+def look(me: Vehicle, rail: Rail, bodies: list[Body]) -> RailView:
     """What ``me`` sees of ``bodies`` on ``rail``."""
     mine = rail.s_at(me.progress) if me.on_route else me.s
     seen: list[Body] = []
@@ -72,7 +72,7 @@ def look(me: Vehicle, rail: Rail, bodies: list[Body]) -> View:
     angle = np.array([b.heading for b in seen]) - rail.heading[index]
     speed = np.array([b.speed for b in seen])
     size = np.array([b.size[:2] for b in seen]).reshape(-1, 2)
-    return View(
+    return RailView(
         seen,
         s,
         offset,
@@ -81,7 +81,7 @@ def look(me: Vehicle, rail: Rail, bodies: list[Body]) -> View:
         np.abs(size[:, 0] * np.cos(angle)) + np.abs(size[:, 1] * np.sin(angle)),
         np.abs(size[:, 1] * np.cos(angle)) + np.abs(size[:, 0] * np.sin(angle)),
         np.array(
-            [isinstance(b, Obstacle) or (isinstance(b, Vehicle) and b.hazard_lights) for b in seen], bool
+            [isinstance(b, StillBody) or (isinstance(b, Vehicle) and b.hazard_lights) for b in seen], bool
         ),
         np.array([isinstance(b, Pedestrian) for b in seen], bool),
     )
@@ -111,7 +111,7 @@ def _curve_speeds(rail: Rail, lateral: float) -> Array:
     return limits
 
 
-def in_my_way(me: Vehicle, view: View) -> npt.NDArray[np.bool_]:
+def in_my_way(me: Vehicle, view: RailView) -> npt.NDArray[np.bool_]:
     """Which of the seen lie ahead on the way that ``me`` is going to take."""
     ahead = view.s > me.s + 0.5
     touching = view.s - 0.5 * view.length - 0.3 * me.size[0]
@@ -125,7 +125,7 @@ def in_my_way(me: Vehicle, view: View) -> npt.NDArray[np.bool_]:
 
 
 def wanted_acceleration(
-    me: Vehicle, style: Style, limit: float, view: View, stands_off: bool = True
+    me: Vehicle, style: Style, limit: float, view: RailView, stands_off: bool = True
 ) -> float:
     """The acceleration that suits the road, the vehicles ahead and people about to be in the way."""
     speed = max(me.speed, 0.0)
@@ -161,7 +161,7 @@ def _following(style: Style, speed: float, gap: Array, lead_speed: Array) -> Arr
     return np.clip(harsh, -EMERGENCY_BRAKE, style.acceleration)
 
 
-def _yield_distance(me: Vehicle, style: Style, view: View) -> float | None:
+def _yield_distance(me: Vehicle, style: Style, view: RailView) -> float | None:
     """Metres to where ``me`` must stop for someone who is or will be in the way."""
     nearest: float | None = None
     for i in np.flatnonzero(view.person & (view.s > me.s + 1.0) & (view.s < me.s + _SIGHT_M)):
@@ -194,7 +194,7 @@ def smoothed(me: Vehicle, style: Style, wanted: float) -> float:
     return acceleration
 
 
-def fixed_ahead(me: Vehicle, view: View, reach_m: float) -> float | None:
+def fixed_ahead(me: Vehicle, view: RailView, reach_m: float) -> float | None:
     """Metres from bumper to the first thing in my lane that has to be driven round."""
     ahead = view.fixed & (view.s > me.s) & (view.s < me.s + reach_m) & (np.abs(view.offset) < 1.75)
     if not ahead.any():

@@ -49,7 +49,7 @@ def run_episode(
 
 def worlds_of_episode(
     seed: int, duration_s: float = 48.0, *, drifts: bool = False, lapses: bool = False
-) -> Iterator[World]:
+) -> Iterator[EpisodeWorld]:
     """The episode of `run_episode` as it goes on: one and the same world at every step of 0.1 s.
 
     It may be forked or copied at any of them, and must not be moved by anybody else.
@@ -69,7 +69,7 @@ def worlds_of_episode(
         yield world
 
 
-def make_world(seed: int, duration_s: float = 48.0, lapses: LateBraking | None = None) -> World:
+def make_world(seed: int, duration_s: float = 48.0, lapses: LateBraking | None = None) -> EpisodeWorld:
     """An episode before its first step, its expert's ``lapses`` given; raises `MapError`."""
     rng = np.random.default_rng([seed, 2])
     speed = float(
@@ -77,10 +77,10 @@ def make_world(seed: int, duration_s: float = 48.0, lapses: LateBraking | None =
     )
     style = varied(Style(speed / 3.6), rng)
     road_map = make_map(seed, max(320.0, 1.15 * duration_s * style.speed))
-    return World(seed, road_map, style, rng, round(duration_s / STEP_S), lapses)
+    return EpisodeWorld(seed, road_map, style, rng, round(duration_s / STEP_S), lapses)
 
 
-class World:
+class EpisodeWorld:
     """Everything that moves in an episode, and what is remembered of it.
 
     Args:
@@ -307,7 +307,7 @@ class World:
         corners = box_corners(np.array([ego.x, ego.y, ego.heading]), EGO_LENGTH_M, EGO_WIDTH_M)
         return not bool(shapely.contains_xy(self._map.drivable, corners[:, 0], corners[:, 1]).all())
 
-    def copied(self, steps: int) -> World:
+    def copied(self, steps: int) -> EpisodeWorld:
         """This world once more, with ``steps`` more to go from now on; the map is shared.
 
         What happens in the copy does not happen here. Its expert begins with a fresh memory where somebody

@@ -9,9 +9,9 @@ import numpy as np
 
 from looktwice.clients.metadrive.world.actors import Body, Vehicle
 from looktwice.clients.metadrive.world.car_following import (
+    RailView,
     SpeedLimits,
     Style,
-    View,
     fixed_ahead,
     has_room,
     in_my_way,
@@ -87,7 +87,7 @@ class Expert:
             wanted = self._lapses.heeded(me, limit, wanted)
         me.advance(rails, smoothed(me, self.style, wanted))
 
-    def _lane_decision(self, me: Vehicle, view: View, bodies: list[Body]) -> int | None:
+    def _lane_decision(self, me: Vehicle, view: RailView, bodies: list[Body]) -> int | None:
         memory = self._memory
         memory.settled_s = 0.0 if me.shift is not None else memory.settled_s + 0.1
         blocked = fixed_ahead(me, view, max(40.0, 5.5 * me.speed))
@@ -110,7 +110,7 @@ class Expert:
                     return rail
         return None
 
-    def _go_round(self, me: Vehicle, view: View, bodies: list[Body], blocked: float) -> int | None:
+    def _go_round(self, me: Vehicle, view: RailView, bodies: list[Body], blocked: float) -> int | None:
         memory = self._memory
         if me.shift is not None and not (me.speed < 0.2 and me.stopped_for_s > 2):
             return None
@@ -141,7 +141,7 @@ class Expert:
         ahead = view.fixed & (view.s > s - 6) & (np.abs(view.offset) < 1.75)
         return float((view.s - s)[ahead].min()) if ahead.any() else 200.0
 
-    def _backing_out(self, me: Vehicle, view: View) -> float:
+    def _backing_out(self, me: Vehicle, view: RailView) -> float:
         blocked = fixed_ahead(me, view, 40.0)
         done = blocked is None or blocked > _ROUND_M + 0.6 or not _clear_behind(me, view)
         target = 0.0 if done else -_REVERSE_SPEED
@@ -172,7 +172,7 @@ class Expert:
                 return self._map.road_starts[index] - me.progress
         return 1000.0
 
-    def _watch_leader(self, me: Vehicle, view: View) -> None:
+    def _watch_leader(self, me: Vehicle, view: RailView) -> None:
         ahead = np.flatnonzero(in_my_way(me, view))
         slow = False
         if len(ahead):
@@ -199,7 +199,7 @@ class Expert:
         return rail
 
 
-def _clear_behind(me: Vehicle, view: View) -> bool:
+def _clear_behind(me: Vehicle, view: RailView) -> bool:
     behind = (view.s < me.s) & (view.s > me.s - 14) & (np.abs(view.offset) < 2.2)
     return not bool(behind.any())
 

@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from looktwice.clients.metadrive.world.actors import STEP_S, Body, Drift, Obstacle, Pedestrian, Vehicle
-from looktwice.clients.metadrive.world.episode import World
+from looktwice.clients.metadrive.world.actors import STEP_S, Body, Drift, Pedestrian, StillBody, Vehicle
+from looktwice.clients.metadrive.world.episode import EpisodeWorld
 from looktwice.clients.metadrive.world.episode_log import EpisodeLog
 from looktwice.clients.metadrive.world.roads import Array, RoadMap
 from looktwice.clients.metadrive.world.tracking import FreeVehicle, world_trajectory
@@ -66,7 +66,7 @@ class Forked:
         return self.collided_s is None and self.off_road_s is None
 
 
-def fork_expert(world: World, steps: int = FUTURE_STEPS) -> Forked:
+def fork_expert(world: EpisodeWorld, steps: int = FUTURE_STEPS) -> Forked:
     """Let the expert drive on from now in a copy of ``world``.
 
     Raises:
@@ -78,7 +78,7 @@ def fork_expert(world: World, steps: int = FUTURE_STEPS) -> Forked:
     return _run(forked, steps, None)
 
 
-def fork_along(world: World, trajectory: FloatArray, steps: int = FUTURE_STEPS) -> Forked:
+def fork_along(world: EpisodeWorld, trajectory: FloatArray, steps: int = FUTURE_STEPS) -> Forked:
     """Follow a trajectory [64, 4] of the ego frame of now in a copy of ``world``, as a driven car would.
 
     Raises:
@@ -123,13 +123,13 @@ class Return(Drift):
         return offset, rate
 
 
-def _copied(world: World, steps: int) -> World:
+def _copied(world: EpisodeWorld, steps: int) -> EpisodeWorld:
     if world.ended:
         raise ForkError(f"episode {world.live.seed} has ended ({world.outcome}): nothing goes on from here")
     return world.copied(steps)
 
 
-def _run(world: World, steps: int, way: Array | None) -> Forked:
+def _run(world: EpisodeWorld, steps: int, way: Array | None) -> Forked:
     start, began_m = world.now, world.ego.progress
     near = world.nearby()
     off_road_s: float | None = None
@@ -160,7 +160,7 @@ def _is_off_route(ego: Vehicle) -> bool:
     return isinstance(ego, FreeVehicle) and abs(ego.offset_m) > OFF_ROUTE_M
 
 
-def _follower(world: World, way: Array, age_s: float) -> Callable[[list[Body]], None]:
+def _follower(world: EpisodeWorld, way: Array, age_s: float) -> Callable[[list[Body]], None]:
     ego = world.ego
     assert isinstance(ego, FreeVehicle)
     return lambda _: ego.follow(way, age_s, world.live.road_map)
@@ -179,7 +179,7 @@ def kind_of(body: Body) -> HitKind:
     """What it is that was hit."""
     if isinstance(body, Pedestrian):
         return "pedestrian"
-    if isinstance(body, Obstacle):
+    if isinstance(body, StillBody):
         return "obstacle"
     if isinstance(body, Vehicle) and not body.on_route:
         return "oncoming vehicle"

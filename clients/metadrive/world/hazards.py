@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from looktwice.clients.metadrive.world.actors import Body, Obstacle, Pedestrian, Vehicle
+from looktwice.clients.metadrive.world.actors import Body, Pedestrian, StillBody, Vehicle
 from looktwice.clients.metadrive.world.car_following import look
 from looktwice.clients.metadrive.world.roads import Rail, RoadMap
 
@@ -111,10 +111,10 @@ class Director:
             bodies.append(self._obstacle("barrier", rail, s + 12.0, outer * offset))
         return bodies
 
-    def _obstacle(self, kind: str, rail: Rail, s: float, offset: float) -> Obstacle:
+    def _obstacle(self, kind: str, rail: Rail, s: float, offset: float) -> StillBody:
         x, y, heading = rail.pose(s, offset)
         kind_name = "cone" if kind == "cone" else "barrier"
-        return Obstacle(self._new_id(), kind_name, kind, x, y, heading, 0.0, rail.progress(s))  # type: ignore[arg-type]
+        return StillBody(self._new_id(), kind_name, kind, x, y, heading, 0.0, rail.progress(s))  # type: ignore[arg-type]
 
     def _queue(self, at: float) -> list[Body]:
         cars: list[Vehicle] = []

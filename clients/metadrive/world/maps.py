@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from looktwice.clients.metadrive import simulator
-from looktwice.clients.metadrive.world.roads import Lane, LineMark, Road, RoadMap, Turn, with_rails
+from looktwice.clients.metadrive.world.roads import LineMark, RoadLane, RoadMap, RoadSegment, Turn, with_rails
 from looktwice.clients.metadrive.world.y_flip import centre_line_from_metadrive
 
 _LANE_SPACING_M: Final = 1.0
@@ -117,8 +117,8 @@ def _reverse(node: str) -> str:
 
 
 def _read(network: Any, end: str, letters: str) -> RoadMap | None:
-    lanes: list[Lane] = []
-    roads: list[Road] = []
+    lanes: list[RoadLane] = []
+    roads: list[RoadSegment] = []
     edges: dict[str, list[int]] = {}
     for start, ways in network.graph.items():
         if start.startswith("decoration"):
@@ -129,10 +129,10 @@ def _read(network: Any, end: str, letters: str) -> RoadMap | None:
             for number, raw in enumerate(raw_lanes):
                 marks = [_MARKS.get(str(mark), "none") for mark in raw.line_types]
                 centre = centre_line_from_metadrive(raw, _LANE_SPACING_M)
-                lanes.append(Lane(len(lanes), road, number, centre, float(raw.width), marks[0], marks[1]))
+                lanes.append(RoadLane(len(lanes), road, number, centre, float(raw.width), marks[0], marks[1]))
             ids = tuple(range(first, len(lanes)))
             turn = _turn(lanes[first], start, stop, network)
-            roads.append(Road(road, start, stop, ids, turn))
+            roads.append(RoadSegment(road, start, stop, ids, turn))
             edges.setdefault(start, []).append(road)
     route = _shortest(edges, roads, ">", end)
     oncoming = _shortest(edges, roads, _reverse(end), "->")
@@ -141,7 +141,7 @@ def _read(network: Any, end: str, letters: str) -> RoadMap | None:
     return with_rails(RoadMap(tuple(lanes), tuple(roads), route, oncoming, letters))
 
 
-def _turn(lane: Lane, start: str, stop: str, network: Any) -> Turn | None:
+def _turn(lane: RoadLane, start: str, stop: str, network: Any) -> Turn | None:
     block = stop.lstrip("-")
     kind = next((c for c in block if c.isalpha()), "")
     other = next((c for c in start.lstrip("-") if c.isalpha()), "")
@@ -157,7 +157,7 @@ def _turn(lane: Lane, start: str, stop: str, network: Any) -> Turn | None:
     return "left" if change > 0 else "right"
 
 
-def _shortest(edges: dict[str, list[int]], roads: list[Road], start: str, end: str) -> tuple[int, ...]:
+def _shortest(edges: dict[str, list[int]], roads: list[RoadSegment], start: str, end: str) -> tuple[int, ...]:
     queue: deque[tuple[str, tuple[int, ...]]] = deque([(start, ())])
     seen = {start}
     while queue:

@@ -24,7 +24,7 @@ _SMALL_HOLE_M2: Final = 80.0
 
 
 @dataclass(frozen=True, eq=False)
-class Lane:
+class RoadLane:
     """One lane of one road; ``number`` 0 is the leftmost."""
 
     lane_id: int
@@ -55,7 +55,7 @@ class Lane:
 
 
 @dataclass(frozen=True, eq=False)
-class Road:
+class RoadSegment:
     """A run of parallel lanes between two nodes of the map; ``turn`` is set on junction roads."""
 
     road_id: int
@@ -140,7 +140,7 @@ def _resampled(points: Array, spacing: float) -> Array:
     return np.stack([np.interp(grid, s, points[:, 0]), np.interp(grid, s, points[:, 1])], axis=1)
 
 
-def make_rail(lanes: list[Lane], starts: list[float], lengths: list[float]) -> Rail:
+def make_rail(lanes: list[RoadLane], starts: list[float], lengths: list[float]) -> Rail:
     """The rail through ``lanes``; road i of the route begins at progress ``starts[i]``."""
     raw = _resampled(np.concatenate([lane.centre for lane in lanes]), RAIL_SPACING_M)
     half = int(_SMOOTHING_M / RAIL_SPACING_M)
@@ -165,8 +165,8 @@ def make_rail(lanes: list[Lane], starts: list[float], lengths: list[float]) -> R
 class RoadMap:
     """Everything that does not move: lanes, roads, the ego's route and the way of oncoming traffic."""
 
-    lanes: tuple[Lane, ...]
-    roads: tuple[Road, ...]
+    lanes: tuple[RoadLane, ...]
+    roads: tuple[RoadSegment, ...]
     route: tuple[int, ...]
     oncoming: tuple[int, ...]
     blocks: str
@@ -262,7 +262,7 @@ def _rails_along(road_map: RoadMap, route: tuple[int, ...]) -> tuple[Rail, ...]:
     return tuple(rails)
 
 
-def _successor(road_map: RoadMap, lane: Lane, road: int) -> Lane | None:
+def _successor(road_map: RoadMap, lane: RoadLane, road: int) -> RoadLane | None:
     for candidate in road_map.roads[road].lanes:
         following = road_map.lanes[candidate]
         if np.hypot(*(following.centre[0] - lane.centre[-1])) < 0.4:

@@ -22,7 +22,7 @@ _NEVER: Final = np.iinfo(np.intp).max
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class SubScore:
     """A sub-score about others, [n] each.
 
     Attributes:
@@ -48,7 +48,7 @@ def track_boxes(tracks: tuple[TrackedBox, ...], steps: int) -> Boxes:
 
 def at_fault(
     ego: Boxes, states: Array, speeds: Array, others: Boxes, tracks: tuple[TrackedBox, ...], areas: Areas
-) -> Verdict:
+) -> SubScore:
     """No at-fault collision: 0 after hitting an agent by one's own fault, 0.5 after hitting a thing.
 
     What touches a plan first without its fault is left out from then on, so that a pair's first contact
@@ -83,7 +83,7 @@ def at_fault(
 
 def too_close(
     ego: Boxes, states: Array, speeds: Array, others: Boxes, count: int, areas: Areas, last_step: int
-) -> Verdict:
+) -> SubScore:
     """Time to collision: 0 where going straight on for 0.9 s would hit something ahead.
 
     Args:
@@ -159,7 +159,7 @@ def _verdict(
     outside: BoolArray,
     outside_is_known: bool,
     values: Array,
-) -> Verdict:
+) -> SubScore:
     """Plain failures count, those aside count outside; where that is not known they leave it open."""
     scores, open_ = np.ones(count), np.zeros(count, dtype=np.bool_)
     fails = plain | (aside & outside)
@@ -171,4 +171,4 @@ def _verdict(
     late = np.lexsort((which[fails], steps[fails]))[::-1]
     first[plans[fails][late]], track[plans[fails][late]] = steps[fails][late], which[fails][late]
     scores[open_] = np.nan
-    return Verdict(scores, first, track)
+    return SubScore(scores, first, track)

@@ -23,8 +23,8 @@ from looktwice.model.driving.pdm.world import (
     YAW_RATE,
     Array,
     BoolArray,
+    EgoVehicle,
     ScoreError,
-    Vehicle,
 )
 
 Version = Literal["v1.1", "v2.2"]
@@ -73,7 +73,7 @@ class Excess:
     limit: float
 
 
-def comfort(states: Array, vehicle: Vehicle, version: Version, past: Array | None = None) -> Comfort:
+def comfort(states: Array, vehicle: EgoVehicle, version: Version, past: Array | None = None) -> Comfort:
     """Comfort of simulated ``states`` [n, 41, 11], with the ``past`` [h, 11] before them in v2.2."""
     states, before = _behind(states, past)
     bounds = _bounds(states, vehicle, version)
@@ -86,7 +86,7 @@ def comfort(states: Array, vehicle: Vehicle, version: Version, past: Array | Non
     return Comfort(holds, np.where(holds, -1, np.maximum(earliest - before, 0)), bound)
 
 
-def excesses(states: Array, vehicle: Vehicle, version: Version, past: Array | None = None) -> list[Excess]:
+def excesses(states: Array, vehicle: EgoVehicle, version: Version, past: Array | None = None) -> list[Excess]:
     """The bounds that one plan's ``states`` [1, 41, 11] break, and its worst values; see `comfort`."""
     found = []
     for bound in _bounds(_behind(states, past)[0], vehicle, version):
@@ -126,7 +126,7 @@ class _Bound:
         return result
 
 
-def _bounds(states: Array, vehicle: Vehicle, version: Version) -> list[_Bound]:
+def _bounds(states: Array, vehicle: EgoVehicle, version: Version) -> list[_Bound]:
     """All bounds, in the order in which they are told."""
     count = states.shape[1]
     longitudinal, lateral = states[..., ACCELERATION], states[..., ACCELERATION_Y]
@@ -199,7 +199,7 @@ def _features(states: Array) -> tuple[Array, Array, Array, Array]:
     return acceleration, jerk, _smooth(heading, 5, 2, 1), _smooth(heading, 5, 2, 2)
 
 
-def _shifted(states: Array, vehicle: Vehicle) -> tuple[Array, Array]:
+def _shifted(states: Array, vehicle: EgoVehicle) -> tuple[Array, Array]:
     """Acceleration of the box's centre in m/s², forward and to the left.
 
     NAVSIM adds the turn's two terms along the car's axis both; physics has one of them to the side. This

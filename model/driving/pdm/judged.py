@@ -21,7 +21,7 @@ THRESHOLD: Final = 0.8
 HORIZON_S: Final = STEPS * STEP_S
 
 
-class Number(NamedTuple):
+class Measurement(NamedTuple):
     """A number that is a fact, in a unit; "" for scores and shares."""
 
     value: float
@@ -107,20 +107,20 @@ _SUFFIXES: Final[Mapping[str, Unit]] = {
 }
 
 
-def numbers(judged: JudgedPlan) -> tuple[Number, ...]:
+def numbers(judged: JudgedPlan) -> tuple[Measurement, ...]:
     """Every number that feedback may name: scores, facts, courses, waypoints; angles in degrees too."""
     return tuple(dict.fromkeys(_numbers(judged)))
 
 
-def _numbers(judged: JudgedPlan) -> Iterator[Number]:
+def _numbers(judged: JudgedPlan) -> Iterator[Measurement]:
     for value in (judged.score, judged.threshold, 0.0, 1.0, *judged.sub_scores.values()):
         if value is not None:
             yield from _in_units(value, "")
-    yield Number(HORIZON_S, "s")
-    yield Number(judged.acceleration_mps2, "m/s2")
+    yield Measurement(HORIZON_S, "s")
+    yield Measurement(judged.acceleration_mps2, "m/s2")
     for fact in judged.facts:
         if fact.time_s is not None:
-            yield Number(fact.time_s, "s")
+            yield Measurement(fact.time_s, "s")
         yield from _fields(fact.other)
         for measure in fact.measures:
             for value in (measure.value, measure.limit, measure.beyond):
@@ -129,14 +129,18 @@ def _numbers(judged: JudgedPlan) -> Iterator[Number]:
     for course in (judged.course, judged.true_course):
         yield from _fields(course)
     for waypoint in (*judged.waypoints, *judged.true_waypoints):
-        yield from (Number(waypoint.time_s, "s"), Number(waypoint.x_m, "m"), Number(waypoint.y_m, "m"))
+        yield from (
+            Measurement(waypoint.time_s, "s"),
+            Measurement(waypoint.x_m, "m"),
+            Measurement(waypoint.y_m, "m"),
+        )
     for one, true in zip(judged.waypoints, judged.true_waypoints, strict=False):
-        yield from (Number(one.x_m - true.x_m, "m"), Number(one.y_m - true.y_m, "m"))
+        yield from (Measurement(one.x_m - true.x_m, "m"), Measurement(one.y_m - true.y_m, "m"))
     if judged.end_off_m is not None:
-        yield Number(judged.end_off_m, "m")
+        yield Measurement(judged.end_off_m, "m")
 
 
-def _fields(record: object) -> Iterator[Number]:
+def _fields(record: object) -> Iterator[Measurement]:
     for name, value in vars(record).items() if record is not None else ():
         if isinstance(value, float):
             yield from _in_units(value, _unit(name))
@@ -146,12 +150,12 @@ def _unit(name: str) -> Unit:
     return next((unit for suffix, unit in _SUFFIXES.items() if name.endswith(suffix)), "")
 
 
-def _in_units(value: float, unit: Unit) -> Iterator[Number]:
-    yield Number(value, unit)
+def _in_units(value: float, unit: Unit) -> Iterator[Measurement]:
+    yield Measurement(value, unit)
     if unit == "":
-        yield Number(100 * value, "%")
+        yield Measurement(100 * value, "%")
     elif unit == "rad":
-        yield Number(math.degrees(value), "deg")
+        yield Measurement(math.degrees(value), "deg")
 
 
 _NUMBER: Final = re.compile(
@@ -175,7 +179,9 @@ _WORDS: Final = re.compile(
 )
 
 
-def foreign_numbers(feedback: Feedback, allowed: Iterable[Number], names: Iterable[str] = ()) -> list[str]:
+def foreign_numbers(
+    feedback: Feedback, allowed: Iterable[Measurement], names: Iterable[str] = ()
+) -> list[str]:
     """Numbers in a teacher's sections that are no facts, as they are written there, each once.
 
     A number is a fact when one of ``allowed`` rounds to it, signs apart: to as many decimals as are written,
@@ -221,7 +227,7 @@ def _unit_of(written: str | None) -> Unit | None:
     )  # fmt: skip
 
 
-def _is_known(digits: str, unit: Unit | None, known: Iterable[Number]) -> bool:
+def _is_known(digits: str, unit: Unit | None, known: Iterable[Measurement]) -> bool:
     decimals = len(digits.partition(".")[2])
     value, half = float(digits), 0.5 * 10.0**-decimals
     return any(

@@ -20,9 +20,9 @@ from looktwice.model.driving.pdm.world import (
     YAW_RATE,
     Area,
     Array,
+    EgoVehicle,
     Lane,
     TrackedBox,
-    Vehicle,
     World,
     X,
     Y,
@@ -32,7 +32,7 @@ from looktwice.model.driving.trajectory import HISTORY_STEPS, FloatArray, to_ego
 
 _WHEELBASE_M: Final = 1.4166 + 1.0523
 """Of MetaDrive's car, behind and before its middle."""
-EGO: Final = Vehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2, EGO_LENGTH_M / 2, _WHEELBASE_M)
+EGO: Final = EgoVehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2, EGO_LENGTH_M / 2, _WHEELBASE_M)
 """The ego of our scenes, measured from its middle: that is the point that never slips.
 
 Experts on their rails, and cars that follow plans (`looktwice.clients.metadrive`), head where their

@@ -22,8 +22,8 @@ from looktwice.model.driving.pdm.world import (
     YAW_ACCELERATION,
     YAW_RATE,
     Array,
+    EgoVehicle,
     ScoreError,
-    Vehicle,
     X,
     Y,
 )
@@ -49,7 +49,7 @@ _PLANS: Final = {8: 0.5, 64: 0.1}
 """Poses of a plan, and the seconds between them."""
 
 
-def reference_poses(plans: Array, vehicle: Vehicle, ego: Array, *, centre: bool = False) -> Array:
+def reference_poses(plans: Array, vehicle: EgoVehicle, ego: Array, *, centre: bool = False) -> Array:
     """Plans as poses of the rear axle at each simulated step.
 
     Args:
@@ -87,7 +87,7 @@ def reference_poses(plans: Array, vehicle: Vehicle, ego: Array, *, centre: bool 
     return poses
 
 
-def simulate(references: Array, vehicle: Vehicle, ego: Array) -> Array:
+def simulate(references: Array, vehicle: EgoVehicle, ego: Array) -> Array:
     """Drive along ``references`` [n, 41, 3] from the state ``ego`` [11]; states [n, 41, 11]."""
     speeds, curvatures = profiles(references)
     # Plans lie on the last axis, so that each step works on whole blocks of memory.
@@ -113,7 +113,7 @@ def simulate(references: Array, vehicle: Vehicle, ego: Array) -> Array:
 
 
 def _commands(
-    now: Array, reference: tuple[Array, ...], wanted: Array, factors: Array, vehicle: Vehicle
+    now: Array, reference: tuple[Array, ...], wanted: Array, factors: Array, vehicle: EgoVehicle
 ) -> tuple[Array, Array]:
     """Acceleration in m/s² and steering rate in rad/s, [n] each, in the states ``now`` [11, n]."""
     x, y, heading, cos, sin = reference
@@ -139,7 +139,9 @@ def _commands(
     return acceleration, steering_rate
 
 
-def _advance(now: Array, acceleration: Array, steering_rate: Array, vehicle: Vehicle, after: Array) -> None:
+def _advance(
+    now: Array, acceleration: Array, steering_rate: Array, vehicle: EgoVehicle, after: Array
+) -> None:
     """Write into ``after`` [11, n] where the car is one step later; both commands come with a lag."""
     steering, speed, heading = now[STEERING], now[SPEED], now[HEADING]
     gained = _ACCELERATION_SHARE * (acceleration - now[ACCELERATION]) + now[ACCELERATION]

@@ -40,7 +40,7 @@ class ScoreError(ValueError):
 
 
 @dataclass(frozen=True)
-class Vehicle:
+class EgoVehicle:
     """The ego's body, measured from its rear axle."""
 
     width_m: float
@@ -64,7 +64,7 @@ class Vehicle:
         return self.length_m / 2 - self.rear_m
 
 
-PACIFICA: Final = Vehicle(width_m=2.297, front_m=4.049, rear_m=1.127, wheelbase_m=3.089)
+PACIFICA: Final = EgoVehicle(width_m=2.297, front_m=4.049, rear_m=1.127, wheelbase_m=3.089)
 """The car of nuPlan and NAVSIM."""
 
 
@@ -197,7 +197,7 @@ class World:
     """
 
     ego: Array
-    vehicle: Vehicle = PACIFICA
+    vehicle: EgoVehicle = PACIFICA
     tracks: tuple[TrackedBox, ...] | None = None
     lanes: tuple[Lane, ...] | None = None
     intersections: tuple[Area, ...] | None = None

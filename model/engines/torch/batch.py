@@ -11,7 +11,7 @@ import numpy.typing as npt
 from looktwice.model.engines.torch.memory import Memory, RowInput, SlotMapping
 
 if TYPE_CHECKING:
-    from looktwice.model.engines.torch.runner import Prompt  # a runner needs torch, batches do not
+    from looktwice.model.engines.torch.runner import PromptPrefill  # a runner needs torch, batches do not
 
 Ids = npt.NDArray[np.int64]
 
@@ -28,7 +28,7 @@ class Feed(NamedTuple):
     """
 
     entry: int
-    prompt: Prompt
+    prompt: PromptPrefill
     held: int
     tokens: Sequence[int]
     wanted: Sequence[tuple[int, Ids]]

@@ -14,7 +14,14 @@ from typing import Final
 import torch
 
 from looktwice.model.engines.binding import Binding, binding_of
-from looktwice.model.engines.engine import DrawFinished, EngineError, Event, Load, PlanRequest, RequestError
+from looktwice.model.engines.engine import (
+    DrawFinished,
+    EngineError,
+    EngineLoad,
+    Event,
+    PlanRequest,
+    RequestError,
+)
 from looktwice.model.engines.gate import Gate
 from looktwice.model.engines.pictures import PictureThreads
 from looktwice.model.engines.requests import painted, prompt_tokens
@@ -111,9 +118,9 @@ class TorchEngine:
         return self._card
 
     @property
-    def load(self) -> Load:
+    def load(self) -> EngineLoad:
         """How full it is now."""
-        return Load(self._settings.rows, self._rows_used, self._pictures.waiting_s)
+        return EngineLoad(self._settings.rows, self._rows_used, self._pictures.waiting_s)
 
     @property
     def counts(self) -> Counts:

@@ -24,7 +24,7 @@ from looktwice.model.families.family import Family
 from looktwice.model.formats.cursor import Cursor
 
 if TYPE_CHECKING:
-    from looktwice.model.engines.torch.runner import Prompt  # a runner needs torch, requests do not
+    from looktwice.model.engines.torch.runner import PromptPrefill  # a runner needs torch, requests do not
 
 _arrivals = itertools.count()
 
@@ -53,7 +53,7 @@ class Tree:
     request: Request
     rows: list[Row] = field(default_factory=list)
     kv_row: int | None = None
-    prompt: Prompt | None = None
+    prompt: PromptPrefill | None = None
 
     @property
     def decoding(self) -> bool:

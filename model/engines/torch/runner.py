@@ -41,7 +41,7 @@ from looktwice.model.engines.torch.layout import (
 from looktwice.model.engines.torch.memory import IntArray, Memory, SlotMapping
 from looktwice.model.engines.torch.packed import Attention, PackedDecoder, Rotation
 from looktwice.model.engines.torch.vision import Encoded, VisionEncoder
-from looktwice.model.families.family import Attempt, Family, View
+from looktwice.model.families.family import Attempt, Family, PictureRequest
 from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.network.checkpoint import Loaded
@@ -59,11 +59,11 @@ class PromptRequest(NamedTuple):
     format: str
     kv_row: int
     attempt: Attempt | None = None
-    view: View | None = None
+    view: PictureRequest | None = None
 
 
 @dataclass(eq=False)
-class Prompt:
+class PromptPrefill:
     """A prompt on its way into its KV row, all but its last token, which rows begin with.
 
     Attributes:
@@ -208,7 +208,7 @@ class Runner:
         """Make the kernels of passes with up to so many tokens."""
         self._decoder.warm_up(sorted({bucket(count) for count in range(1, tokens + 1)}))
 
-    def begin_prompts(self, asked: Sequence[PromptRequest]) -> list[Prompt | Exception]:
+    def begin_prompts(self, asked: Sequence[PromptRequest]) -> list[PromptPrefill | Exception]:
         """Begin to prefill scenes, their pictures encoded all at once.
 
         Of each prompt its KV row holds what is known already. A scene that cannot be made into inputs (a
@@ -218,7 +218,7 @@ class Runner:
             asked: scenes with all that decides their prompts.
         """
         pictures = self._vision.encode([each.scene for each in asked])
-        begun: list[Prompt | Exception] = []
+        begun: list[PromptPrefill | Exception] = []
         for each, encoded in zip(asked, pictures, strict=True):
             if isinstance(encoded, Exception):
                 begun.append(encoded)
@@ -229,7 +229,7 @@ class Runner:
                 begun.append(error)
         return begun
 
-    def feed_prompts(self, parts: Sequence[tuple[Prompt, int]]) -> None:
+    def feed_prompts(self, parts: Sequence[tuple[PromptPrefill, int]]) -> None:
         """Run up to so many more of each prompt's tokens into its row, in one pass."""
         spans = [
             (prompt, slice(prompt.held, min(prompt.held + count, len(prompt.embeddings))))
@@ -344,7 +344,7 @@ class Runner:
         rotation = self._rotation.at(positions.to(device))
         return self._decoder(embeddings, rotation, attention, wanted.to(device) if len(wanted) else None)
 
-    def _begin_prompt(self, asked: PromptRequest, encoded: Encoded) -> Prompt:
+    def _begin_prompt(self, asked: PromptRequest, encoded: Encoded) -> PromptPrefill:
         loaded, (scene, format, kv_row, attempt, view) = self.loaded, asked
         route, tracks = loaded.inputs.way(scene), loaded.inputs.tracks(scene)
         prompt = loaded.inputs.prompt_for(scene, format, attempt, view)
@@ -353,7 +353,7 @@ class Runner:
         rotation = self._decoder.rotation(embedded.position_ids)
         kept = len(prompt.ids) - 1
         clips = np.flatnonzero(prompt.ids == loaded.model.config.video_token_id)
-        begun = Prompt(
+        begun = PromptPrefill(
             kv_row,
             embedded.embeddings[:kept],
             Rotation(*(part[:kept] for part in rotation)),
@@ -369,7 +369,7 @@ class Runner:
             self._begin_with_shared(begun, format, int(clips[0]))
         return begun
 
-    def _begin_with_shared(self, prompt: Prompt, format: str, count: int) -> None:
+    def _begin_with_shared(self, prompt: PromptPrefill, format: str, count: int) -> None:
         """Fill a prompt's row with what is known already.
 
         That is all up to the end of its pictures where these were seen lately, or else the ``count`` tokens
@@ -385,7 +385,7 @@ class Runner:
         prompt.held = kept.shape[-2]
         self._held(prompt, prompt.held).copy_(kept)
 
-    def _held(self, prompt: Prompt, count: int) -> Tensor:
+    def _held(self, prompt: PromptPrefill, count: int) -> Tensor:
         """A prompt's first keys and values, [2, layers, heads, count, head_dim]."""
         return self._memory.row(prompt.kv_row, count)
 

@@ -24,19 +24,19 @@ def urgency(request: Request, now_s: float) -> tuple[float, int]:
     return due_s, request.arrival
 
 
-class Room(NamedTuple):
+class FreeRows(NamedTuple):
     """Memory to be had: rows of the batch, and KV rows."""
 
     rows: int
     kv_rows: int
 
-    def within(self, other: Room) -> bool:
+    def within(self, other: FreeRows) -> bool:
         """Whether ``other`` is as much in both."""
         return self.rows <= other.rows and self.kv_rows <= other.kv_rows
 
-    def without(self, other: Room) -> Room:
+    def without(self, other: FreeRows) -> FreeRows:
         """What is left when ``other`` is taken."""
-        return Room(self.rows - other.rows, self.kv_rows - other.kv_rows)
+        return FreeRows(self.rows - other.rows, self.kv_rows - other.kv_rows)
 
 
 class Schedule(NamedTuple):
@@ -67,7 +67,7 @@ class Scheduler:
     """
 
     def __init__(self, rows: int, kv_rows: int, rows_a_tree: int) -> None:
-        self._all, self._rows_a_tree = Room(rows, kv_rows), rows_a_tree
+        self._all, self._rows_a_tree = FreeRows(rows, kv_rows), rows_a_tree
         self._requests: dict[str, Request] = {}
 
     def __contains__(self, request_id: str) -> bool:
@@ -132,7 +132,7 @@ class Scheduler:
                 continue
             # Its rows are reserved already; one KV row after the other, however many trees wait.
             trees = [tree for tree in request.trees if tree.kv_row is None][: free.kv_rows]
-            free = free.without(Room(0, len(trees)))
+            free = free.without(FreeRows(0, len(trees)))
             growing += trees
             if not free.kv_rows:
                 break
@@ -145,7 +145,7 @@ class Scheduler:
         """
         if not now_s <= first.deadline_s < float("inf"):
             return []
-        needed = _needed(first) if first.phase is Phase.WAITING else Room(0, 1)
+        needed = _needed(first) if first.phase is Phase.WAITING else FreeRows(0, 1)
         victims, running = list[Request](), [each for each in self.running(now_s) if each is not first]
         while running and not needed.within(self._free(victims)):
             if urgency(running[-1], now_s) < urgency(first, now_s):
@@ -153,12 +153,12 @@ class Scheduler:
             victims.append(running.pop())
         return victims
 
-    def _free(self, preempted: Iterable[Request] = ()) -> Room:
+    def _free(self, preempted: Iterable[Request] = ()) -> FreeRows:
         """What is not reserved, once some requests are preempted."""
         free = self._all
         for request in self._requests.values():
             if request.phase is Phase.RUNNING and request not in preempted:
-                free = free.without(Room(request.most_rows, _kv_rows(request)))
+                free = free.without(FreeRows(request.most_rows, _kv_rows(request)))
         return free
 
 
@@ -167,9 +167,9 @@ def _waits(request: Request) -> bool:
     return request.phase is Phase.WAITING or any(tree.kv_row is None for tree in request.trees)
 
 
-def _needed(request: Request) -> Room:
+def _needed(request: Request) -> FreeRows:
     """What a request begins with."""
-    return Room(request.most_rows, len(request.trees))
+    return FreeRows(request.most_rows, len(request.trees))
 
 
 def _kv_rows(request: Request) -> int:

@@ -47,7 +47,7 @@ class Prepared:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class DecodingStep:
     """A token was written.
 
     Attributes:
@@ -61,7 +61,7 @@ class Step:
     logits: Logits
 
 
-class Decoding:
+class PlainDecoder:
     """Writes the draws of requests with one network. Call under `torch.inference_mode`.
 
     Args:
@@ -88,7 +88,7 @@ class Decoding:
         binding = binding_of(request, loaded.codec, loaded.vocabulary)
         return Prepared(request, family, start, inputs, binding, reason_mask)
 
-    def write(self, asked: Prepared, index: int) -> Iterator[Step]:
+    def write(self, asked: Prepared, index: int) -> Iterator[DecodingStep]:
         """Write draw ``index``, token by token, from a prompt of its own."""
         model, prompt = self._model, self._model.encode_prompt_embeddings(asked.inputs)
         cache = DynamicCache(config=model.config)
@@ -106,7 +106,7 @@ class Decoding:
             logprob = reported(asked.request.controls, response.cursor, scores, token)
             place = len(asked.inputs.prompt.ids) + len(response.tokens)
             finished = response.append(token, self._loaded.vocabulary, logprob)
-            yield Step(response, finished, scores)
+            yield DecodingStep(response, finished, scores)
             logits = model(
                 input_ids=torch.tensor([[token]]),
                 position_ids=torch.full((3, 1, 1), place + prompt.position_offset),

@@ -14,8 +14,8 @@ import torch
 from looktwice.model.engines.engine import (
     DrawFinished,
     EngineError,
+    EngineLoad,
     Event,
-    Load,
     PlanRequest,
     RequestError,
     Started,
@@ -31,7 +31,7 @@ from looktwice.model.engines.requests import (
     read,
     told,
 )
-from looktwice.model.engines.transformers.decoding import Decoding, Prepared
+from looktwice.model.engines.transformers.decoding import PlainDecoder, Prepared
 from looktwice.model.engines.warm_up import warm_up
 from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import CompiledFormat, Cursor
@@ -68,7 +68,7 @@ class TransformersEngine:
             name: CompiledFormat(family.format, self._loaded.vocabulary)
             for name, family in self._families.items()
         }
-        self._decoding = Decoding(self._loaded)
+        self._decoding = PlainDecoder(self._loaded)
         self._pictures, self._gate = PictureThreads(), Gate()
         self._thread: ThreadPoolExecutor | None = None
         self._ended: asyncio.Event | None = None
@@ -80,10 +80,10 @@ class TransformersEngine:
         return self._card
 
     @property
-    def load(self) -> Load:
+    def load(self) -> EngineLoad:
         """How full it is now; what waits for the thread counts as far as there would be room."""
         asked = sum(request.controls.n for request, _ in self._running.values())
-        return Load(self._rows, min(asked, self._rows), self._pictures.waiting_s)
+        return EngineLoad(self._rows, min(asked, self._rows), self._pictures.waiting_s)
 
     async def start(self) -> None:
         """Start the thread and plan once for a grey scene in every format."""

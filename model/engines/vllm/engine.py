@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from looktwice.model.driving.scene import Scene
-from looktwice.model.engines.engine import EngineError, Event, Load, PlanRequest, RequestError
+from looktwice.model.engines.engine import EngineError, EngineLoad, Event, PlanRequest, RequestError
 from looktwice.model.engines.least_error import LeastError
 from looktwice.model.engines.pictures import PictureThreads
 from looktwice.model.engines.reason_mask import reason_mask_of
@@ -23,7 +23,7 @@ from looktwice.model.engines.requests import begin, inputs_of, painted, prompt_t
 from looktwice.model.engines.vllm.decoding import Decoding, VllmPrompt
 from looktwice.model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
 from looktwice.model.engines.warm_up import warm_up
-from looktwice.model.families.family import Attempt, View
+from looktwice.model.families.family import Attempt, PictureRequest
 from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import Active, CompiledFormat, Cursor, Rest
 from looktwice.model.formats.grammar_export import to_lark
@@ -93,10 +93,10 @@ class VllmEngine:
         return self._card
 
     @property
-    def load(self) -> Load:
+    def load(self) -> EngineLoad:
         """How full it is now; what waits within vLLM counts as far as there would be room."""
         asked = sum(decoding.draws for decoding in self._running.values())
-        return Load(self._settings.rows, min(asked, self._settings.rows), self._pictures.waiting_s)
+        return EngineLoad(self._settings.rows, min(asked, self._settings.rows), self._pictures.waiting_s)
 
     @property
     def llm(self) -> Any:
@@ -198,7 +198,7 @@ class VllmEngine:
             decoding.fail(EngineError("the request was cancelled"))
 
     def prompt(
-        self, scene: Scene, format: str, attempt: Attempt | None = None, view: View | None = None
+        self, scene: Scene, format: str, attempt: Attempt | None = None, view: PictureRequest | None = None
     ) -> VllmPrompt:
         """A scene as vLLM takes it, with the attempt that is to be refined, and the picture to be seen.
 

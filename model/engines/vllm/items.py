@@ -33,7 +33,7 @@ Form = tuple[tuple[int, ...], type[np.generic]]
 """An array's shape and type."""
 
 
-class Kind(NamedTuple):
+class ItemKind(NamedTuple):
     """What vLLM calls a modality.
 
     Attributes:
@@ -47,13 +47,13 @@ class Kind(NamedTuple):
     arrays: Mapping[str, Form]
 
 
-def kinds_of(settings: VlaSettings) -> dict[str, Kind]:
+def kinds_of(settings: VlaSettings) -> dict[str, ItemKind]:
     """What a prompt of a checkpoint can hold, by modality."""
     slices, rows, columns = settings.grid
     cameras, patches = len(settings.cameras), slices * rows * columns
     width = 3 * settings.temporal_patch_size * settings.patch_size**2
     history, route = ((HISTORY_STEPS, 4), np.float32), ((ROUTE_POINTS, 2), np.float32)
-    kinds: dict[str, Kind] = {}
+    kinds: dict[str, ItemKind] = {}
     if settings.scene_tokens:
         seen: dict[str, Form] = {
             "scene_patches": ((cameras * patches, width), np.uint8),
@@ -61,17 +61,17 @@ def kinds_of(settings: VlaSettings) -> dict[str, Kind]:
             "scene_route": route,
             "scene_has_route": ((), np.bool_),
         }
-        kinds[SCENE] = Kind(settings.scene_tokens, 1, seen)
+        kinds[SCENE] = ItemKind(settings.scene_tokens, 1, seen)
     else:
         clip: dict[str, Form] = {
             "pixel_values_videos": ((patches, width), np.uint8),
             "video_grid_thw": ((3,), np.int64),
             "second_per_grid_ts": ((), np.float32),
         }
-        kinds[CLIPS] = Kind(settings.clip_tokens, cameras, clip)
-    kinds["history"] = Kind(1, 1, {"history": history})
+        kinds[CLIPS] = ItemKind(settings.clip_tokens, cameras, clip)
+    kinds["history"] = ItemKind(1, 1, {"history": history})
     if settings.with_route:
-        kinds["route"] = Kind(1, 1, {"route": route})
+        kinds["route"] = ItemKind(1, 1, {"route": route})
     if settings.with_tracks:
         tracks: dict[str, Form] = {
             "tracks": ((MAX_TRACKS, len(TRACK_FEATURES)), np.float32),
@@ -79,7 +79,7 @@ def kinds_of(settings: VlaSettings) -> dict[str, Kind]:
             "tracks_route": route,
             "tracks_has_route": ((), np.bool_),
         }
-        kinds["tracks"] = Kind(settings.intent_tokens, 1, tracks)
+        kinds["tracks"] = ItemKind(settings.intent_tokens, 1, tracks)
     return kinds
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from looktwice.model.families.trajectory_codes import TRAJECTORY_CODES
-from looktwice.model.formats.phrases import Reflection
+from looktwice.model.formats.phrases import ReflectionPhrases
 from looktwice.model.formats.pieces import Choice, Format, FreeText, Literal, Option, Piece, Section, Sequence
 from looktwice.model.formats.plan_tracks import PlanTracks, RevisedPlan
 
@@ -45,6 +45,6 @@ FREE_TEXT: Final = _cf_vla(FreeText("\n", MAX_THINKING_TOKENS), PlanTracks())
 """plan, branch { Action: trajectory | Thinking: free text, revised plan, Action: trajectory }"""
 
 PHRASES: Final = _cf_vla(
-    Sequence((Reflection(PLAN), Literal("\n"))), RevisedPlan(first_plan=PLAN, reflection=REFLECTION)
+    Sequence((ReflectionPhrases(PLAN), Literal("\n"))), RevisedPlan(first_plan=PLAN, reflection=REFLECTION)
 )
 """The same with a reflection in phrases, and a revised plan that changes as these say."""

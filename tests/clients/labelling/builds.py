@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
-from looktwice.clients.labelling.ledger import Ledger, Run
+from looktwice.clients.labelling.ledger import Ledger, StageRun
 from looktwice.clients.labelling.rollout import Sampling, config_of, key_of, packed
 from looktwice.clients.wire import ModelName
 from looktwice.model.driving.plan import parse_plan
@@ -45,7 +45,7 @@ def named(one: LabelledScene, scene_id: str) -> LabelledScene:
     return replace(one, scene=replace(one.scene, scene_id=scene_id))
 
 
-def rolled_out(folder: Path, count: int) -> Run:
+def rolled_out(folder: Path, count: int) -> StageRun:
     """A ledger in which the scenes of `scenes` are rolled out and kept."""
     one = labelled("scene")
     with Ledger(folder) as ledger:

@@ -6,8 +6,8 @@ import asyncio
 from pathlib import Path
 
 from looktwice.clients.labelling.failures import (
+    FeedbackSample,
     Inference,
-    Sample,
     feedback_config,
     feedback_jobs,
     infer,
@@ -17,7 +17,7 @@ from looktwice.clients.labelling.failures import (
 )
 from looktwice.clients.labelling.label import config_of, jobs, labeller, questions
 from looktwice.clients.labelling.ledger import Ledger
-from looktwice.clients.labelling.pipeline import Limits, work_through
+from looktwice.clients.labelling.pipeline import StageLimits, work_through
 from looktwice.clients.labelling.rollout import RETRY_POLICY
 from looktwice.clients.labelling.rollout import jobs as rollout_jobs
 from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
@@ -38,7 +38,7 @@ def label_all(folder: Path, scenes: Path, url: str, key: str) -> None:
             found = jobs(begun, questions(ledger, rollout, scenes))
             work = labeller(ledger, begun, teacher)
             try:
-                await work_through(ledger, begun, found, work, Limits(AT_ONCE))
+                await work_through(ledger, begun, found, work, StageLimits(AT_ONCE))
             finally:
                 await teacher.close()
 
@@ -49,7 +49,7 @@ def fail_all(folder: Path, scenes: Path, service: str, teacher_url: str, key: st
     """What `looktwice failures` does with an endpoint as its teacher."""
 
     async def run() -> None:
-        inference, sample = Inference(n=2), Sample(threshold=1.0)
+        inference, sample = Inference(n=2), FeedbackSample(threshold=1.0)
         teacher = OpenAiTeacher(OpenAiSettings(f"{teacher_url}/v1", "some-vlm", key))
         with Ledger(folder) as ledger:
             async with AsyncPlannerClient(service, RETRY_POLICY) as planner:
@@ -61,7 +61,7 @@ def fail_all(folder: Path, scenes: Path, service: str, teacher_url: str, key: st
                     inferred,
                     rollout_jobs(inferred, scenes, lambda _: None),
                     lambda job: infer(planner, job.subject, model, inference),
-                    Limits(AT_ONCE),
+                    StageLimits(AT_ONCE),
                 )
             begun = ledger.run("feedback", feedback_config(inferred, teacher, sample.threshold))
             chosen = sampled(ledger, inferred, sample)
@@ -71,7 +71,7 @@ def fail_all(folder: Path, scenes: Path, service: str, teacher_url: str, key: st
                     begun,
                     feedback_jobs(ledger, inferred, begun, chosen, scenes),
                     writer(ledger, begun, teacher, inference.version, sample.threshold),
-                    Limits(AT_ONCE),
+                    StageLimits(AT_ONCE),
                 )
             finally:
                 await teacher.close()

@@ -19,8 +19,8 @@ from fastapi.responses import JSONResponse, Response
 from starlette.requests import ClientDisconnect
 
 from looktwice.clients.labelling.failures import (
+    FeedbackSample,
     Inference,
-    Sample,
     feedback_config,
     feedback_jobs,
     inference_config,
@@ -28,7 +28,7 @@ from looktwice.clients.labelling.failures import (
     rows,
     sampled,
 )
-from looktwice.clients.labelling.ledger import Ledger, Run
+from looktwice.clients.labelling.ledger import Ledger, StageRun
 from looktwice.clients.labelling.teachers.feedback import check_feedback, question_of
 from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
 from looktwice.model.driving.feedback_store import FeedbackFileError, read_feedback, write_feedback
@@ -83,10 +83,10 @@ class CountingTeacher:
 def test_killed_at_any_moment_it_goes_on_where_it_was(tmp_path: Path) -> None:
     file, folder = tmp_path / "scenes.parquet", tmp_path / "failures"
     write_scenes(file, differing())
-    inference, sample = Inference(n=2), Sample(threshold=1.0)
+    inference, sample = Inference(n=2), FeedbackSample(threshold=1.0)
     unasked = OpenAiTeacher(OpenAiSettings("", "some-vlm"))
 
-    def runs(ledger: Ledger) -> tuple[Run, Run]:
+    def runs(ledger: Ledger) -> tuple[StageRun, StageRun]:
         inferred = ledger.run("inference", inference_config(MODEL, inference))
         return inferred, ledger.run("feedback", feedback_config(inferred, unasked, sample.threshold))
 
@@ -155,7 +155,7 @@ def response(score: float) -> dict[str, Any]:
     return {"draws": [{"plan": None, "think": None, "trajectory": [], "score": score, "is_partial": False}]}
 
 
-def inferred_ledger(folder: Path, scores: list[float]) -> tuple[Ledger, Run]:
+def inferred_ledger(folder: Path, scores: list[float]) -> tuple[Ledger, StageRun]:
     ledger = Ledger(folder)
     run = ledger.run("inference", inference_config(MODEL, Inference(n=1)))
     for number, score in enumerate(scores):
@@ -168,20 +168,20 @@ def test_a_sample_takes_so_many_of_each_kind_and_is_not_shuffled_by_more_scenes(
     ledger, run = inferred_ledger(tmp_path, scores)
     with ledger:
 
-        def kinds(sample: Sample) -> list[bool]:
+        def kinds(sample: FeedbackSample) -> list[bool]:
             chosen = sampled(ledger, run, sample)
             return [scores[int(key[-3:])] >= sample.threshold for key in chosen]
 
-        few = Sample(0.8, correct=5, wrong=7)
+        few = FeedbackSample(0.8, correct=5, wrong=7)
         assert (kinds(few).count(True), kinds(few).count(False)) == (5, 7)
-        assert kinds(Sample()).count(True) == 12
-        assert kinds(Sample(0.0)).count(False) == 0
+        assert kinds(FeedbackSample()).count(True) == 12
+        assert kinds(FeedbackSample(0.0)).count(False) == 0
         before = set(sampled(ledger, run, few))
         assert before != set(sampled(ledger, run, replace(few, seed=1)))
         ledger.finish(run, "key-100", "scene-100", response(0.0))
         assert len(before & set(sampled(ledger, run, few))) >= 11
     with pytest.raises(ValueError, match="threshold"):
-        Sample(threshold=1.5)
+        FeedbackSample(threshold=1.5)
 
 
 def test_the_file_is_whole_and_of_its_version(tmp_path: Path) -> None:

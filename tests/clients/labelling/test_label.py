@@ -13,8 +13,8 @@ from looktwice.clients.labelling.batch import BatchError, batch_requests, read_r
 from looktwice.clients.labelling.checks import FailedCheck
 from looktwice.clients.labelling.export import DATASET, PARTS_FILE, reflections, right_plans, write_messages
 from looktwice.clients.labelling.label import LabelTask, config_of, jobs, labeller, predicted_plans, questions
-from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError, Run
-from looktwice.clients.labelling.pipeline import Job, Limits, StageStopped, Tally, work_through
+from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError, StageRun
+from looktwice.clients.labelling.pipeline import Job, StageLimits, StageStopped, Tally, work_through
 from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
 from looktwice.clients.labelling.teachers.prompt import Text, user_message
 from looktwice.clients.labelling.teachers.rules import RuleTeacher
@@ -71,11 +71,11 @@ class Scripted:
         pass
 
 
-def labelled(ledger: Ledger, file: Path, teacher: Teacher, *, plans: int = 1) -> tuple[Run, Tally]:
+def labelled(ledger: Ledger, file: Path, teacher: Teacher, *, plans: int = 1) -> tuple[StageRun, Tally]:
     rollout = ledger.the_run("rollout")
     run = ledger.run("label", config_of(rollout, teacher, 0))
     found = jobs(run, questions(ledger, rollout, file, plans_per_scene=plans))
-    limits = Limits(max_error_rate=1.0, give_up_after_s=1.0)
+    limits = StageLimits(max_error_rate=1.0, give_up_after_s=1.0)
     return run, asyncio.run(work_through(ledger, run, found, labeller(ledger, run, teacher), limits))
 
 
@@ -254,7 +254,7 @@ def test_messages_are_what_trainers_read(ledger: Ledger, file: Path, tmp_path: P
 SETTINGS = OpenAiSettings("https://api.example/v1", "some-vlm", api_key="sk-secret")
 
 
-def in_batch(ledger: Ledger, file: Path) -> tuple[Run, list[Job[LabelTask]]]:
+def in_batch(ledger: Ledger, file: Path) -> tuple[StageRun, list[Job[LabelTask]]]:
     rollout = ledger.the_run("rollout")
     run = ledger.run("label", config_of(rollout, OpenAiTeacher(SETTINGS), 0))
     return run, list(jobs(run, questions(ledger, rollout, file)))

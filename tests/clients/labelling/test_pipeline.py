@@ -8,7 +8,14 @@ import pytest
 
 from looktwice.clients.labelling.concurrency import ConcurrencyLimit
 from looktwice.clients.labelling.ledger import Ledger, Record
-from looktwice.clients.labelling.pipeline import CannotBeDone, Job, Limits, StageStopped, Tally, work_through
+from looktwice.clients.labelling.pipeline import (
+    CannotBeDone,
+    Job,
+    StageLimits,
+    StageStopped,
+    Tally,
+    work_through,
+)
 from looktwice.clients.retries import TryLater
 
 
@@ -20,7 +27,7 @@ def worked(
     folder: Path,
     found: Iterator[Job[int]],
     do: Callable[[Job[int]], Awaitable[Record]],
-    limits: Limits = Limits(at_once=8, give_up_after_s=5.0),
+    limits: StageLimits = StageLimits(at_once=8, give_up_after_s=5.0),
 ) -> Tally:
     with Ledger(folder) as ledger:
         run = ledger.run("rollout", {})
@@ -70,10 +77,10 @@ def test_too_many_errors_stop_it_and_nothing_is_lost(tmp_path: Path) -> None:
         return await square(job)
 
     with pytest.raises(StageStopped, match=r"of \d+ could not be done.*because: no"):
-        worked(tmp_path, jobs(1000), refuse_half, Limits(at_once=4, max_error_rate=0.2))
+        worked(tmp_path, jobs(1000), refuse_half, StageLimits(at_once=4, max_error_rate=0.2))
     done = len(records(tmp_path))
     assert 5 <= done <= 40
-    patient = worked(tmp_path, jobs(100), refuse_half, Limits(at_once=4, max_error_rate=1.0))
+    patient = worked(tmp_path, jobs(100), refuse_half, StageLimits(at_once=4, max_error_rate=1.0))
     assert len(records(tmp_path)) == 50 == done + patient.done
 
 
@@ -81,13 +88,13 @@ def test_where_there_was_nothing_to_be_done_it_goes_on(tmp_path: Path) -> None:
     async def silent(job: Job[int]) -> Record:
         raise CannotBeDone("nothing to say", fault=False)
 
-    tally = worked(tmp_path, jobs(100), silent, Limits(at_once=4, max_error_rate=0.1))
+    tally = worked(tmp_path, jobs(100), silent, StageLimits(at_once=4, max_error_rate=0.1))
     assert (tally.done, tally.dead) == (0, 100)
 
 
 def test_so_many_more_are_begun_and_no_others(tmp_path: Path) -> None:
     worked(tmp_path, jobs(5), square)
-    tally = worked(tmp_path, jobs(30), square, Limits(at_most=3))
+    tally = worked(tmp_path, jobs(30), square, StageLimits(at_most=3))
     assert (tally.done, tally.earlier) == (3, 5)
 
 
@@ -110,7 +117,7 @@ def test_who_never_answers_ends_it_in_time(tmp_path: Path) -> None:
         raise TryLater("nobody there", 0.01)
 
     with pytest.raises(StageStopped, match="nobody there"):
-        worked(tmp_path, jobs(5), away, Limits(give_up_after_s=0.1))
+        worked(tmp_path, jobs(5), away, StageLimits(give_up_after_s=0.1))
     assert records(tmp_path) == {}
     assert worked(tmp_path, jobs(5), square).done == 5
 
@@ -121,7 +128,7 @@ def test_one_that_fails_while_others_succeed_is_a_dead_letter(tmp_path: Path) ->
             raise TryLater("the engine failed", 0.01)
         return await square(job)
 
-    tally = worked(tmp_path, jobs(20), one_is_cursed, Limits(give_up_after_s=0.1))
+    tally = worked(tmp_path, jobs(20), one_is_cursed, StageLimits(give_up_after_s=0.1))
     assert (tally.done, tally.dead) == (19, 1)
 
 
@@ -145,7 +152,7 @@ def test_never_more_at_once_than_allowed(tmp_path: Path) -> None:
         inside -= 1
         return await square(job)
 
-    worked(tmp_path, jobs(100), counted, Limits(at_once=6))
+    worked(tmp_path, jobs(100), counted, StageLimits(at_once=6))
     assert most == 6, "it grows up to what is allowed"
 
 

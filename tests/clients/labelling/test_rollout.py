@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from fastapi import FastAPI
 
-from looktwice.clients.labelling.ledger import Ledger, Run
-from looktwice.clients.labelling.pipeline import Limits, StageStopped, Tally, work_through
+from looktwice.clients.labelling.ledger import Ledger, StageRun
+from looktwice.clients.labelling.pipeline import StageLimits, StageStopped, Tally, work_through
 from looktwice.clients.labelling.rollout import (
     RETRY_POLICY,
     Sampling,
@@ -36,7 +36,7 @@ from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import Served, serve
 from tests.sockets import listening
 
-LIMITS = Limits(at_once=4, give_up_after_s=20.0, max_error_rate=1.0)
+LIMITS = StageLimits(at_once=4, give_up_after_s=20.0, max_error_rate=1.0)
 
 
 @pytest.fixture
@@ -50,10 +50,10 @@ def served(engine: ScriptedEngine, tmp_path: Path) -> Iterator[Served]:
         yield running
 
 
-def rolled(url: str, file: Path, folder: Path) -> tuple[Run, Tally]:
+def rolled(url: str, file: Path, folder: Path) -> tuple[StageRun, Tally]:
     model, chosen = MODEL, Sampling(n=2)
 
-    async def go() -> tuple[Run, Tally]:
+    async def go() -> tuple[StageRun, Tally]:
         async with AsyncPlannerClient(url, RETRY_POLICY) as planner:
             with Ledger(folder) as ledger:
                 run = ledger.run("rollout", config_of(model, chosen))

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from looktwice.clients.metadrive.world.actors import Vehicle
-from looktwice.clients.metadrive.world.episode import World, make_world
+from looktwice.clients.metadrive.world.episode import EpisodeWorld, make_world
 from looktwice.clients.metadrive.world.fork import ForkError, fork_along, fork_expert, on_rails
 from looktwice.clients.metadrive.world.tracking import FreeVehicle
 from looktwice.model.driving.trajectory import FUTURE_STEPS, constant_velocity, to_ego_frame
 from tests.clients.metadrive.conftest import SEED
 
 
-def driven(steps: int, seconds: float = 20.0, seed: int = SEED) -> World:
+def driven(steps: int, seconds: float = 20.0, seed: int = SEED) -> EpisodeWorld:
     world = make_world(seed, seconds)
     near = world.remember()
     while world.now < steps and not world.ended:

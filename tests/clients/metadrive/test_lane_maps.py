@@ -16,7 +16,7 @@ from looktwice.clients.metadrive.scenes.lane_maps import (
     _intersections,
     _parts,
 )
-from looktwice.clients.metadrive.world.roads import Lane, Road, RoadMap, Turn
+from looktwice.clients.metadrive.world.roads import RoadLane, RoadMap, RoadSegment, Turn
 from looktwice.model.driving.lane_map import LaneMap
 from looktwice.model.driving.pdm.geometry import crosses_itself
 from looktwice.model.driving.pdm.labelled import plans_of, world_of
@@ -38,10 +38,10 @@ def area_of(rings: Any) -> Any:
     return area
 
 
-def road(number: int, points: list[tuple[float, float]], turn: Turn | None) -> tuple[Lane, Road]:
+def road(number: int, points: list[tuple[float, float]], turn: Turn | None) -> tuple[RoadLane, RoadSegment]:
     """A road of one lane, 4 m wide."""
-    lane = Lane(number, number, 0, np.array(points, np.float64), 4.0, "none", "none")
-    return lane, Road(number, f"{number}", f"{number}>", (number,), turn)
+    lane = RoadLane(number, number, 0, np.array(points, np.float64), 4.0, "none", "none")
+    return lane, RoadSegment(number, f"{number}", f"{number}>", (number,), turn)
 
 
 def test_an_intersection_is_where_ways_over_a_junction_lie() -> None:

@@ -21,7 +21,7 @@ from looktwice.clients.metadrive.outcomes.replay import (
 )
 from looktwice.clients.metadrive.outcomes.verdicts import judged, outcomes_at
 from looktwice.clients.metadrive.simulator import described
-from looktwice.clients.metadrive.world.episode import World
+from looktwice.clients.metadrive.world.episode import EpisodeWorld
 from looktwice.clients.metadrive.world.fork import Forked, fork_expert
 from looktwice.model.driving.outcome import FailureName, Outcome
 from looktwice.model.driving.scene_store import MANIFEST
@@ -125,7 +125,7 @@ def test_where_the_expert_is_not_comfortable_nobody_must_be() -> None:
 
 def test_an_episode_made_again_is_the_stored_one_to_the_last_bit(filmed: Filmed) -> None:
     for moment, world in replayed(SEED, SETTING, moments(filmed)):
-        assert isinstance(world, World)
+        assert isinstance(world, EpisodeWorld)
         np.testing.assert_array_equal(fork_expert(world).trajectory, moment.future)
 
 

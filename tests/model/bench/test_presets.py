@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from looktwice.model.bench.presets import PRESETS, Preset, write_random
-from looktwice.model.bench.roofline import Work, work_of_plan
+from looktwice.model.bench.roofline import PlanCost, work_of_plan
 from looktwice.model.engines.engine import Controls, DrawFinished, PlanRequest
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.network.checkpoint import read_config
@@ -53,7 +53,7 @@ def test_work_grows_with_what_is_done(untrained_checkpoint: Path) -> None:
         scene_passes: float = 10,
         together: int = 1,
         dtype: torch.dtype = torch.float32,
-    ) -> Work:
+    ) -> PlanCost:
         return work_of_plan(
             config,
             100,

@@ -14,15 +14,15 @@ import pytest
 from looktwice.model.bench.contenders import SHORTCUTS
 from looktwice.model.bench.memory import peak_bytes
 from looktwice.model.bench.report import BenchReport, Roofline
-from looktwice.model.bench.roofline import Machine, Work
-from looktwice.model.bench.run import Job, Row, can_do, run
+from looktwice.model.bench.roofline import Machine, PlanCost
+from looktwice.model.bench.run import BenchJob, BenchRow, can_do, run
 from looktwice.model.bench.workload import Workload
 from looktwice.model.bundled import SCENES
 from looktwice.model.engines.torch.shortcuts import Shortcuts
 
 
-def job(checkpoint: Path, *contenders: str, loads: tuple[Workload, ...]) -> Job:
-    return Job(contenders, loads, checkpoint, SCENES, repeats=1)
+def job(checkpoint: Path, *contenders: str, loads: tuple[Workload, ...]) -> BenchJob:
+    return BenchJob(contenders, loads, checkpoint, SCENES, repeats=1)
 
 
 def test_engines_run_side_by_side(untrained_checkpoint: Path) -> None:
@@ -95,8 +95,8 @@ def test_a_peak_is_of_what_was_done_since() -> None:
     subprocess.run([sys.executable, "-c", _PEAKS], check=True)
 
 
-def row(engine: str, latency_s: float, plans_per_s: float) -> Row:
-    return Row(
+def row(engine: str, latency_s: float, plans_per_s: float) -> BenchRow:
+    return BenchRow(
         engine,
         1,
         6,
@@ -118,7 +118,7 @@ def row(engine: str, latency_s: float, plans_per_s: float) -> Row:
 
 def test_reports_say_how_much_slower_the_others_are() -> None:
     machine = Machine(1e10, 1e12, "bfloat16", "cpu")
-    work = Work(2e9, 1e8)
+    work = PlanCost(2e9, 1e8)
     roofline = Roofline(machine, 1, 6, work, work.seconds(machine), 0.1)
     shared = replace(row("torch", 0.1, 10.0), counts={"row_passes": 63, "fan_out_row_passes": 90})
     report = BenchReport((row("torch", 0.1, 10.0), row("vllm", 0.4, 5.0)), (shared,), (roofline,))

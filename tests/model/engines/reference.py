@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from looktwice.model.engines.engine import Draw, PlanRequest
 from looktwice.model.engines.requests import decided, given_plans, read, said
 from looktwice.model.engines.sampling import probabilities
-from looktwice.model.engines.transformers.decoding import Decoding
+from looktwice.model.engines.transformers.decoding import PlainDecoder
 from looktwice.model.families.family import Family
 from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import CompiledFormat
@@ -70,7 +70,7 @@ def reference(
 
 
 def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> tuple[Draw, Shares]:
-    controls, decoding = request.controls, Decoding(loaded)
+    controls, decoding = request.controls, PlainDecoder(loaded)
     inputs = loaded.inputs.build(request.scene, request.format, request.attempt, controls.view)
     compiled = CompiledFormat(family.format, loaded.vocabulary)
     expected = loaded.inputs.expected(request.scene, controls.view)

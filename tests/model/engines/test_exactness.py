@@ -33,7 +33,7 @@ from looktwice.model.engines.torch.deadlines import TimeFor
 from looktwice.model.engines.torch.decoder import Decoder, Failed
 from looktwice.model.engines.torch.request import Request
 from looktwice.model.engines.torch.rows import Row
-from looktwice.model.engines.torch.runner import Prompt, Runner
+from looktwice.model.engines.torch.runner import PromptPrefill, Runner
 from looktwice.model.engines.torch.shortcuts import Shortcuts
 from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.families.family import Attempt, Family
@@ -358,5 +358,5 @@ def test_a_soak_leaves_nothing_behind(exact: Loaded) -> None:
     assert decoder.idle, "a request is stuck"
     assert decoder.rows_used == 0
     gc.collect()
-    left = [each for each in gc.get_objects() if type(each) in (Row, Request, Prompt)]
+    left = [each for each in gc.get_objects() if type(each) in (Row, Request, PromptPrefill)]
     assert not left, "kept for nobody"

@@ -15,8 +15,8 @@ from looktwice.model.engines.engine import (
     Draw,
     DrawFinished,
     EngineError,
+    EngineLoad,
     Event,
-    Load,
     PlanRequest,
     RequestError,
     SectionFinished,
@@ -64,8 +64,8 @@ class FakeEngine:
         self._company = company
 
     @property
-    def load(self) -> Load:
-        return Load(rows=64, rows_used=0)
+    def load(self) -> EngineLoad:
+        return EngineLoad(rows=64, rows_used=0)
 
     async def wait(self) -> None:
         await asyncio.Event().wait()

@@ -19,7 +19,7 @@ from looktwice.model.driving.trajectory import (
     constant_velocity,
 )
 from looktwice.model.engines.engine import Controls, Draw, DrawFinished, Event, PlanRequest
-from looktwice.model.evaluation.failures import Stage, evaluate_stage, formats_of, stage_variants
+from looktwice.model.evaluation.failures import MeasuredStage, evaluate_stage, formats_of, stage_variants
 from looktwice.model.evaluation.failures_report import FailuresReport, failures_report
 from looktwice.model.network.model_card import ModelCard
 from tests.model.evaluation.fakes import FakeEngine, draw_of
@@ -58,14 +58,14 @@ class Learner(FakeEngine):
             yield DrawFinished(eight(way, index))
 
 
-def stage(name: str, engine: Learner, scenes: list[LabelledScene] = SCENES, seeds: int = 2) -> Stage:
+def stage(name: str, engine: Learner, scenes: list[LabelledScene] = SCENES, seeds: int = 2) -> MeasuredStage:
     judges = [SceneJudge(each) for each in scenes]
     variants = stage_variants(name, engine.card, Controls(n=2), seeds)
     run = partial(evaluate_stage, name=name, judges=judges)
     return asyncio.run(run(engine, scenes, variants))
 
 
-def report(*stages: Stage) -> FailuresReport:
+def report(*stages: MeasuredStage) -> FailuresReport:
     return failures_report([SceneJudge(each) for each in SCENES], stages)
 
 

@@ -9,7 +9,13 @@ import pytest
 from looktwice.model.bundled import SCENES
 from looktwice.model.driving.facts import FACTS, SPEED_SCALE_MS, scene_facts
 from looktwice.model.driving.scene_store import read_scenes
-from looktwice.model.evaluation.perception import Reading, auc, format_perception, perception_rows, read_facts
+from looktwice.model.evaluation.perception import (
+    FactReadings,
+    auc,
+    format_perception,
+    perception_rows,
+    read_facts,
+)
 from looktwice.model.network.checkpoint import load
 from looktwice.model.training.perception_gate import format_gate, perception_gate
 from looktwice.model.training.small import SmallSettings
@@ -18,11 +24,11 @@ from tests.model.network.motions import made_up_motions
 BUNDLED = list(read_scenes(SCENES, dense=False))
 
 
-def reading_of(read: np.ndarray, true: np.ndarray) -> Reading:
+def reading_of(read: np.ndarray, true: np.ndarray) -> FactReadings:
     count = len(true)
     histories, futures = made_up_motions(count)
     route = np.stack([np.stack([np.arange(1, 21) * 4.0, np.zeros(20)], axis=1)] * count)
-    return Reading(
+    return FactReadings(
         read.astype(np.float32),
         true.astype(np.float32),
         histories,

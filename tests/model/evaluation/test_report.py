@@ -11,7 +11,12 @@ from looktwice.model.driving.scene import FRONT_WIDE
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.engines.engine import Controls, DrawFinished, Event, PlanRequest
 from looktwice.model.evaluation.open_loop import SceneResult
-from looktwice.model.evaluation.report import LEAD_SUBGROUP, SOON_SUBGROUP, Report, evaluate_checkpoint
+from looktwice.model.evaluation.report import (
+    LEAD_SUBGROUP,
+    SOON_SUBGROUP,
+    EvaluationReport,
+    evaluate_checkpoint,
+)
 from looktwice.model.evaluation.variants import Variant, standard_variants
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
 from tests.model.evaluation.fakes import FakeEngine, draw_of
@@ -43,7 +48,7 @@ class LookingEngine(FakeEngine):
 
 
 @pytest.fixture(scope="module")
-def report() -> Report:
+def report() -> EvaluationReport:
     seen: list[tuple[Variant, SceneResult]] = []
     variants = standard_variants(["cf_vla", "traj_only"], Controls(n=2))
     made = asyncio.run(
@@ -58,7 +63,9 @@ def report() -> Report:
     return made
 
 
-def test_every_variant_and_baseline_has_a_row_and_those_for_scenes_with_a_lead(report: Report) -> None:
+def test_every_variant_and_baseline_has_a_row_and_those_for_scenes_with_a_lead(
+    report: EvaluationReport,
+) -> None:
     names = [row.name for row in report.rows]
     assert list(dict.fromkeys(names))[:3] == ["expert", "constant velocity", "constant turn rate"]
     assert len(names) == 3 * (3 + 10)
@@ -71,7 +78,7 @@ def test_every_variant_and_baseline_has_a_row_and_those_for_scenes_with_a_lead(r
     assert report.to_json()["scenes"] == 6
 
 
-def test_what_should_differ_is_compared(report: Report) -> None:
+def test_what_should_differ_is_compared(report: EvaluationReport) -> None:
     ratio = {(each.name, each.measure): each.ratio for each in report.comparisons}
     for free in ("meta-act", "meta-act + route"):
         plain, shuffled = free.replace("meta-act", "traj-only"), f"{free}, shuffled images : {free}"
@@ -87,7 +94,7 @@ def test_what_should_differ_is_compared(report: Report) -> None:
     assert not any(name == "meta-act + route : meta-act" for name, _ in ratio)
 
 
-def test_a_planner_that_copies_its_speed_has_a_response_of_one(report: Report) -> None:
+def test_a_planner_that_copies_its_speed_has_a_response_of_one(report: EvaluationReport) -> None:
     # The engine of this report follows the expert, whatever the speed.
     assert report.speed_response == {"meta-act + route": {0.5: pytest.approx(0), 1.5: pytest.approx(0)}}
     variants = [each for each in standard_variants(["cf_vla"], Controls(n=1)) if each.route]
@@ -103,7 +110,7 @@ def test_a_planner_of_ones_own_has_a_row() -> None:
     assert row.values["agreed_ade_m"] == 0
 
 
-def test_the_text_holds_rows_comparisons_and_responses(report: Report) -> None:
+def test_the_text_holds_rows_comparisons_and_responses(report: EvaluationReport) -> None:
     text = str(report)
     assert "meta-act, shuffled images : meta-act" in text
     assert text.count("\n") == 1 + len(report.rows) + len(report.comparisons) + len(report.speed_response)

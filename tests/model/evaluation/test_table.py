@@ -7,7 +7,7 @@ import pytest
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.evaluation.bootstrap import compare
 from looktwice.model.evaluation.open_loop import MEASURES, evaluate_baselines, evaluate_draws
-from looktwice.model.evaluation.table import Row, format_table, to_json
+from looktwice.model.evaluation.table import VariantRow, format_table, to_json
 from tests.model.driving.drives import labelled_scene
 from tests.model.evaluation.fakes import draw_of, offset
 
@@ -19,7 +19,7 @@ RESULTS = [
     )
     for scene in SCENES
 ]
-ROW = Row.of("meta-act", RESULTS, MEASURES, thinking="adaptive", n=3, route=True)
+ROW = VariantRow.of("meta-act", RESULTS, MEASURES, thinking="adaptive", n=3, route=True)
 BASELINE = evaluate_baselines(SCENES)["constant velocity"]
 
 CONTRACT = {
@@ -46,7 +46,7 @@ CONTRACT = {
 
 def test_json_has_the_keys_that_scripts_rely_on() -> None:
     comparison = compare("meta-act : constant velocity", RESULTS, BASELINE)
-    report = json.loads(json.dumps(to_json([ROW, Row.of("cv", BASELINE, MEASURES)], [comparison])))
+    report = json.loads(json.dumps(to_json([ROW, VariantRow.of("cv", BASELINE, MEASURES)], [comparison])))
     assert (report["scenes"], report["episodes"]) == (6, 3)
     row, baseline = report["rows"]
     assert set(row) >= CONTRACT
@@ -63,9 +63,12 @@ def test_json_has_the_keys_that_scripts_rely_on() -> None:
 
 
 def test_the_text_shows_every_row_in_aligned_columns() -> None:
-    some = Row.of("meta-act", RESULTS[:2], MEASURES, thinking="never", n=3, subgroup="lead within 20 m")
+    some = VariantRow.of(
+        "meta-act", RESULTS[:2], MEASURES, thinking="never", n=3, subgroup="lead within 20 m"
+    )
     text = format_table(
-        [Row.of("constant velocity", BASELINE, MEASURES), ROW, some], [compare("gain", RESULTS, BASELINE)]
+        [VariantRow.of("constant velocity", BASELINE, MEASURES), ROW, some],
+        [compare("gain", RESULTS, BASELINE)],
     )
     header, *rows = text.splitlines()
     assert [row.split("  ")[0] for row in rows] == [
@@ -76,7 +79,9 @@ def test_the_text_shows_every_row_in_aligned_columns() -> None:
     ]
     end = header.index("minADE m") + len("minADE m")
     column = [row[:end].split()[-1] for row in rows[:3]]
-    assert column == [f"{row.values['min_ade_m']:.2f}" for row in (Row.of("", BASELINE, MEASURES), ROW, some)]
+    assert column == [
+        f"{row.values['min_ade_m']:.2f}" for row in (VariantRow.of("", BASELINE, MEASURES), ROW, some)
+    ]
     assert rows[0].endswith("-")
     assert "ratio" in rows[3]
 
@@ -84,4 +89,4 @@ def test_the_text_shows_every_row_in_aligned_columns() -> None:
 def test_an_empty_table_is_an_empty_report_and_a_row_needs_scenes() -> None:
     assert to_json([])["rows"] == []
     with pytest.raises(ValueError, match="row 'x' has no scenes"):
-        Row.of("x", [], MEASURES)
+        VariantRow.of("x", [], MEASURES)

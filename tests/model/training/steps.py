@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 
 from looktwice.model.network.checkpoint import Loaded
-from looktwice.model.training.batches import Sample, collate
+from looktwice.model.training.batches import ResponseSample, collate
 from looktwice.model.training.learner import ResponseLearner
 
 
-def two_losses(loaded: Loaded, sample: Sample) -> tuple[float, float]:
+def two_losses(loaded: Loaded, sample: ResponseSample) -> tuple[float, float]:
     """The loss of a sample, and again after a step that it was learned from."""
     batch = collate([sample])
     learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec)

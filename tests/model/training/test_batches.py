@@ -11,11 +11,11 @@ from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
 from looktwice.model.driving.trajectory import present_speed
 from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
-from looktwice.model.families.family import Reflection, Situation
+from looktwice.model.families.family import Counterfactual, Situation
 from looktwice.model.formats.pieces import FormatError
 from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.network.vocabulary import FUTURE_START, TRACK, VIDEO_PAD
-from looktwice.model.training.batches import Sample, collate
+from looktwice.model.training.batches import ResponseSample, collate
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.learner import ResponseLearner
 from looktwice.model.training.responses import ResponseDataset
@@ -41,7 +41,7 @@ def dataset(loaded: Loaded, *texts: str, pictures: bool = True) -> ResponseDatas
         loaded.vocabulary,
         PAPER_WEIGHTS,
         pictures=pictures,
-        reflections=[Reflection(WRONG, text) for text in texts],
+        reflections=[Counterfactual(WRONG, text) for text in texts],
     )
 
 
@@ -115,7 +115,7 @@ def test_responses_that_share_a_prompt_do_not_see_each_other(loaded: Loaded) -> 
         loaded.model, loaded.vocabulary, loaded.codec, error_weight=0.5, head_weight=0.25
     )
 
-    def learned(batch: list[Sample]) -> tuple[float, torch.Tensor]:
+    def learned(batch: list[ResponseSample]) -> tuple[float, torch.Tensor]:
         loaded.model.zero_grad()
         loss = learner(**collate(batch))["loss"]
         loss.backward()

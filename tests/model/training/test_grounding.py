@@ -13,8 +13,8 @@ from looktwice.model.training.dense import DENSE_SHAPE, UNLABELLED
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.grounding import (
     GroundingDataset,
+    GroundingItem,
     GroundingLearner,
-    Look,
     collate_grounding,
     fact_loss,
     looked_at,
@@ -35,7 +35,7 @@ def data(loaded: Loaded) -> GroundingDataset:
 
 
 def test_a_mirrored_look_swaps_everything_and_twice_is_as_before(data: GroundingDataset) -> None:
-    plain, swapped = data.look(Look(1)), data.look(Look(1, mirror=True))
+    plain, swapped = data.look(GroundingItem(1)), data.look(GroundingItem(1, mirror=True))
     np.testing.assert_array_equal(swapped.facts, mirrored(plain.facts))
     np.testing.assert_array_equal(swapped.classes, plain.classes[..., ::-1])
     np.testing.assert_array_equal(swapped.motion[:, 1], -plain.motion[:, 1, :, ::-1])
@@ -44,9 +44,9 @@ def test_a_mirrored_look_swaps_everything_and_twice_is_as_before(data: Grounding
 
 
 def test_a_route_is_given_only_where_there_is_one(data: GroundingDataset) -> None:
-    assert not data.look(Look(0)).has_route
-    assert data.look(Look(1)).has_route
-    assert not data.look(Look(1, route=False)).has_route
+    assert not data.look(GroundingItem(0)).has_route
+    assert data.look(GroundingItem(1)).has_route
+    assert not data.look(GroundingItem(1, route=False)).has_route
 
 
 def test_scenes_with_a_walker_or_an_obstacle_are_looked_at_more_often() -> None:
@@ -73,7 +73,7 @@ def test_facts_that_do_not_apply_cost_nothing() -> None:
 def test_tower_and_resampler_learn_what_is_seen(loaded: Loaded, data: GroundingDataset) -> None:
     learner = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE)
     learner.eval()  # without dropout the loss can only fall
-    batch = collate_grounding([data.look(Look(index)) for index in range(4)])
+    batch = collate_grounding([data.look(GroundingItem(index)) for index in range(4)])
     optimizer = torch.optim.AdamW(learner.parameters(), lr=3e-4)
     losses = []
     for _ in range(12):
@@ -88,7 +88,7 @@ def test_tower_and_resampler_learn_what_is_seen(loaded: Loaded, data: GroundingD
 
 def test_scenes_without_dense_targets_teach_their_facts(loaded: Loaded, data: GroundingDataset) -> None:
     learner = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE)
-    batch = collate_grounding([data.look(Look(index)) for index in range(2)])
+    batch = collate_grounding([data.look(GroundingItem(index)) for index in range(2)])
     batch["classes"] = torch.full_like(batch["classes"], UNLABELLED)
     parts = learner(**batch)
     assert float(parts["class_loss"]) == 0.0
@@ -100,7 +100,7 @@ def test_what_is_gathered_depends_on_pictures_history_and_route(
     loaded: Loaded, data: GroundingDataset
 ) -> None:
     learner = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE).eval()
-    batch = collate_grounding([data.look(Look(1))])
+    batch = collate_grounding([data.look(GroundingItem(1))])
     names = ("patches", "history", "route", "has_route")
     _, as_it_is = learner.gather(**{name: batch[name] for name in names})
     for name, change in (

@@ -6,7 +6,7 @@ from looktwice.model.driving.phrases import PhraseError
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.reflection_store import LabelledReflection
 from looktwice.model.driving.scene import FRONT_WIDE
-from looktwice.model.families.family import Reflection
+from looktwice.model.families.family import Counterfactual
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.reflections import mirrored, reflections_on
 from tests.model.training.scenes import training_scene
@@ -38,13 +38,13 @@ def test_a_mirrored_reflection_says_the_other_side() -> None:
         "Going on like this would get me stuck, so I should move to the {} lane."
     )
     left, right = (
-        Reflection(PLAN, text.format(side, side), plan, judged=False)
+        Counterfactual(PLAN, text.format(side, side), plan, judged=False)
         for side, plan in zip(("left", "right"), plans, strict=True)
     )
     assert mirrored(left) == right
-    assert mirrored(Reflection(plans[0], "")) == Reflection(plans[1], "")
+    assert mirrored(Counterfactual(plans[0], "")) == Counterfactual(plans[1], "")
     with pytest.raises(PhraseError):
-        mirrored(Reflection(PLAN, "I should slow down."))
+        mirrored(Counterfactual(PLAN, "I should slow down."))
 
 
 def test_a_reflection_on_an_unknown_scene_is_refused() -> None:

@@ -12,7 +12,7 @@ from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.families.cf_vla.format import PHRASES
 from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
 from looktwice.model.families.cf_vla.traj_only import TRAJ_ONLY
-from looktwice.model.families.family import Lesson, Reflection
+from looktwice.model.families.family import Counterfactual, Lesson
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.pieces import FormatError, Values
 from looktwice.model.formats.text import parse
@@ -25,7 +25,7 @@ PLAN = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
 WRONG = parse_plan("- longitudinal\n  - 0.0s-6.4s: Accelerate\n")
 
 
-def lesson(plan: Plan, reflection: Reflection | None = None) -> Lesson:
+def lesson(plan: Plan, reflection: Counterfactual | None = None) -> Lesson:
     return Lesson(plan, CODES, constant_velocity(np.zeros((HISTORY_STEPS, 4), np.float32)), reflection)
 
 
@@ -52,7 +52,7 @@ def test_a_family_that_teaches_nothing_is_refused() -> None:
 
 def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
-    reflection = Reflection(WRONG, "The car ahead stands still.")
+    reflection = Counterfactual(WRONG, "The car ahead stands still.")
     target = make_target(CF_VLA, compiled, lesson(PLAN, reflection), PAPER_WEIGHTS)
     plans = {"plan": WRONG, "revised_plan": PLAN}
     values = parse(compiled, VOCABULARY.decode(target.ids), plans)
@@ -73,7 +73,7 @@ def test_a_counterfactual_target_does_not_teach_the_wrong_plan() -> None:
 
 def test_a_plan_that_nobody_judged_teaches_no_branch() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
-    told = Reflection(WRONG, "The car ahead stands still.")
+    told = Counterfactual(WRONG, "The car ahead stands still.")
     judged, unjudged = (
         make_target(CF_VLA, compiled, lesson(PLAN, replace(told, judged=judged)), PAPER_WEIGHTS)
         for judged in (True, False)
@@ -109,7 +109,7 @@ def test_the_expert_may_teach_no_branch() -> None:
     ]
     assert {section for section, _ in differ} == {"branch"}
     assert {weight for _, weight in differ} == {0.0}
-    looked = lesson(PLAN, Reflection(WRONG, "The car ahead stands still."))
+    looked = lesson(PLAN, Counterfactual(WRONG, "The car ahead stands still."))
     assert make_target(CF_VLA, compiled, looked, PAPER_WEIGHTS, expert_branches=False) == make_target(
         CF_VLA, compiled, looked, PAPER_WEIGHTS
     )
@@ -117,7 +117,7 @@ def test_the_expert_may_teach_no_branch() -> None:
 
 def test_a_right_plan_of_its_own_is_acted_on_and_not_taught() -> None:
     compiled = CompiledFormat(CF_VLA.format, VOCABULARY)
-    target = make_target(CF_VLA, compiled, lesson(PLAN, Reflection(WRONG, "")), PAPER_WEIGHTS)
+    target = make_target(CF_VLA, compiled, lesson(PLAN, Counterfactual(WRONG, "")), PAPER_WEIGHTS)
     values = parse(compiled, VOCABULARY.decode(target.ids), {"plan": WRONG})
     assert values == Values.of({"plan": WRONG, "branch": "Action:", "trajectory": CODES})
     taught = [id for id, weight in zip(target.ids, target.weights, strict=True) if weight > 0]
@@ -129,7 +129,7 @@ def test_a_reflection_in_phrases_leads_to_its_own_plan() -> None:
     first, slower = three_tracks("Keep Speed", "Keep Lane"), three_tracks("Wait", "Keep Lane")
     text = str(Statement(Thing("barrier", "my lane", 20), "too close", "slower"))
     expert = three_tracks("Wait", "Left Lane Change")
-    target = make_target(CF_VLA, compiled, lesson(expert, Reflection(first, text, slower)), PAPER_WEIGHTS)
+    target = make_target(CF_VLA, compiled, lesson(expert, Counterfactual(first, text, slower)), PAPER_WEIGHTS)
     values = parse(compiled, VOCABULARY.decode(target.ids))
     assert (values["thinking"], values["revised_plan"]) == (text, slower)
     # The expert goes to the left, of which nothing is stated: its trajectory is not what was planned.
@@ -138,7 +138,7 @@ def test_a_reflection_in_phrases_leads_to_its_own_plan() -> None:
         token.section: weight for token, weight in zip(tokens, target.weights, strict=True) if weight != 10
     }
     assert weights == {"plan": 0.0, "trajectory": 0.0}
-    same = make_target(CF_VLA, compiled, lesson(slower, Reflection(first, text, slower)), PAPER_WEIGHTS)
+    same = make_target(CF_VLA, compiled, lesson(slower, Counterfactual(first, text, slower)), PAPER_WEIGHTS)
     assert same.ids == target.ids
     assert set(same.weights) == {0.0, 1.0, 10.0}
 
@@ -148,10 +148,13 @@ def test_a_plan_that_phrases_do_not_lead_to_is_refused() -> None:
     first, slower = three_tracks("Keep Speed", "Keep Lane"), three_tracks("Wait", "Left Lane Change")
     text = str(Statement(Thing("barrier", "my lane", 20), "too close", "slower"))
     with pytest.raises(FormatError, match="changes otherwise"):
-        make_target(CF_VLA, compiled, lesson(slower, Reflection(first, text, slower)), PAPER_WEIGHTS)
+        make_target(CF_VLA, compiled, lesson(slower, Counterfactual(first, text, slower)), PAPER_WEIGHTS)
     with pytest.raises(FormatError, match="no reflection in phrases"):
         make_target(
-            CF_VLA, compiled, lesson(slower, Reflection(first, "I should slow down.", slower)), PAPER_WEIGHTS
+            CF_VLA,
+            compiled,
+            lesson(slower, Counterfactual(first, "I should slow down.", slower)),
+            PAPER_WEIGHTS,
         )
 
 

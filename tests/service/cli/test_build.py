@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from looktwice.clients.labelling.ledger import Run
+from looktwice.clients.labelling.ledger import StageRun
 from looktwice.clients.retries import TryLater, with_retries
 from looktwice.model.bundled import CHECKPOINT, SCENES
 from looktwice.model.driving.phrases import agrees, read_facts
@@ -274,7 +274,7 @@ def test_waiting_is_told_beside_the_bar_alone(capsys: pytest.CaptureFixture[str]
             raise refusal
         return "done"
 
-    with progress_bar(Run("id", "rollout", {}), 1, quiet=False):
+    with progress_bar(StageRun("id", "rollout", {}), 1, quiet=False):
         assert asyncio.run(with_retries(answer, 10.0)) == "done"
     told = capsys.readouterr()
     assert told.out == ""

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from looktwice.loadtests.loads import Phase, poisson_arrivals
+from looktwice.loadtests.loads import LoadPhase, poisson_arrivals
 from looktwice.service.admission.places import Admission
 from looktwice.service.cli.loadtest import loadtest as command
 from looktwice.service.operations.settings import Settings
@@ -74,7 +74,7 @@ def test_pictures_come_out_of_services_that_imagine_and_others_are_refused_by_na
 def test_by_default_a_service_of_one_plan_a_second_refuses_none() -> None:
     asked = {name: each.default for name, each in inspect.signature(command).parameters.items()}
     assert (asked["scenario"], asked["mix"]) == ("poisson", "plan")
-    phases = [Phase(name, asked[name], asked["rate"]) for name in ("warm_up", "seconds")]
+    phases = [LoadPhase(name, asked[name], asked["rate"]) for name in ("warm_up", "seconds")]
     due_s = poisson_arrivals(phases, asked["seed"]).tolist()
     now_s, settings = 0.0, Settings()
     admission = Admission(settings.max_draws, settings.max_scenes, lambda: now_s)

@@ -27,7 +27,7 @@ from looktwice.clients.labelling.checks import FailedCheck
 from looktwice.clients.labelling.teachers.teacher import Answer, Question
 from looktwice.loadtests.attacks import costly_calls, never_seen, scans
 from looktwice.loadtests.bodies import make_call
-from looktwice.loadtests.mix import Kind
+from looktwice.loadtests.mix import RequestKind
 from looktwice.model.bundled import CHECKPOINT
 from looktwice.model.driving.images import decode_image
 from looktwice.model.engines.engine import EngineError
@@ -421,7 +421,7 @@ def test_keys_are_made_on_the_command_line() -> None:
 
 def test_a_log_that_nobody_reads_holds_up_nobody_and_dear_requests_are_refused() -> None:
     """Standard error is a pipe that is never emptied: it takes some hundred lines."""
-    polite = make_call(Kind("direct", 1), [labelled_scene(8.0, pictures=1)], seed=1)
+    polite = make_call(RequestKind("direct", 1), [labelled_scene(8.0, pictures=1)], seed=1)
     with process(subprocess.PIPE) as (started, url), httpx.Client(base_url=url, timeout=60) as http:
         for _ in range(600):
             assert http.get("/v1/models").status_code == 200

@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import pytest
 
-from looktwice.model.engines.engine import Load
+from looktwice.model.engines.engine import EngineLoad
 from looktwice.service.http.documents import read_json
 from looktwice.service.operations.settings import Settings
 from tests.service.http.test_errors import problem
@@ -25,8 +25,8 @@ class WaitingEngine(ScriptedEngine):
     pictures_wait_s = 0.0
 
     @property
-    def load(self) -> Load:
-        return Load(rows=64, rows_used=0, pictures_wait_s=self.pictures_wait_s)
+    def load(self) -> EngineLoad:
+        return EngineLoad(rows=64, rows_used=0, pictures_wait_s=self.pictures_wait_s)
 
 
 def test_a_loop_that_stood_still_is_not_ready_for_a_while(engine: ScriptedEngine) -> None:

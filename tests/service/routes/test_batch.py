@@ -10,7 +10,7 @@ import looktwice.clients.wire as wire
 from looktwice.model.engines.engine import EngineError
 from looktwice.service.operations.settings import Settings
 from looktwice.service.planning.events import Arrival
-from looktwice.service.planning.submitting import Planning
+from looktwice.service.planning.submitting import SceneSubmitter
 from tests.service.http.test_errors import BOMB, problem
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
@@ -126,14 +126,14 @@ def test_scenes_that_fail_are_counted(served: Served, engine: ScriptedEngine) ->
 def test_a_defect_in_one_scene_leaves_the_others_and_is_counted(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    in_turn = Planning.in_turn
+    in_turn = SceneSubmitter.in_turn
 
-    async def unlucky(planning: Planning, asked: wire.PlanRequest, arrival: Arrival) -> Any:
+    async def unlucky(planning: SceneSubmitter, asked: wire.PlanRequest, arrival: Arrival) -> Any:
         if asked.scene.scene_id == "unlucky":
             raise ArithmeticError("no")
         return await in_turn(planning, asked, arrival)
 
-    monkeypatch.setattr(Planning, "in_turn", unlucky)
+    monkeypatch.setattr(SceneSubmitter, "in_turn", unlucky)
     results = ask(served, body(scene("lucky")), body(scene("unlucky")))
     assert [result.status for result in results] == [200, 500]
     assert results[1].problem is not None

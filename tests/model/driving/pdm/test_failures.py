@@ -12,7 +12,7 @@ from looktwice.model.driving.pdm.comfort import Version
 from looktwice.model.driving.pdm.course import course_of
 from looktwice.model.driving.pdm.failures import Fact, facts_of
 from looktwice.model.driving.pdm.feedback import Feedback, parse_feedback
-from looktwice.model.driving.pdm.judged import Number, foreign_numbers, numbers
+from looktwice.model.driving.pdm.judged import Measurement, foreign_numbers, numbers
 from looktwice.model.driving.pdm.judging import Said, judged_plans
 from looktwice.model.driving.pdm.rule_teacher import SHORT, critique
 from looktwice.model.driving.pdm.scoring import (
@@ -207,12 +207,12 @@ def test_names_of_others_cannot_break_the_text() -> None:
 
 
 FACTS = (
-    Number(18.234, "m"),
-    Number(-6.31, "m"),
-    Number(4.0, "s"),
-    Number(0.0, ""),
-    Number(0.38, "%"),
-    Number(38.0, "%"),
+    Measurement(18.234, "m"),
+    Measurement(-6.31, "m"),
+    Measurement(4.0, "s"),
+    Measurement(0.0, ""),
+    Measurement(0.38, "%"),
+    Measurement(38.0, "%"),
 )
 
 

@@ -25,11 +25,11 @@ from looktwice.model.driving.pdm.scoring import (
 from looktwice.model.driving.pdm.world import (
     Area,
     Array,
+    EgoVehicle,
     Lane,
     RedLight,
     ScoreError,
     TrackedBox,
-    Vehicle,
     World,
 )
 from tests.model.driving.pdm.worlds import case
@@ -221,7 +221,7 @@ def test_poses_of_the_centre_are_those_of_the_axle_moved() -> None:
         (lambda: standing("x", float("inf")), "a pose is three finite numbers"),
         (lambda: TrackedBox("x", True, 4, 2, np.full((51, 3), np.nan), 0.0), "no future"),
         (lambda: Area((np.zeros((2, 2)),)), "three different points"),
-        (lambda: Vehicle(0.0, 1.0, 1.0, 1.0), "1 mm"),
+        (lambda: EgoVehicle(0.0, 1.0, 1.0, 1.0), "1 mm"),
         (lambda: road(tracks=(standing("a", 9), standing("a", 9))), "occur twice: a"),
         (lambda: road(centreline=np.zeros((3, 2))), "all its points are the same"),
         (

@@ -29,8 +29,8 @@ from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTe
 from looktwice.clients.labelling.teachers.service import ServiceTeacher
 from looktwice.clients.labelling.teachers.teacher import (
     Answer,
+    CheckedReflection,
     Question,
-    Reflection,
     ReflectionRefused,
     TeacherClosed,
     TeacherError,
@@ -151,7 +151,7 @@ def wait_for(address: str, process: subprocess.Popen[bytes], log: Path) -> None:
     raise AssertionError(f"vLLM did not start:\n{log.read_text()[-4000:]}")
 
 
-async def asked(settings: OpenAiSettings) -> tuple[Reflection | None, list[Answer]]:
+async def asked(settings: OpenAiSettings) -> tuple[CheckedReflection | None, list[Answer]]:
     """What comes of the question, None where it is refused, and all answers."""
     teacher, answers = OpenAiTeacher(settings), list[Answer]()
     try:
