@@ -21,15 +21,15 @@ from looktwice.service.admission.places import Admission
 from looktwice.service.admission.rates import Rates
 from looktwice.service.http.auth import Guard
 from looktwice.service.http.body_limit import BodyLimit
-from looktwice.service.http.errors import install_error_handlers
 from looktwice.service.http.idempotency import Idempotency
 from looktwice.service.http.middleware import Around
 from looktwice.service.http.openapi import describe
+from looktwice.service.http.problem_documents import install_error_handlers
 from looktwice.service.inspector.page import add_inspector
 from looktwice.service.operations.lifecycle import Lifecycle
 from looktwice.service.operations.logs import configure_logging
-from looktwice.service.operations.metrics import Metrics
 from looktwice.service.operations.pulse import Pulse
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.operations.settings import Settings
 from looktwice.service.operations.traces import Traces, traces_from_environment
 from looktwice.service.planning.submitting import SceneSubmitter, TimeLimits

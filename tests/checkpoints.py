@@ -14,10 +14,10 @@ from looktwice.model.driving.scene import CLIP_FRAMES, FRONT_TELE, FRONT_WIDE, C
 from looktwice.model.families.picture_codes import PICTURE
 from looktwice.model.network.checkpoint import Loaded, load, save, write_code_embeddings
 from looktwice.model.network.codec import TrajectoryCodec
-from looktwice.model.network.corpus import nano_corpus, nano_phrases
+from looktwice.model.network.nano_corpus import nano_corpus, nano_phrases
 from looktwice.model.network.numbers import needed_numbers, write_number_embeddings
-from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.vla import LookTwiceVla, nano_config
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from tests.model.network.motions import made_up_motions
 

@@ -32,7 +32,7 @@ def brief_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Its reflections are phrases: with the free text of `untrained_checkpoint` a response takes eight times as
     long.
     """
-    from looktwice.model.network.settings import NANO_SETTINGS
+    from looktwice.model.network.vla_settings import NANO_SETTINGS
     from tests.checkpoints import write_untrained
 
     folder = tmp_path_factory.mktemp("checkpoint") / "brief"
@@ -42,7 +42,7 @@ def brief_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def resampling_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As `untrained_checkpoint`, but with a resampler and tracks, as the shipped model's recipe makes it."""
-    from looktwice.model.network.settings import NANO_SETTINGS
+    from looktwice.model.network.vla_settings import NANO_SETTINGS
     from tests.checkpoints import write_untrained
 
     folder = tmp_path_factory.mktemp("checkpoint") / "resampling"
@@ -54,7 +54,7 @@ def refining_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Untrained, thinks and refines: its only formats are those of ELF-VLA."""
     from dataclasses import replace
 
-    from looktwice.model.network.settings import NANO_SETTINGS
+    from looktwice.model.network.vla_settings import NANO_SETTINGS
     from tests.checkpoints import write_untrained
 
     folder = tmp_path_factory.mktemp("checkpoint") / "refining"

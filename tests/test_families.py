@@ -25,15 +25,15 @@ OTHERWISE = {
     "clients/labelling": ("plan thinking trajectory", "records in the ledger"),
     "clients/wire": ("Action: Thinking: branch plan revised_plan thinking trajectory", "the HTTP contract"),
     "loadtests": ("plan", "a kind of work, and an event"),
-    "model/bench/report.py": ("thinking", "a control"),
+    "model/bench/bench_report.py": ("thinking", "a control"),
     "model/driving/trajectory.py": ("trajectory", "what an error speaks of"),
     "model/evaluation/draw_store.py": ("plan revised_plan trajectory", "fields of a draw"),
     "model/evaluation/pictures.py": ("plan", "a caption"),
     "model/families/trajectory_codes.py": ("trajectory", "an alphabet"),
     "service/cli": ("branch plan thinking trajectory", "commands, and what they print"),
-    "service/http/errors.py": ("plan trajectory", "fields of the HTTP contract"),
+    "service/http/problem_documents.py": ("plan trajectory", "fields of the HTTP contract"),
     "service/inspector": ("plan thinking", "elements of the page"),
-    "service/operations/metrics.py": ("branch plan thinking", "labels of metrics"),
+    "service/operations/service_metrics.py": ("branch plan thinking", "labels of metrics"),
     "service/planning": ("branch plan revised_plan thinking trajectory", "endpoints and events"),
     "service/routes": ("plan thinking trajectory", "examples and events"),
 }
@@ -110,7 +110,10 @@ def test_nobody_else_names_sections_and_words_of_elf_vla() -> None:
         if text in sections or any(word in text for word in ELF_VLA_WORDS)
     }
     # What a branch of CF-VLA's is counted as; a field of the HTTP contract of feedback.
-    assert found == {"service/operations/metrics.py": "think", "service/routes/examples.py": "think"}
+    assert found == {
+        "service/operations/service_metrics.py": "think",
+        "service/routes/request_examples.py": "think",
+    }
 
 
 def test_nobody_else_writes_the_tags_of_vla_world() -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from looktwice.clients import wire
+from looktwice.clients.labelling.build_outcomes import followed_plans, plans_that_hold
 from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError, StageRun
-from looktwice.clients.labelling.outcomes import followed_plans, plans_that_hold
 from looktwice.clients.labelling.teachers.prompt import camera_line
 from looktwice.model.driving.images import media_type
 from looktwice.model.driving.phrases import corrected, facts_of

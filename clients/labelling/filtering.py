@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from looktwice.clients.labelling.build_outcomes import Followed, plans_that_fail
 from looktwice.clients.labelling.ledger import Entry
-from looktwice.clients.labelling.outcomes import Followed, plans_that_fail
 from looktwice.clients.labelling.rollout import min_ade_m
 
 QUIET = "quiet"

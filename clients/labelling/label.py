@@ -7,9 +7,9 @@ from collections.abc import Awaitable, Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from looktwice.clients.labelling.build_outcomes import Followed, failure_of, followed_entries
 from looktwice.clients.labelling.checks import FailedCheck
 from looktwice.clients.labelling.ledger import Entry, Ledger, Record, StageRun
-from looktwice.clients.labelling.outcomes import Followed, failure_of, followed_entries
 from looktwice.clients.labelling.pipeline import CannotBeDone, Job, StageStopped
 from looktwice.clients.labelling.rollout import key_of
 from looktwice.clients.labelling.teachers.teacher import (

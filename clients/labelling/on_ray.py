@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import ray
 
 from looktwice.clients import wire
-from looktwice.clients.labelling import label, outcomes, rollout
+from looktwice.clients.labelling import build_outcomes, label, rollout
 from looktwice.clients.labelling.ledger import Entered, Entry, Ledger, StageRun
 from looktwice.clients.labelling.pipeline import Job, StageLimits, StageStopped, Tally, work_through
 from looktwice.clients.labelling.rollout import RETRY_POLICY, Sampling, roll_out
@@ -102,7 +102,7 @@ class LabelWork:
             book.run(run.stage, run.config)
         for entry, _ in chunk.kept:
             book.finish(self.rollout, entry.key, entry.scene_id, entry.record)
-        outcomes_run = book.run("outcomes", outcomes.config_of(self.rollout))
+        outcomes_run = book.run("outcomes", build_outcomes.config_of(self.rollout))
         for entry in chunk.followed:
             book.finish(outcomes_run, entry.key, entry.scene_id, entry.record)
         book.select(self.rollout, [(entry.key, draws) for entry, draws in chunk.kept])
@@ -135,7 +135,7 @@ def chunks(ledger: Ledger, run: StageRun, scenes: Path, rollout: StageRun | None
     """The row groups of scene files; with a ``rollout`` those with kept scenes, and what is kept."""
     kept: dict[str, list[tuple[Entry, list[int]]]] = {}
     begun = ledger.begun(run)
-    followed = {} if rollout is None else outcomes.followed_entries(ledger, rollout)
+    followed = {} if rollout is None else build_outcomes.followed_entries(ledger, rollout)
     if rollout is not None:
         for entry in ledger.entries(rollout):
             found = ledger.selected(entry.key)

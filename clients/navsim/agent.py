@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from looktwice.clients import wire
+from looktwice.clients.navsim.agent_input import AgentInput, Cameras, InputError
 from looktwice.clients.navsim.history import PERIOD_S, STATUSES, history_of
-from looktwice.clients.navsim.inputs import AgentInput, Cameras, InputError
 from looktwice.clients.navsim.reprojection import seen_as
 from looktwice.clients.planner import Access, PlannerClient, RetryPolicy
 from looktwice.model.driving.cameras import FRONT_CAMERAS, CameraSpec

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from looktwice.clients.navsim.inputs import EgoStatus, InputError
+from looktwice.clients.navsim.agent_input import EgoStatus, InputError
 from looktwice.model.driving.trajectory import HISTORY_STEPS, STEP_S, FloatArray, to_ego_frame
 
 PERIOD_S: Final = 0.5

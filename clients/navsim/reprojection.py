@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from looktwice.clients.navsim.inputs import Camera, InputError
+from looktwice.clients.navsim.agent_input import Camera, InputError
 from looktwice.model.driving.cameras import CameraSpec
 
 _UNSEEN: Final = 128

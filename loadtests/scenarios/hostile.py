@@ -19,10 +19,10 @@ from looktwice.loadtests.attacks import COSTLY, Bait, Hostility, be_hostile, cos
 from looktwice.loadtests.bad_teacher import BadTeacher
 from looktwice.loadtests.bodies import make_call, make_calls
 from looktwice.loadtests.environment import left_behind, lines_lost
+from looktwice.loadtests.load_run import WARM_UP, Result, Setup, check, run
 from looktwice.loadtests.loads import LoadPhase, OpenLoop, poisson_arrivals, windows
 from looktwice.loadtests.memory import MemoryWatch
 from looktwice.loadtests.mix import RequestKind
-from looktwice.loadtests.run import WARM_UP, Result, Setup, check, run
 
 CALM, HOSTILE, AFTER = "calm", "hostile", "after"
 _NICENESS: Final = 5

@@ -7,10 +7,10 @@ from typing import Final
 
 from looktwice.loadtests.accounting import Summary, summarise
 from looktwice.loadtests.bodies import make_calls, make_drives
+from looktwice.loadtests.load_run import WARM_UP, Ran, Result, Setup, check, needed, run
 from looktwice.loadtests.loads import LoadPhase, OpenLoop, Window, poisson_arrivals
 from looktwice.loadtests.loads import fleet as make_fleet
 from looktwice.loadtests.memory import Growth, MemoryWatch, growth
-from looktwice.loadtests.run import WARM_UP, Ran, Result, Setup, check, needed, run
 
 MEASURED = "measured"
 

@@ -10,8 +10,8 @@ from typing import Any, Final
 from looktwice.loadtests.accounting import LEAST_ACHIEVED, Summary
 from looktwice.loadtests.bodies import make_calls
 from looktwice.loadtests.exchange import Exchange
+from looktwice.loadtests.load_run import Result, Setup, check, run
 from looktwice.loadtests.loads import OpenLoop, poisson_arrivals
-from looktwice.loadtests.run import Result, Setup, check, run
 from looktwice.loadtests.scenarios.steady import MEASURED, steady_phases
 
 

@@ -24,7 +24,7 @@ from looktwice.model.bench.contenders import (
     TimedAnswer,
     Transformers,
 )
-from looktwice.model.bench.memory import forget_peaks, peak_bytes
+from looktwice.model.bench.process_memory import forget_peaks, peak_bytes
 from looktwice.model.bench.workload import Workload
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.engines.engine import PlanRequest

@@ -10,8 +10,8 @@ import torch
 from transformers import Qwen2_5_VLConfig
 
 from looktwice.model.network.checkpoint import read_parts, save
-from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.vla import LookTwiceVla, padded_size, with_settings
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.network.vocabulary import END_OF_TEXT, IM_END
 
 

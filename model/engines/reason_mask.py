@@ -20,7 +20,7 @@ from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.engines.engine import PlanRequest
 from looktwice.model.families.family import Family
 from looktwice.model.formats.cursor import Cursor, Token
-from looktwice.model.formats.phrases import in_phrases
+from looktwice.model.formats.phrase_pieces import in_phrases
 
 BoolArray = npt.NDArray[np.bool_]
 

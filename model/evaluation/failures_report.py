@@ -11,7 +11,6 @@ from looktwice.model.driving.pdm.comfort import Version
 from looktwice.model.driving.pdm.judged import THRESHOLD
 from looktwice.model.driving.pdm.judging import SceneJudge
 from looktwice.model.evaluation.bootstrap import Comparison, compare
-from looktwice.model.evaluation.failures import MEASURES, MeasuredStage
 from looktwice.model.evaluation.figures import FigureRow, figure_table
 from looktwice.model.evaluation.scores import (
     SceneScore,
@@ -20,6 +19,7 @@ from looktwice.model.evaluation.scores import (
     scene_scores,
     table_of,
 )
+from looktwice.model.evaluation.stage_results import MEASURES, MeasuredStage
 from looktwice.model.evaluation.table import comparison_cells
 
 

@@ -11,7 +11,7 @@ import re
 from functools import cache
 from typing import Final
 
-from looktwice.model.network.corpus import driving_sentences
+from looktwice.model.network.nano_corpus import driving_sentences
 
 _TEACHERS: Final = """
 allow am back be bends calls carry come do drawing drive drives ease eat fits foot get go going have hold

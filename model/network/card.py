@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from looktwice.model.network.codec import CODEC_FILE
-from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla_settings import VlaSettings
 
 CARD_FILE: Final = "looktwice.json"
 LOG_FILE: Final = "log.jsonl"

@@ -33,7 +33,6 @@ from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.model_card import ModelCard
 from looktwice.model.network.numbers import needed_numbers, write_number_embeddings
 from looktwice.model.network.repository import write_repository
-from looktwice.model.network.settings import SettingsError, VlaSettings
 from looktwice.model.network.visual_codes import WEIGHTS_FILE as VISUAL_CODES_FILE
 from looktwice.model.network.visual_codes import VisualCodes, load_visual_codes
 from looktwice.model.network.vla import (
@@ -44,6 +43,7 @@ from looktwice.model.network.vla import (
     parameters_of,
     with_settings,
 )
+from looktwice.model.network.vla_settings import SettingsError, VlaSettings
 from looktwice.model.network.vocabulary import Vocabulary, VocabularyError, add_numbers, expand_tokenizer
 
 _PUBLISHED_NAMES: Final = {

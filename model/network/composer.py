@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from looktwice.model.network.blocks import ConvBlock
+from looktwice.model.network.convolutions import ConvBlock
 
 SEEN_PICTURES: Final = 2
 """Earlier pictures that a composer is shown, half a second apart, the last one of now."""

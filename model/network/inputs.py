@@ -20,12 +20,12 @@ from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.families.family import Attempt, PictureRequest, Situation, TextInputs
 from looktwice.model.families.registry import family_named
 from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.network.chat_prompt import prompt_text
 from looktwice.model.network.composer import SEEN_PICTURES
 from looktwice.model.network.patches import normalise, patchify, resize
-from looktwice.model.network.prompts import prompt_text
-from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.track_features import track_features
 from looktwice.model.network.visual_codes import Seen, VisualCodes, frame_of
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.network.vocabulary import VIDEO_PAD, Vocabulary
 
 IntArray = npt.NDArray[np.int64]

@@ -10,7 +10,7 @@ from transformers import BatchFeature, ProcessorMixin
 from looktwice.model.driving.scene import Scene
 from looktwice.model.families.family import Attempt
 from looktwice.model.network.inputs import InputBuilder
-from looktwice.model.network.settings import CONFIG_KEY, VlaSettings
+from looktwice.model.network.vla_settings import CONFIG_KEY, VlaSettings
 from looktwice.model.network.vocabulary import Vocabulary
 
 
@@ -20,7 +20,7 @@ class LookTwiceProcessor(ProcessorMixin):
     Args:
         tokenizer: with our markers and codes.
         looktwice: the checkpoint's settings, as in its ``config.json``.
-        chat_template: writes the prompt that `looktwice.model.network.prompts` writes.
+        chat_template: writes the prompt that `looktwice.model.network.chat_prompt` writes.
     """
 
     def __init__(

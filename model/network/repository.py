@@ -18,10 +18,10 @@ from looktwice.model.families.registry import family_named
 from looktwice.model.families.trajectory_codes import CODES, TRAJECTORY
 from looktwice.model.formats.pieces import Codes, walk
 from looktwice.model.network.card import CheckpointError, read_card, write_about
+from looktwice.model.network.chat_prompt import chat_template
 from looktwice.model.network.processor import LookTwiceProcessor, processor_config
-from looktwice.model.network.prompts import chat_template
-from looktwice.model.network.settings import CONFIG_KEY, SettingsError, VlaSettings
 from looktwice.model.network.vla import LookTwiceVla
+from looktwice.model.network.vla_settings import CONFIG_KEY, SettingsError, VlaSettings
 
 CARD: Final = "README.md"
 _MODEL_CODE: Final = "modeling_looktwice"

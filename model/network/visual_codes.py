@@ -33,8 +33,8 @@ from looktwice.model.families.picture_codes import (
     codes_of,
     levels_of,
 )
-from looktwice.model.network.blocks import ConvBlock
 from looktwice.model.network.composer import SEEN_PICTURES, Composer
+from looktwice.model.network.convolutions import ConvBlock
 
 FRAME_WIDTH: Final = 224
 FRAME_HEIGHT: Final = 112

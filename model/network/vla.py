@@ -20,8 +20,8 @@ from looktwice.model.network.fact_reader import likely
 from looktwice.model.network.inputs import ModelInputs, Prompt, rotary_positions
 from looktwice.model.network.intent import SketchBooks, SketchCodes, TrackReader
 from looktwice.model.network.resampler import SceneResampler
-from looktwice.model.network.settings import CONFIG_KEY, VlaSettings
 from looktwice.model.network.vision import attends_to_whole_pictures, encode_pictures, normalised
+from looktwice.model.network.vla_settings import CONFIG_KEY, VlaSettings
 from looktwice.model.network.vocabulary import (
     END_OF_TEXT,
     HISTORY,

@@ -12,8 +12,8 @@ import torch
 from looktwice.model.network.card import CheckpointError
 from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.network.model_card import ModelCard
-from looktwice.model.network.settings import CONFIG_KEY
 from looktwice.model.network.visual_codes import VisualCodes
+from looktwice.model.network.vla_settings import CONFIG_KEY
 
 _NO_SIZES: Final = {CONFIG_KEY, "_name_or_path", "dtype", "transformers_version"}
 """Entries of a configuration that say nothing of the network's sizes and operations."""

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from looktwice.model.training.targets import Target
+from looktwice.model.training.response_targets import Target
 
 Batch = dict[str, Tensor]
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]

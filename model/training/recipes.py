@@ -18,8 +18,8 @@ from looktwice.model.families.cf_vla.targets import CODE_WEIGHTS, NANO_WEIGHTS, 
 from looktwice.model.families.elf_vla import targets as elf_vla
 from looktwice.model.families.vla_world import targets as vla_world
 from looktwice.model.families.vla_world.rewards import REWARDS as VLA_WORLD_REWARDS
+from looktwice.model.training.response_targets import SectionWeights
 from looktwice.model.training.rewards import RewardWeights
-from looktwice.model.training.targets import SectionWeights
 
 Goal = Literal["ground", "read", "respond", "outcome", "code"]
 FeedbackWriter = Literal["teacher", "rule"]

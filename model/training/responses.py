@@ -24,10 +24,10 @@ from looktwice.model.families.registry import families_of
 from looktwice.model.families.trajectory_codes import CODES
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.pieces import FormatError
+from looktwice.model.network.chat_prompt import motion_text
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.patches import patchify
-from looktwice.model.network.prompts import motion_text
 from looktwice.model.network.track_features import MIRRORED, without_route
 from looktwice.model.network.visual_codes import Frame, VisualCodes, frame_of
 from looktwice.model.network.vocabulary import Vocabulary
@@ -35,9 +35,9 @@ from looktwice.model.training.batches import Array, ResponseSample
 from looktwice.model.training.examples import Examples, example_frames
 from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.reflections import mirrored
+from looktwice.model.training.response_targets import SectionWeights, Target, make_target
 from looktwice.model.training.sampler import Item
 from looktwice.model.training.soft_codes import SoftCodes
-from looktwice.model.training.targets import SectionWeights, Target, make_target
 from looktwice.model.training.vision_cache import VisionCache
 
 _MIRROR: Final = np.array([1, -1, 1, -1], np.float32)

@@ -14,7 +14,7 @@ from looktwice.model.engines.engine import Draw
 from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.track_features import track_features
 from looktwice.model.training.batches import ResponseSample
-from looktwice.model.training.targets import Target
+from looktwice.model.training.response_targets import Target
 
 _ROW_TOKENS: Final = 1536
 """Of a prompt and the responses behind it: what attention takes grows with the square of a row."""

@@ -34,11 +34,11 @@ from looktwice.model.network.checkpoint import (
     with_visual_codes,
 )
 from looktwice.model.network.codec import TrajectoryCodec
-from looktwice.model.network.corpus import nano_corpus, nano_phrases
 from looktwice.model.network.intent import IntentReader
-from looktwice.model.network.settings import EXPANDED_SETTINGS, NANO_SETTINGS
+from looktwice.model.network.nano_corpus import nano_corpus, nano_phrases
 from looktwice.model.network.visual_codes import load_visual_codes
 from looktwice.model.network.vla import LookTwiceVla
+from looktwice.model.network.vla_settings import EXPANDED_SETTINGS, NANO_SETTINGS
 from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from looktwice.model.training.attempts import AttemptsOn, attempts_on
 from looktwice.model.training.batches import collate
@@ -59,6 +59,7 @@ from looktwice.model.training.intents import (
     read_facts,
 )
 from looktwice.model.training.learner import ResponseLearner
+from looktwice.model.training.open_loop_validation import open_loop
 from looktwice.model.training.outcomes import OutcomeLearner, ScenePlaces, collate_places
 from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.recipes import Recipe
@@ -66,7 +67,6 @@ from looktwice.model.training.reflections import OnExamples, reflections_on
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.sampler import TaskSampler
 from looktwice.model.training.trainer import LearnerTrainer, Validate
-from looktwice.model.training.validation import open_loop
 from looktwice.model.training.vision_cache import open_vision
 
 

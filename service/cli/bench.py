@@ -24,8 +24,8 @@ from looktwice.service.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from looktwice.model.bench.report import Roofline
-    from looktwice.model.bench.run import BenchRow
+    from looktwice.model.bench.bench_report import Roofline
+    from looktwice.model.bench.bench_run import BenchRow
 
 bench = typer.Typer(help="Measure speed, as ratios within one run.", no_args_is_help=True)
 
@@ -64,8 +64,8 @@ def engine(
 ) -> None:
     """Our engine, transformers and vLLM on the same checkpoint, scenes and controls."""
     with reported_errors(), tempfile.TemporaryDirectory() as folder:
-        from looktwice.model.bench.report import BenchReport
-        from looktwice.model.bench.run import BenchJob, run, run_deadlines, run_planner
+        from looktwice.model.bench.bench_report import BenchReport
+        from looktwice.model.bench.bench_run import BenchJob, run, run_deadlines, run_planner
         from looktwice.model.bench.workload import Workload
         from looktwice.model.families.registry import family_named
         from looktwice.model.network.checkpoint import read_parts
@@ -126,7 +126,7 @@ def precision(
 ) -> None:
     """How often rounding in float32 and bfloat16 changes a response, and how close the decision was."""
     with reported_errors():
-        from looktwice.model.bench.precision import measure
+        from looktwice.model.bench.rounding import measure
         from looktwice.model.driving.scene_store import read_scenes
 
         found = measure(checkpoint, [each.scene for each in read_scenes(scenes, dense=False)], n)
@@ -152,7 +152,7 @@ def score(
 ) -> None:
     """Our scorer of plans, and NAVSIM's own beside it, in seconds of one core."""
     with reported_errors():
-        from looktwice.model.bench.scoring import measure
+        from looktwice.model.bench.scoring_speed import measure
 
         found = measure(repeats, navsim or [], navsim_python and navsim_python.absolute())
         if as_json:
@@ -293,7 +293,7 @@ def _random_checkpoint(preset: str, words_of: Path, folder: Path, device: str, a
 
 
 def _rooflines(rows: list[BenchRow], checkpoint: Path, format: str, device: str) -> list[Roofline]:
-    from looktwice.model.bench.report import Roofline
+    from looktwice.model.bench.bench_report import Roofline
     from looktwice.model.bench.roofline import measure, work_of_plan
     from looktwice.model.network.checkpoint import read_config, read_parts
     from looktwice.model.network.precision import fast_dtype

@@ -126,8 +126,8 @@ def outcomes(
     """Follow the model's own plans in the simulator: which hold, which fail, and at what."""
     from collections import Counter
 
+    from looktwice.clients.labelling.build_outcomes import Followed, config_of
     from looktwice.clients.labelling.follow import follow_all
-    from looktwice.clients.labelling.outcomes import Followed, config_of
     from looktwice.clients.labelling.pipeline import StageLimits
 
     limits = StageLimits(max_error_rate=max_error_rate, at_most=dry_run or limit)
@@ -180,9 +180,9 @@ def choose(
     as_json: Json = False,
 ) -> None:
     """Keep the scenes whose plan is what goes wrong; writes filter.png."""
+    from looktwice.clients.labelling.build_outcomes import followed_plans
     from looktwice.clients.labelling.filtering import Thresholds, filtered, filtered_by_outcome, summary
     from looktwice.clients.labelling.ledger import Ledger
-    from looktwice.clients.labelling.outcomes import followed_plans
     from looktwice.clients.labelling.scatter import scatter
     from looktwice.model.driving.scene_store import row_groups, scene_files
 
@@ -325,7 +325,7 @@ def export(
     run: Annotated[str | None, typer.Option("--run", help="Which labels (openai-batch: rollout).")] = None,
 ) -> None:
     """Write what was labelled, or what is still to be asked."""
-    from looktwice.clients.labelling.batch import batch_requests
+    from looktwice.clients.labelling.batch_api import batch_requests
     from looktwice.clients.labelling.export import held_plans, reflections, right_plans, write_messages
     from looktwice.clients.labelling.ledger import Ledger
     from looktwice.model.driving.reflection_store import write_reflections
@@ -375,7 +375,7 @@ def take(
     as_json: Json = False,
 ) -> None:
     """Take the answers to an exported openai-batch; what fails its checks is in the next export again."""
-    from looktwice.clients.labelling.batch import read_results, take_results
+    from looktwice.clients.labelling.batch_api import read_results, take_results
     from looktwice.clients.labelling.dead_letters import write_dead_letters
     from looktwice.clients.labelling.ledger import Ledger
 

@@ -94,7 +94,7 @@ def egodriver(
         async def run() -> None:
             from looktwice.clients.alpasim.driver import Egodriver
             from looktwice.clients.alpasim.errors import EgodriverError
-            from looktwice.clients.alpasim.server import serve
+            from looktwice.clients.alpasim.grpc_server import serve
             from looktwice.clients.planner import PlannerError
 
             async with _planner(service, made) as planner:

@@ -44,8 +44,8 @@ def evaluate_stages(
 ) -> FailuresReport:
     """Evaluate stages one after the other on the same scenes."""
     from looktwice.model.driving.pdm.judging import SceneJudge
-    from looktwice.model.evaluation.failures import evaluate_stage, stage_variants
     from looktwice.model.evaluation.failures_report import failures_report
+    from looktwice.model.evaluation.stage_results import evaluate_stage, stage_variants
     from looktwice.service.cli.evaluate import run_started
 
     judges = [SceneJudge(each) for each in scenes]

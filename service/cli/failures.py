@@ -13,7 +13,7 @@ from looktwice.service.cli.options import Json, reported_errors
 from looktwice.service.cli.stages import do_jobs, report_run, run_stage, scenes_in
 
 if TYPE_CHECKING:
-    from looktwice.clients.labelling.failures import FeedbackSample, Inference
+    from looktwice.clients.labelling.feedback_set import FeedbackSample, Inference
     from looktwice.clients.labelling.ledger import Ledger, StageRun
     from looktwice.clients.labelling.pipeline import StageLimits, Tally
 
@@ -46,7 +46,7 @@ def failures(
     as_json: Json = False,
 ) -> None:
     """Infer, score, sample correct and wrong responses, have feedback written: docs/feedback.md."""
-    from looktwice.clients.labelling.failures import FeedbackSample, Inference, rows, sampled
+    from looktwice.clients.labelling.feedback_set import FeedbackSample, Inference, rows, sampled
     from looktwice.clients.labelling.ledger import Ledger
     from looktwice.clients.labelling.pipeline import StageLimits
     from looktwice.model.driving.feedback_store import write_feedback
@@ -91,7 +91,7 @@ async def _infer(
     retry_dead: bool,
     quiet: bool,
 ) -> tuple[StageRun, Tally]:
-    from looktwice.clients.labelling.failures import infer, inference_config
+    from looktwice.clients.labelling.feedback_set import infer, inference_config
     from looktwice.clients.labelling.rollout import RETRY_POLICY, jobs
     from looktwice.clients.planner import Access, AsyncPlannerClient, PlannerError
     from looktwice.clients.wire import ModelName
@@ -126,8 +126,8 @@ async def _write(
     retry_dead: bool,
     quiet: bool,
 ) -> tuple[StageRun, Tally]:
-    from looktwice.clients.labelling.failures import feedback_config, feedback_jobs, sampled, writer
-    from looktwice.clients.labelling.teachers.feedback import FeedbackTeacher
+    from looktwice.clients.labelling.feedback_set import feedback_config, feedback_jobs, sampled, writer
+    from looktwice.clients.labelling.teachers.feedback_teacher import FeedbackTeacher
     from looktwice.service.operations.settings import TeacherSettings
 
     set_teacher = TeacherSettings().teacher()

@@ -21,7 +21,7 @@ def feedback(
 ) -> None:
     """Say why a request's trajectories fail, as the built-in teacher does; docs/feedback.md tells how."""
     from looktwice.clients.wire_feedback import FeedbackRequest
-    from looktwice.service.http.errors import validated
+    from looktwice.service.http.problem_documents import validated
     from looktwice.service.problems import ProblemError
     from looktwice.service.scenes.bundled import BundledScenes
     from looktwice.service.scoring.rule_feedback import feedback_given

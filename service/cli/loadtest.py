@@ -89,9 +89,9 @@ def loadtest(
         from looktwice.loadtests.attacks import RUDE
         from looktwice.loadtests.bad_teacher import bad_teacher
         from looktwice.loadtests.environment import describe_client, describe_service, versions
+        from looktwice.loadtests.load_report import LoadReport
+        from looktwice.loadtests.load_run import Result, Setup
         from looktwice.loadtests.mix import parse_mix
-        from looktwice.loadtests.report import LoadReport
-        from looktwice.loadtests.run import Result, Setup
         from looktwice.loadtests.scenarios.hostile import OwnService, costly, hostile
         from looktwice.loadtests.scenarios.steady import burst, fleet, poisson, soak
         from looktwice.loadtests.scenarios.sweep import KneeSearch, sweep
@@ -144,7 +144,7 @@ def loadtest(
         began = datetime.now(UTC).isoformat(timespec="seconds")
         made = LoadReport(setup, run[scenario](), began, client, models, versions())
         if report is not None:
-            from looktwice.loadtests.page import page
+            from looktwice.loadtests.report_page import page
 
             report.parent.mkdir(parents=True, exist_ok=True)
             report.write_text(page(made), encoding="utf-8")

@@ -25,7 +25,7 @@ from looktwice.clients.metadrive.outcomes import (
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.engines.engine import Controls, Draw, EngineError
-from looktwice.model.evaluation.outcomes import FollowedDraw, OutcomeTable, outcome_table
+from looktwice.model.evaluation.second_looks import FollowedDraw, OutcomeTable, outcome_table
 from looktwice.model.evaluation.variants import Variant
 
 MOST_UNPAIRED: Final = 0.02

@@ -97,7 +97,7 @@ def _read(file: Path) -> Iterator[LabelledScene | wire.PlanRequest]:
         yield from read_scenes(file, dense=False)
         return
     import looktwice.clients.wire as wire
-    from looktwice.service.http.errors import validated
+    from looktwice.service.http.problem_documents import validated
     from looktwice.service.problems import ProblemError
 
     try:

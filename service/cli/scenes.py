@@ -238,7 +238,7 @@ def short_term(
 ) -> None:
     """Measure how far off half a second ahead is predicted: VLA-World's short-term predictor."""
     with reported_errors():
-        from looktwice.clients.summaries.short_term import format_short_term, short_term_figures
+        from looktwice.clients.summaries.short_term_errors import format_short_term, short_term_figures
 
         figures = short_term_figures(train, validation)
         typer.echo(json.dumps(figures) if as_json else format_short_term(figures))

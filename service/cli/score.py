@@ -98,10 +98,10 @@ def _agreed_draws(
 
 def _score_request(request: Path, scenes: Path, *, as_json: bool) -> None:
     from looktwice.clients.wire_scores import ScoreRequest
-    from looktwice.service.http.errors import validated
+    from looktwice.service.http.problem_documents import validated
     from looktwice.service.problems import ProblemError
     from looktwice.service.scenes.bundled import BundledScenes
-    from looktwice.service.scoring.scores import scored
+    from looktwice.service.scoring.request_scores import scored
 
     text = sys.stdin.read() if str(request) == "-" else request.read_text()
     try:

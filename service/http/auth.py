@@ -9,9 +9,9 @@ from typing import Final
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from looktwice.service.http.errors import problem_response
+from looktwice.service.http.problem_documents import problem_response
 from looktwice.service.operations.keys import Keys
-from looktwice.service.operations.metrics import Metrics
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.problems import MISDIRECTED, UNAUTHORIZED, ProblemError
 
 OPEN_PATHS: Final = frozenset({"/healthz", "/readyz"})

@@ -14,8 +14,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from looktwice.clients.wire import REQUEST_ID_HEADER
-from looktwice.service.http.errors import problem_response
-from looktwice.service.operations.metrics import Metrics
+from looktwice.service.http.problem_documents import problem_response
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.operations.traces import Traces
 from looktwice.service.problems import DRAINING, ProblemError, unforeseen
 

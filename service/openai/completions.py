@@ -7,9 +7,9 @@ import time
 from typing import Any, Final
 
 import looktwice.clients.wire as wire
-from looktwice.service.openai.requests import ChatRequest
-from looktwice.service.planning.answers import plan_answer, wire_branch
+from looktwice.service.openai.chat_requests import ChatRequest
 from looktwice.service.planning.events import PlannedScene
+from looktwice.service.planning.wire_answers import plan_answer, wire_branch
 
 THINKING: Final = f"{wire_branch(looked_twice=True)} "
 _EVERY: Final = 5

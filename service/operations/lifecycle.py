@@ -11,7 +11,7 @@ import structlog
 
 from looktwice.model.engines.engine import Engine, EngineLoad
 from looktwice.model.network.model_card import ModelCard
-from looktwice.service.operations.metrics import Metrics
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.problems import (
     CHECKPOINT_FAILED,
     DRAINING,

@@ -33,10 +33,10 @@ from looktwice.model.driving.trajectory import (
 from looktwice.model.engines.engine import Draw
 from looktwice.model.families.registry import family_named
 from looktwice.model.network.model_card import ModelCard
-from looktwice.service.planning.answers import plan_answer
 from looktwice.service.planning.events import Arrival, Begun, PlannedScene, SceneEvent
 from looktwice.service.planning.telling import PlanTeller, Written
 from looktwice.service.planning.validation import Geometry, geometry_of
+from looktwice.service.planning.wire_answers import plan_answer
 from looktwice.service.problems import (
     INVALID_FEEDBACK,
     INVALID_TRACKS,
@@ -46,8 +46,8 @@ from looktwice.service.problems import (
     ProblemError,
     at,
 )
+from looktwice.service.scoring.request_scores import answer as score_answer
 from looktwice.service.scoring.rule_feedback import CALLER
-from looktwice.service.scoring.scores import answer as score_answer
 
 VERSION: Final[Version] = "v1.1"
 """PDMS, which the paper judges by."""

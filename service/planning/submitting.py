@@ -33,7 +33,7 @@ from looktwice.model.network.model_card import ModelCard
 from looktwice.service.admission.places import Admission, Place, full_as_problem, let_in, whole_seconds
 from looktwice.service.admission.rates import RateLimited, Rates
 from looktwice.service.operations.lifecycle import Lifecycle
-from looktwice.service.operations.metrics import Metrics
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.operations.traces import Traces
 from looktwice.service.planning.events import Arrival, Begun, Judged, PlannedScene, SceneEvent
 from looktwice.service.planning.validation import Geometry, engine_request

@@ -9,8 +9,8 @@ from looktwice.model.engines.engine import DraftFinished, SectionFinished, TextW
 from looktwice.model.families.family import Family
 from looktwice.model.families.registry import family_named
 from looktwice.model.formats.pieces import Values
-from looktwice.service.planning.answers import wire_branch, wire_sections, wire_times, wire_trajectory
 from looktwice.service.planning.events import Judged, SceneEvent
+from looktwice.service.planning.wire_answers import wire_branch, wire_sections, wire_times, wire_trajectory
 
 Written = (
     wire.PlanWritten | wire.BranchTaken | wire.ThinkingWritten | wire.SectionWritten | wire.TrajectoryWritten

@@ -13,16 +13,16 @@ from starlette.responses import JSONResponse
 import looktwice.clients.wire as wire
 from looktwice.service.http.callers import while_connected
 from looktwice.service.http.dialect import dialect_error
-from looktwice.service.http.errors import validated
 from looktwice.service.http.openapi import Responses, event_stream, problems
 from looktwice.service.http.payloads import payload_route
+from looktwice.service.http.problem_documents import validated
+from looktwice.service.openai.chat_requests import ChatPlaces, ChatRequest, check_model, plan_document
 from looktwice.service.openai.completions import THINKING, Completion, trajectory_text
-from looktwice.service.openai.requests import ChatPlaces, ChatRequest, check_model, plan_document
-from looktwice.service.planning.answers import wire_branch
 from looktwice.service.planning.events import PlannedScene
 from looktwice.service.planning.submitting import last
 from looktwice.service.planning.telling import PlanTeller, Written
 from looktwice.service.planning.validation import format_of
+from looktwice.service.planning.wire_answers import wire_branch
 from looktwice.service.problems import (
     DRAINING,
     ENGINE_FAILED,

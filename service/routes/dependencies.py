@@ -13,11 +13,11 @@ from looktwice.clients.labelling.teachers.teacher import Teacher
 from looktwice.clients.wire import Problem
 from looktwice.model.engines.engine import Engine
 from looktwice.service.admission.places import Admission, full_as_problem
-from looktwice.service.http.errors import problem_document
 from looktwice.service.http.idempotency import Idempotency, made_before
+from looktwice.service.http.problem_documents import problem_document
 from looktwice.service.operations.lifecycle import Lifecycle
-from looktwice.service.operations.metrics import Metrics
 from looktwice.service.operations.pulse import Pulse
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.operations.settings import Settings
 from looktwice.service.planning.submitting import SceneSubmitter
 from looktwice.service.problems import ProblemError, unforeseen

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Body, Request
 from fastapi.openapi.models import Example
 
 import looktwice.clients.wire_feedback as wire_feedback
-from looktwice.clients.labelling.teachers.feedback import FeedbackTeacher
+from looktwice.clients.labelling.teachers.feedback_teacher import FeedbackTeacher
 from looktwice.service.admission.places import Admission, let_in
 from looktwice.service.http.callers import while_connected
 from looktwice.service.http.openapi import PACKED, payloads, problems
@@ -22,9 +22,9 @@ from looktwice.service.problems import (
 )
 from looktwice.service.routes.arrivals import arrival_of
 from looktwice.service.routes.dependencies import Dependencies
-from looktwice.service.routes.examples import example_feedback
+from looktwice.service.routes.request_examples import example_feedback
 from looktwice.service.routes.score import SCORING_REFUSALS
-from looktwice.service.teaching.feedback import taught
+from looktwice.service.teaching.teacher_feedback import taught
 
 EXAMPLES: Final[dict[str, Example]] = {"why one of two trajectories is wrong": {"value": example_feedback()}}
 

@@ -19,8 +19,8 @@ from looktwice.service.planning.submitting import last
 from looktwice.service.problems import CANNOT_IMAGINE, INVALID_TRAJECTORY
 from looktwice.service.routes.arrivals import arrival_of
 from looktwice.service.routes.dependencies import Dependencies
-from looktwice.service.routes.examples import example_imagining, example_trajectory
 from looktwice.service.routes.plan import REFUSALS
+from looktwice.service.routes.request_examples import example_imagining, example_trajectory
 from looktwice.service.routes.streaming import server_sent, streamed
 
 EXAMPLES: Final[dict[str, Example]] = {

@@ -8,7 +8,7 @@ import looktwice.clients.wire as wire
 from looktwice.service.http.auth import NOBODY
 from looktwice.service.http.openapi import problems
 from looktwice.service.http.payloads import payload_route
-from looktwice.service.planning.answers import model_card
+from looktwice.service.planning.wire_answers import model_card
 from looktwice.service.problems import (
     BODY_TIMEOUT,
     BODY_TOO_LARGE,

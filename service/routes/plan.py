@@ -14,15 +14,15 @@ from starlette.responses import Response
 
 import looktwice.clients.wire as wire
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
-from looktwice.service.http.errors import validated
 from looktwice.service.http.idempotency import IdempotencyKey, NotCached, once, refuse_key
 from looktwice.service.http.openapi import PACKED, answers_and_stream, payloads, problems
 from looktwice.service.http.payloads import payload_route, respond
-from looktwice.service.planning.answers import plan_answer, reflect_answer
+from looktwice.service.http.problem_documents import validated
 from looktwice.service.planning.events import Arrival, PlannedScene
 from looktwice.service.planning.submitting import AnyPlanRequest, last
 from looktwice.service.planning.telling import PlanTeller
 from looktwice.service.planning.validation import format_of
+from looktwice.service.planning.wire_answers import plan_answer, reflect_answer
 from looktwice.service.problems import (
     BODY_TIMEOUT,
     BODY_TOO_LARGE,
@@ -57,7 +57,7 @@ from looktwice.service.problems import (
 )
 from looktwice.service.routes.arrivals import arrival_of
 from looktwice.service.routes.dependencies import Dependencies
-from looktwice.service.routes.examples import example_reflection, example_request
+from looktwice.service.routes.request_examples import example_reflection, example_request
 from looktwice.service.routes.streaming import server_sent, streamed
 
 _TRY_AGAIN: Final = frozenset((429, 500, 503, 504))

@@ -21,8 +21,8 @@ from looktwice.service.planning.submitting import last
 from looktwice.service.problems import INVALID_FEEDBACK, INVALID_TRAJECTORY, NEEDS_TRACKS
 from looktwice.service.routes.arrivals import arrival_of
 from looktwice.service.routes.dependencies import Dependencies
-from looktwice.service.routes.examples import example_refinement
 from looktwice.service.routes.plan import REFUSALS
+from looktwice.service.routes.request_examples import example_refinement
 from looktwice.service.routes.streaming import server_sent, streamed
 
 _DRAFT: Final = example_refinement((FRONT_WIDE, FRONT_TELE))

@@ -11,9 +11,9 @@ from fastapi.openapi.models import Example
 import looktwice.clients.wire_scores as wire_scores
 from looktwice.service.admission.places import Admission, let_in
 from looktwice.service.http.callers import while_connected
-from looktwice.service.http.errors import validated
 from looktwice.service.http.openapi import PACKED, payloads, problems
 from looktwice.service.http.payloads import payload_route, respond
+from looktwice.service.http.problem_documents import validated
 from looktwice.service.planning.events import Arrival
 from looktwice.service.problems import (
     BODY_TIMEOUT,
@@ -34,7 +34,7 @@ from looktwice.service.problems import (
 )
 from looktwice.service.routes.arrivals import arrival_of
 from looktwice.service.routes.dependencies import Dependencies
-from looktwice.service.routes.examples import example_score
+from looktwice.service.routes.request_examples import example_score
 
 EXAMPLES: Final[dict[str, Example]] = {"straight on behind a car": {"value": example_score()}}
 SCORING_REFUSALS: Final = (

@@ -14,8 +14,8 @@ from starlette.responses import StreamingResponse
 
 import looktwice.clients.wire as wire
 from looktwice.service.http.callers import CallerLeft, while_connected
-from looktwice.service.http.errors import problem_document
-from looktwice.service.operations.metrics import Metrics
+from looktwice.service.http.problem_documents import problem_document
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.planning.events import PlannedScene, SceneEvent
 from looktwice.service.problems import ProblemError, unforeseen
 

@@ -25,8 +25,8 @@ import looktwice.clients.wire_scores as wire_scores
 from looktwice.clients.wire import Fault
 from looktwice.service.problems import INVALID_LABELS, KINDS, ProblemError
 from looktwice.service.scenes.bundled import BundledScenes
+from looktwice.service.scoring.request_scores import scored
 from looktwice.service.scoring.rule_feedback import Given, feedback_given
-from looktwice.service.scoring.scores import scored
 
 MAX_MEMORY_BYTES: Final = 768_000_000
 """Of data; about 150 MB are taken by libraries."""

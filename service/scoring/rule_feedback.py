@@ -7,7 +7,11 @@ from dataclasses import asdict, dataclass
 from typing import Final, Literal
 
 import looktwice.clients.wire_feedback as wire_feedback
-from looktwice.clients.labelling.teachers.feedback import FeedbackQuestion, check_feedback, question_of
+from looktwice.clients.labelling.teachers.feedback_teacher import (
+    FeedbackQuestion,
+    check_feedback,
+    question_of,
+)
 from looktwice.clients.wire import TeacherName
 from looktwice.model.driving.hashing import hash_of
 from looktwice.model.driving.pdm.course import Course
@@ -19,7 +23,7 @@ from looktwice.model.driving.pdm.rule_teacher import NAME, REVISION, feedback_on
 from looktwice.model.driving.pdm.world import ScoreError
 from looktwice.service.problems import INVALID_FEEDBACK, INVALID_LABELS, OTHER_PLAN, at
 from looktwice.service.scenes.bundled import BundledScenes
-from looktwice.service.scoring.scores import rounded, scores_of, trajectory_of
+from looktwice.service.scoring.request_scores import rounded, scores_of, trajectory_of
 
 GROUND_TRUTH: Final = "ground_truth"
 CALLER: Final = "caller"
@@ -57,8 +61,8 @@ def feedback_given(asked: wire_feedback.FeedbackRequest, bundled: BundledScenes,
     """The answer to one request, the built-in teacher having written.
 
     Raises:
-        ProblemError: what `looktwice.service.scoring.scores.scored` refuses; labels that no trajectory can be
-            judged by; written feedback that is for another plan, or tells what is no fact.
+        ProblemError: what `looktwice.service.scoring.request_scores.scored` refuses; labels that no
+            trajectory can be judged by; written feedback that is for another plan, or tells what is no fact.
     """
     truth = None if asked.ground_truth is None else trajectory_of(asked.ground_truth, "/ground_truth")
     if truth is not None and asked.reference is None:

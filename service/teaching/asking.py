@@ -9,7 +9,7 @@ from typing import Final, Protocol
 import structlog
 
 from looktwice.clients.labelling.teachers.teacher import Answer, TeacherBusy, TeacherClosed, TeacherError
-from looktwice.service.operations.metrics import Metrics
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.problems import TEACHER_AWAY, TEACHER_REFUSED, ProblemError
 
 log = structlog.stdlib.get_logger()

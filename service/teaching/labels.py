@@ -21,7 +21,7 @@ from looktwice.model.driving.outcome import Outcome
 from looktwice.model.driving.scene import AGENT_KINDS, Agent, SceneError
 from looktwice.model.driving.tracks import track_of
 from looktwice.model.driving.view import Surroundings
-from looktwice.service.operations.metrics import Metrics
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.planning.validation import plan_of, scene_of
 from looktwice.service.problems import (
     INVALID_REQUEST,

@@ -9,7 +9,7 @@ from playwright.sync_api import Page, expect
 
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
-from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.service.operations.settings import Settings
 from tests.checkpoints import write_untrained
 from tests.service.scenes import labelled

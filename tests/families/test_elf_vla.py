@@ -24,7 +24,7 @@ from looktwice.model.driving.reasoning import thoughts_of
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.thoughts import Thoughts, read_thoughts
 from looktwice.model.engines.engine import Controls, Draw, PlanRequest, RequestError
-from looktwice.model.engines.requests import begin
+from looktwice.model.engines.engine_requests import begin
 from looktwice.model.engines.torch.decoder import Decoder
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.engines.torch.runner import PromptRequest, Runner
@@ -41,11 +41,11 @@ from looktwice.model.formats.grammar_export import to_lark
 from looktwice.model.formats.pieces import FormatError
 from looktwice.model.formats.text import parse
 from looktwice.model.network.checkpoint import Loaded, load
-from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.training.examples import Examples
+from looktwice.model.training.response_targets import make_target
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.sampler import Item
-from looktwice.model.training.targets import make_target
 from looktwice.service.operations.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.model.driving.drives import MIDDLES_S, drive, labelled_scene

@@ -14,7 +14,7 @@ from looktwice.clients.planner import PlanEvent, PlannerClient, PlanResult, atte
 from looktwice.model.driving.phrases import ReflectionLanguage
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.families.registry import OURS, family_named
-from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.service.operations.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.service.serving import Served, serve

@@ -34,12 +34,12 @@ from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.grammar_export import to_lark
 from looktwice.model.formats.text import parse
 from looktwice.model.network.checkpoint import Loaded, load
-from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.training.examples import Examples
+from looktwice.model.training.response_targets import make_target
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.sampler import Item
-from looktwice.model.training.targets import make_target
-from looktwice.service.operations.metrics import Metrics
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.operations.settings import Settings
 from looktwice.service.planning.events import Judged, SceneEvent
 from looktwice.service.planning.telling import PlanTeller

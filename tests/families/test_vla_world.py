@@ -23,7 +23,7 @@ from looktwice.model.driving.perceived import perceived_of
 from looktwice.model.driving.scene import Clip, LabelledScene, NextFrame, mirrored_camera
 from looktwice.model.driving.short_term import INERTIA
 from looktwice.model.engines.engine import Controls, Decision, Draw, PlanRequest, RequestError
-from looktwice.model.engines.requests import begin, painted
+from looktwice.model.engines.engine_requests import begin, painted
 from looktwice.model.engines.torch.deadlines import LatencyModel
 from looktwice.model.engines.torch.decoder import Decoder
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
@@ -40,8 +40,8 @@ from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.grammar_export import to_lark
 from looktwice.model.network.checkpoint import Loaded, load, save, with_visual_codes
 from looktwice.model.network.inputs import moved_pictures
-from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes, frame_of
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.network.vocabulary import END_OF_TEXT, Vocabulary
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.responses import ResponseDataset

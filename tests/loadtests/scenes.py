@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import cache
 
+from looktwice.loadtests.load_run import Setup
 from looktwice.loadtests.mix import Mix
-from looktwice.loadtests.run import Setup
 from looktwice.loadtests.sending import ServiceTarget
 from looktwice.model.bundled import SCENES
 from looktwice.model.driving.scene import LabelledScene

@@ -10,10 +10,10 @@ from html.parser import HTMLParser
 import pytest
 
 from looktwice.loadtests.attacks import Hostility
+from looktwice.loadtests.load_report import LoadReport
+from looktwice.loadtests.load_run import Result, Setup
 from looktwice.loadtests.mix import Mix
-from looktwice.loadtests.page import page
-from looktwice.loadtests.report import LoadReport
-from looktwice.loadtests.run import Result, Setup
+from looktwice.loadtests.report_page import page
 from looktwice.loadtests.scenarios.hostile import hostile
 from looktwice.loadtests.scenarios.steady import burst, fleet, poisson, soak
 from looktwice.loadtests.scenarios.sweep import KneeSearch, sweep

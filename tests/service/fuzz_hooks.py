@@ -16,8 +16,8 @@ from looktwice.clients.wire_feedback import FeedbackRequest
 from looktwice.clients.wire_imagine import ImagineRequest
 from looktwice.clients.wire_refine import RefineRequest
 from looktwice.clients.wire_scores import ScoreRequest
-from looktwice.service.openai.requests import ChatRequest
-from looktwice.service.routes.examples import example_feedback, example_refinement, example_score
+from looktwice.service.openai.chat_requests import ChatRequest
+from looktwice.service.routes.request_examples import example_feedback, example_refinement, example_score
 from tests.service.serving import body
 
 REAL = body()["scene"]

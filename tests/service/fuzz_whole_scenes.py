@@ -13,7 +13,7 @@ from typing import Any
 import schemathesis
 
 from looktwice.model.driving.scene import FRONT_WIDE
-from looktwice.service.routes.examples import example_score
+from looktwice.service.routes.request_examples import example_score
 from tests.service import fuzz_hooks
 from tests.service.fuzz_hooks import ATTEMPT, DRAFT, PICTURES, REAL
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN

@@ -13,12 +13,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from looktwice.clients.answers import retry_after_s
 from looktwice.clients.labelling.checks import FailedCheck
-from looktwice.clients.labelling.teachers.facts import RESPONSE_FORMAT, phrases_of
-from looktwice.clients.labelling.teachers.feedback import (
+from looktwice.clients.labelling.teachers.feedback_teacher import (
     FEEDBACK_PROMPT_VERSION,
     FEEDBACK_SYSTEM,
     FeedbackQuestion,
 )
+from looktwice.clients.labelling.teachers.phrase_answers import RESPONSE_FORMAT, phrases_of
 from looktwice.clients.labelling.teachers.prompt import PROMPT_VERSION, SYSTEM, Part, Text, user_message
 from looktwice.clients.labelling.teachers.teacher import (
     Answer,

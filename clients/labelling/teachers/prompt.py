@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final, get_args
 
 from looktwice.clients.labelling.checks import MOST_WORDS, FailedCheck
-from looktwice.clients.labelling.teachers.facts import TABLE
+from looktwice.clients.labelling.teachers.phrase_answers import TABLE
 from looktwice.clients.labelling.teachers.teacher import Question
 from looktwice.model.driving.outcome import in_words
 from looktwice.model.driving.phrases import FARTHEST_M, ReflectionLanguage, Spot

@@ -1,9 +1,13 @@
 """Cars that drive by somebody's trajectories. A door: others import from here."""
 
+from looktwice.clients.metadrive.closed_loop.driver_table import (
+    driver_rows,
+    drives_to_json,
+    format_driver_rows,
+)
 from looktwice.clients.metadrive.closed_loop.drives import EXPERT, Drive, DriveConfig, drive, drive_store
 from looktwice.clients.metadrive.closed_loop.film import IMAGINED, Film
 from looktwice.clients.metadrive.closed_loop.pilots import ConstantVelocity, Pilot, Planned, ServicePilot
-from looktwice.clients.metadrive.closed_loop.table import driver_rows, drives_to_json, format_driver_rows
 from looktwice.clients.metadrive.drawing.rig import Rig
 from looktwice.clients.metadrive.world.maps import MapError
 

@@ -14,7 +14,7 @@ from looktwice.clients.metadrive.drawing.rig import RenderedPicture, Rig
 from looktwice.clients.metadrive.drawing.stage import Stage
 from looktwice.clients.metadrive.result_store import ResultStore
 from looktwice.clients.metadrive.scenes.annotate import route_ahead
-from looktwice.clients.metadrive.scenes.tracks import tracks_at
+from looktwice.clients.metadrive.scenes.simulated_tracks import tracks_at
 from looktwice.clients.metadrive.scenes.windows import PICTURE_STEPS, blank_clips, history_at
 from looktwice.clients.metadrive.world.actors import STEP_S, Body
 from looktwice.clients.metadrive.world.episode import EpisodeWorld, make_world

@@ -11,7 +11,7 @@ import numpy as np
 from looktwice.clients.metadrive import simulator
 from looktwice.clients.metadrive.drawing import map_meshes
 from looktwice.clients.metadrive.drawing.meshes import box
-from looktwice.clients.metadrive.drawing.models import GAIT_CYCLE_M, GAIT_POSES, model_meshes
+from looktwice.clients.metadrive.drawing.model_meshes import GAIT_CYCLE_M, GAIT_POSES, model_meshes
 from looktwice.clients.metadrive.drawing.rig import RenderedPicture, Rig
 from looktwice.clients.metadrive.world.actors import BODY_SIZES
 from looktwice.clients.metadrive.world.episode_log import (

@@ -1,6 +1,11 @@
 """What comes of plans, in the worlds of generated scenes. A door: others import from here."""
 
-from looktwice.clients.metadrive.outcomes.replay import EpisodeSetting, Moment, ReplayError, setting_of
+from looktwice.clients.metadrive.outcomes.replayed_worlds import (
+    EpisodeSetting,
+    Moment,
+    ReplayError,
+    setting_of,
+)
 from looktwice.clients.metadrive.outcomes.store import outcome_key, outcome_store
 from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes
 from looktwice.clients.metadrive.outcomes.workers import FollowTask, WorkerDied, follow_episodes

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from looktwice.clients.metadrive.outcomes.replay import EpisodeSetting
+from looktwice.clients.metadrive.outcomes.replayed_worlds import EpisodeSetting
 from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes
 from looktwice.clients.metadrive.outcomes.workers import FollowTask
 from looktwice.clients.metadrive.result_store import ResultStore

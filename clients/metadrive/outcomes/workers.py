@@ -10,7 +10,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from typing import Final
 
-from looktwice.clients.metadrive.outcomes.replay import (
+from looktwice.clients.metadrive.outcomes.replayed_worlds import (
     EpisodeSetting,
     Moment,
     ReplayError,

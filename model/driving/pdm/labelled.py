@@ -8,7 +8,7 @@ import numpy as np
 
 from looktwice.model.driving.agents import ROAD_USERS, Agent
 from looktwice.model.driving.lane_map import LaneArea
-from looktwice.model.driving.pdm.simulator import reference_poses, simulate
+from looktwice.model.driving.pdm.plan_simulator import reference_poses, simulate
 from looktwice.model.driving.pdm.world import (
     ACCELERATION,
     HEADING,

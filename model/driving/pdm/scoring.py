@@ -24,7 +24,7 @@ from looktwice.model.driving.pdm.lanes import (
     progress_m,
     red_light_steps,
 )
-from looktwice.model.driving.pdm.simulator import reference_poses, simulate
+from looktwice.model.driving.pdm.plan_simulator import reference_poses, simulate
 from looktwice.model.driving.pdm.world import (
     HEADING,
     LONG_STEPS,

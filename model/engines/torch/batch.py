@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from looktwice.model.engines.torch.memory import Memory, RowInput, SlotMapping
+from looktwice.model.engines.torch.kv_memory import Memory, RowInput, SlotMapping
 
 if TYPE_CHECKING:
     from looktwice.model.engines.torch.runner import PromptPrefill  # a runner needs torch, batches do not

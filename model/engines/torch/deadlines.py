@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import Final
 
-from looktwice.model.engines.requests import leads_to_reflection
+from looktwice.model.engines.engine_requests import leads_to_reflection
 from looktwice.model.families.family import Branch
 from looktwice.model.formats.cursor import Cursor
 

@@ -22,10 +22,10 @@ from looktwice.model.engines.engine import (
     RequestError,
     Started,
 )
+from looktwice.model.engines.engine_requests import begin, read
 from looktwice.model.engines.least_error import LeastError
 from looktwice.model.engines.logprobs import reported
 from looktwice.model.engines.reason_mask import reason_mask_of
-from looktwice.model.engines.requests import begin, read
 from looktwice.model.engines.torch.batch import Batch, Feed
 from looktwice.model.engines.torch.deadlines import LatencyModel, drafts_of
 from looktwice.model.engines.torch.drafter import Drafter

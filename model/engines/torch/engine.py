@@ -22,12 +22,12 @@ from looktwice.model.engines.engine import (
     PlanRequest,
     RequestError,
 )
+from looktwice.model.engines.engine_requests import painted, prompt_tokens
 from looktwice.model.engines.gate import Gate
-from looktwice.model.engines.pictures import PictureThreads
-from looktwice.model.engines.requests import painted, prompt_tokens
+from looktwice.model.engines.picture_threads import PictureThreads
 from looktwice.model.engines.torch.decoder import Counts, Decoder, Failed
-from looktwice.model.engines.torch.frames import Frames
 from looktwice.model.engines.torch.graphs import CudaGraph
+from looktwice.model.engines.torch.picture_cache import Frames
 from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.engines.torch.shortcuts import Shortcuts
 from looktwice.model.engines.torch.threads import FreeCores, fit_threads

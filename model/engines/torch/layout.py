@@ -16,7 +16,7 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from looktwice.model.engines.torch.memory import BoolArray, IntArray, SlotMapping, count_up
+from looktwice.model.engines.torch.kv_memory import BoolArray, IntArray, SlotMapping, count_up
 
 _SPAN: Final = 32
 """Slots that are attended to come in multiples of this: few sizes, few kernels."""

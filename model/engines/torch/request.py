@@ -18,7 +18,7 @@ from looktwice.model.engines.binding import Binding
 from looktwice.model.engines.engine import Controls, Draw, PlanRequest
 from looktwice.model.engines.least_error import LeastError
 from looktwice.model.engines.reason_mask import ReasonMask
-from looktwice.model.engines.torch.memory import Memory
+from looktwice.model.engines.torch.kv_memory import Memory
 from looktwice.model.engines.torch.rows import Row
 from looktwice.model.families.family import Family
 from looktwice.model.formats.cursor import Cursor

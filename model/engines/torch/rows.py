@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from looktwice.model.engines.engine import Event
+from looktwice.model.engines.engine_requests import drawn_as, leads_to_reflection, told
 from looktwice.model.engines.least_error import least_error
-from looktwice.model.engines.requests import drawn_as, leads_to_reflection, told
 from looktwice.model.engines.response import Response, SectionText
 from looktwice.model.engines.sampling import choose, probabilities, uniforms
 from looktwice.model.engines.torch.deadlines import TimeFor

@@ -14,19 +14,19 @@ from torch.nn import functional
 
 from looktwice.model.driving.scene import Scene
 from looktwice.model.driving.trajectory import FloatArray
-from looktwice.model.engines.torch.attention import (
+from looktwice.model.engines.torch.batch import Batch
+from looktwice.model.engines.torch.cached_attention import (
     DecodeAttention,
     OrderedDecode,
     OrderedPrefill,
     PrefillAttention,
     PrefillChunk,
 )
-from looktwice.model.engines.torch.batch import Batch
 from looktwice.model.engines.torch.clips import ClipCache
-from looktwice.model.engines.torch.frames import Frames
 from looktwice.model.engines.torch.graphs import Capture, Graphs, Numbers, Sizes
 from looktwice.model.engines.torch.head import AllowedHead
 from looktwice.model.engines.torch.kv import KvRows
+from looktwice.model.engines.torch.kv_memory import IntArray, Memory, SlotMapping
 from looktwice.model.engines.torch.layout import (
     RowPath,
     Shape,
@@ -38,9 +38,9 @@ from looktwice.model.engines.torch.layout import (
     reached,
     repeatable_bucket,
 )
-from looktwice.model.engines.torch.memory import IntArray, Memory, SlotMapping
 from looktwice.model.engines.torch.packed import Attention, PackedDecoder, Rotation
-from looktwice.model.engines.torch.vision import Encoded, VisionEncoder
+from looktwice.model.engines.torch.picture_cache import Frames
+from looktwice.model.engines.torch.vision_tokens import Encoded, VisionEncoder
 from looktwice.model.families.family import Attempt, Family, PictureRequest
 from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import CompiledFormat

@@ -20,9 +20,7 @@ from looktwice.model.engines.engine import (
     RequestError,
     Started,
 )
-from looktwice.model.engines.gate import Gate
-from looktwice.model.engines.pictures import PictureThreads
-from looktwice.model.engines.requests import (
+from looktwice.model.engines.engine_requests import (
     PictureCodes,
     begin,
     inputs_of,
@@ -31,7 +29,9 @@ from looktwice.model.engines.requests import (
     read,
     told,
 )
-from looktwice.model.engines.transformers.decoding import PlainDecoder, Prepared
+from looktwice.model.engines.gate import Gate
+from looktwice.model.engines.picture_threads import PictureThreads
+from looktwice.model.engines.transformers.plain_decoder import PlainDecoder, Prepared
 from looktwice.model.engines.warm_up import warm_up
 from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import CompiledFormat, Cursor

@@ -20,10 +20,10 @@ from looktwice.model.engines.engine import (
     PlanRequest,
     Started,
 )
+from looktwice.model.engines.engine_requests import leads_to_reflection, read, told
 from looktwice.model.engines.least_error import Expected, LeastError, least_error
 from looktwice.model.engines.logprobs import reported
 from looktwice.model.engines.reason_mask import ReasonMask
-from looktwice.model.engines.requests import leads_to_reflection, read, told
 from looktwice.model.engines.response import Response, SectionText
 from looktwice.model.families.family import Branch, Family
 from looktwice.model.formats.cursor import Allowed, Cursor

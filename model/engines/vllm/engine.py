@@ -16,10 +16,10 @@ import numpy as np
 
 from looktwice.model.driving.scene import Scene
 from looktwice.model.engines.engine import EngineError, EngineLoad, Event, PlanRequest, RequestError
+from looktwice.model.engines.engine_requests import begin, inputs_of, painted, prompt_tokens
 from looktwice.model.engines.least_error import LeastError
-from looktwice.model.engines.pictures import PictureThreads
+from looktwice.model.engines.picture_threads import PictureThreads
 from looktwice.model.engines.reason_mask import reason_mask_of
-from looktwice.model.engines.requests import begin, inputs_of, painted, prompt_tokens
 from looktwice.model.engines.vllm.decoding import Decoding, VllmPrompt
 from looktwice.model.engines.vllm.items import PLACEHOLDERS, items_of, kinds_of
 from looktwice.model.engines.warm_up import warm_up

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from looktwice.model.driving.tracks import MAX_TRACKS
 from looktwice.model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS
 from looktwice.model.network.inputs import ModelInputs
-from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.track_features import TRACK_FEATURES
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.network.vocabulary import HISTORY, ROUTE, TRACK, VIDEO_PAD
 
 CLIPS: Final = "video"

@@ -28,8 +28,8 @@ from looktwice.model.engines.vllm.items import CLIPS, PLACEHOLDERS, kinds_of
 from looktwice.model.network.encoders import HistoryEncoder, RouteEncoder
 from looktwice.model.network.intent import SketchBooks, SketchCodes, TrackReader
 from looktwice.model.network.resampler import SceneResampler
-from looktwice.model.network.settings import CONFIG_KEY, VlaSettings
 from looktwice.model.network.vision import normalised
+from looktwice.model.network.vla_settings import CONFIG_KEY, VlaSettings
 
 _ON_CPU: Final = frozenset({"video_grid_thw", "second_per_grid_ts"})
 """Arrays that no kernel reads."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from looktwice.model.families.trajectory_codes import TRAJECTORY_CODES
-from looktwice.model.formats.phrases import ReflectionPhrases
+from looktwice.model.formats.phrase_pieces import ReflectionPhrases
 from looktwice.model.formats.pieces import Choice, Format, FreeText, Literal, Option, Piece, Section, Sequence
 from looktwice.model.formats.plan_tracks import PlanTracks, RevisedPlan
 

@@ -31,8 +31,8 @@ from carla_driver_interface.protocol import (
 )
 
 from looktwice.clients.alpasim.driver import DriverConfig, Egodriver
+from looktwice.clients.alpasim.grpc_server import start_server
 from looktwice.clients.alpasim.messages import DebugFormat
-from looktwice.clients.alpasim.server import start_server
 from looktwice.clients.alpasim.session import CAMERAS
 from looktwice.clients.planner import AsyncPlannerClient
 from looktwice.service.operations.settings import Settings

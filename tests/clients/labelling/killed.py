@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
-from looktwice.clients.labelling.failures import (
+from looktwice.clients.labelling.feedback_set import (
     FeedbackSample,
     Inference,
     feedback_config,

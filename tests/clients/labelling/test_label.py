@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from looktwice.clients.labelling import outcomes
-from looktwice.clients.labelling.batch import BatchError, batch_requests, read_results, take_results
+from looktwice.clients.labelling import build_outcomes
+from looktwice.clients.labelling.batch_api import BatchError, batch_requests, read_results, take_results
 from looktwice.clients.labelling.checks import FailedCheck
 from looktwice.clients.labelling.export import DATASET, PARTS_FILE, reflections, right_plans, write_messages
 from looktwice.clients.labelling.label import LabelTask, config_of, jobs, labeller, predicted_plans, questions
@@ -110,7 +110,7 @@ def test_a_question_tells_what_its_plan_failed_at(ledger: Ledger, file: Path) ->
     assert {question.outcome for question in teacher.questions} == {None}
 
     rollout = ledger.the_run("rollout")
-    followed = ledger.run("outcomes", outcomes.config_of(rollout))
+    followed = ledger.run("outcomes", build_outcomes.config_of(rollout))
     holds = Outcome((), None, None, None, None, None, None, 60.0, 60.0)
     late = replace(holds, fails=("behind",), driven_m=42.0)
     for entry, first in zip(ledger.entries(rollout), (late, late, holds), strict=False):

@@ -10,6 +10,11 @@ import pytest
 from PIL import Image
 
 from looktwice.clients import wire
+from looktwice.clients.metadrive.closed_loop.driver_table import (
+    driver_rows,
+    drives_to_json,
+    format_driver_rows,
+)
 from looktwice.clients.metadrive.closed_loop.drives import (
     EXPERT,
     TAKE_OVER,
@@ -21,7 +26,6 @@ from looktwice.clients.metadrive.closed_loop.drives import (
 )
 from looktwice.clients.metadrive.closed_loop.film import IMAGINED, Film
 from looktwice.clients.metadrive.closed_loop.pilots import ConstantVelocity, Planned, ServicePilot
-from looktwice.clients.metadrive.closed_loop.table import driver_rows, drives_to_json, format_driver_rows
 from looktwice.clients.metadrive.drawing.rig import Rig
 from looktwice.clients.metadrive.world.episode import make_world, run_episode
 from looktwice.clients.metadrive.world.episode_log import EpisodeLog

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from looktwice.clients.metadrive.generation.blocks import GENERATOR_VERSION, GenerateConfig
-from looktwice.clients.metadrive.outcomes.replay import (
+from looktwice.clients.metadrive.outcomes.replayed_worlds import (
     EpisodeSetting,
     Moment,
     ReplayError,

@@ -16,7 +16,7 @@ from looktwice.clients.metadrive.closed_loop.drives import TAKE_OVER, DriveConfi
 from looktwice.clients.metadrive.closed_loop.pilots import Careless, ConstantVelocity, Planned
 from looktwice.clients.metadrive.generation.blocks import GenerateConfig, GenerationError, generate
 from looktwice.clients.metadrive.generation.own_states import own_states
-from looktwice.clients.metadrive.outcomes.replay import ReplayError, setting_of
+from looktwice.clients.metadrive.outcomes.replayed_worlds import ReplayError, setting_of
 from looktwice.model.driving.metrics import collides, leaves_road
 from looktwice.model.driving.scene import Scene
 from looktwice.model.driving.scene_store import read_scenes

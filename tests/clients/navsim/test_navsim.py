@@ -11,8 +11,8 @@ import pytest
 
 from looktwice.clients import wire
 from looktwice.clients.navsim.agent import NavsimMissing, NavsimPlanner, make_agent
+from looktwice.clients.navsim.agent_input import InputError
 from looktwice.clients.navsim.history import history_of
-from looktwice.clients.navsim.inputs import InputError
 from looktwice.clients.navsim.reprojection import seen_as
 from looktwice.clients.planner import PlannerClient
 from looktwice.model.driving.cameras import FRONT_CAMERAS

@@ -10,9 +10,9 @@ import numpy.typing as npt
 from torch import Tensor, nn
 
 from looktwice.model.engines.engine import Draw, PlanRequest
-from looktwice.model.engines.requests import decided, given_plans, read, said
+from looktwice.model.engines.engine_requests import decided, given_plans, read, said
 from looktwice.model.engines.sampling import probabilities
-from looktwice.model.engines.transformers.decoding import PlainDecoder
+from looktwice.model.engines.transformers.plain_decoder import PlainDecoder
 from looktwice.model.families.family import Family
 from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import CompiledFormat

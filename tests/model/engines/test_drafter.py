@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from looktwice.model.engines.requests import leads_to_reflection
+from looktwice.model.engines.engine_requests import leads_to_reflection
 from looktwice.model.engines.sampling import uniform
 from looktwice.model.engines.torch.drafter import _CONTEXTS, Drafter, _Ngrams, _Responses
 from looktwice.model.engines.torch.rows import Row

@@ -40,8 +40,8 @@ from looktwice.model.families.family import Attempt, Family
 from looktwice.model.families.registry import OURS, families_of, family_named
 from looktwice.model.formats.pieces import Format
 from looktwice.model.network.checkpoint import Loaded, load, with_visual_codes
-from looktwice.model.network.settings import NANO_SETTINGS, VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes
+from looktwice.model.network.vla_settings import NANO_SETTINGS, VlaSettings
 from tests.checkpoints import copy_picture_codes, made_up_tracks, noisy_scene, write_untrained
 from tests.model.engines.decoding import Again
 from tests.model.engines.integrity import check_integrity

@@ -22,7 +22,7 @@ from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.families.cf_vla.traj_only import TRAJ_ONLY
 from looktwice.model.formats.cursor import CompiledFormat, Token
-from looktwice.model.formats.phrases import Phrases
+from looktwice.model.formats.phrase_pieces import Phrases
 from looktwice.model.formats.pieces import Format, Section, Sequence
 from looktwice.model.formats.pieces import Literal as Text
 from looktwice.model.network.checkpoint import Loaded, load

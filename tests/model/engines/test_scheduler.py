@@ -3,7 +3,7 @@ from __future__ import annotations
 from typing import Any
 
 from looktwice.model.engines.engine import Controls, PlanRequest
-from looktwice.model.engines.torch.memory import Memory
+from looktwice.model.engines.torch.kv_memory import Memory
 from looktwice.model.engines.torch.request import Phase, Request
 from looktwice.model.engines.torch.scheduler import Scheduler
 from looktwice.model.families.cf_vla import CF_VLA

@@ -11,7 +11,7 @@ from looktwice.model.driving.images import encode_jpeg
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, Clip, Scene
 from looktwice.model.network.checkpoint import Loaded, create_nano, load
 from looktwice.model.network.codec import TrajectoryCodec
-from looktwice.model.network.corpus import nano_corpus
+from looktwice.model.network.nano_corpus import nano_corpus
 from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from tests.model.network.motions import made_up_motions
 

@@ -22,10 +22,10 @@ from looktwice.model.network.checkpoint import Loaded, create_nano, expand_stock
 from looktwice.model.network.codec import CODEC_FILE, TrajectoryCodec
 from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.repository import write_repository
-from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.small_planner import SmallPlanner, small_revision
 from looktwice.model.network.visual_codes import WEIGHTS_FILE as VISUAL_CODES_FILE
 from looktwice.model.network.visual_codes import VisualCodes
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from tests.model.network.conftest import made_up_scene
 from tests.model.network.stock import write_stock

@@ -7,9 +7,9 @@ import pytest
 
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, Scene, SceneError
 from looktwice.model.families.family import FamilyError
+from looktwice.model.network.chat_prompt import prompt_text
 from looktwice.model.network.inputs import InputBuilder, rotary_positions
-from looktwice.model.network.prompts import prompt_text
-from looktwice.model.network.settings import NANO_SETTINGS, SettingsError, VlaSettings
+from looktwice.model.network.vla_settings import NANO_SETTINGS, SettingsError, VlaSettings
 from looktwice.model.network.vocabulary import HISTORY, ROUTE, VIDEO_PAD, Vocabulary
 from tests.model.network.conftest import made_up_scene
 

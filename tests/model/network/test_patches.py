@@ -4,7 +4,7 @@ import numpy as np
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
 from looktwice.model.network.patches import PIXEL_MEAN, PIXEL_STD, normalise, patchify, resize
-from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla_settings import VlaSettings
 
 SETTINGS = VlaSettings(image_width=112, image_height=56)
 

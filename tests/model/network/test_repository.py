@@ -24,11 +24,11 @@ from looktwice.model.bundled import CHECKPOINT, CHECKPOINTS, SCENES
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.families.registry import family_named
 from looktwice.model.network.card import CheckpointError, read_card
+from looktwice.model.network.chat_prompt import chat_template, prompt_text
 from looktwice.model.network.checkpoint import load, read_parts
 from looktwice.model.network.processor import LookTwiceProcessor
-from looktwice.model.network.prompts import chat_template, prompt_text
 from looktwice.model.network.repository import write_repository
-from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.service.cli.commands import app
 from tests.checkpoints import write_untrained
 from tests.sockets import listening

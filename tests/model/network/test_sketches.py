@@ -13,9 +13,9 @@ from torch import Tensor
 from looktwice.model.network.checkpoint import Loaded, create_nano, load, save, with_sketches
 from looktwice.model.network.codec import DIMENSIONS, TrajectoryCodec
 from looktwice.model.network.intent import INTENT_TOKENS, SketchBooks, SketchCodes
-from looktwice.model.network.settings import NANO_SETTINGS, SettingsError, VlaSettings
 from looktwice.model.network.track_features import TRACK_FEATURES
 from looktwice.model.network.trajectory_head import spread_of
+from looktwice.model.network.vla_settings import NANO_SETTINGS, SettingsError, VlaSettings
 from looktwice.model.network.vocabulary import Vocabulary
 from tests.model.network.conftest import CODEC_SIZE
 from tests.model.network.motions import made_up_motions

@@ -12,7 +12,7 @@ from transformers import AutoTokenizer, PreTrainedTokenizerFast
 from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.families.cf_vla.corpus import random_plans
 from looktwice.model.network import vocabulary as words
-from looktwice.model.network.corpus import driving_sentences, nano_corpus
+from looktwice.model.network.nano_corpus import driving_sentences, nano_corpus
 from looktwice.model.network.vocabulary import (
     FUTURE_START,
     Vocabulary,

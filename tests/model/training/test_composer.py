@@ -20,8 +20,8 @@ from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.families.picture_codes import LEVELS, codes_of
 from looktwice.model.network.card import LOG_FILE
 from looktwice.model.network.checkpoint import load, save
-from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes, frame_of, load_visual_codes
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.training import written_pictures
 from looktwice.model.training.composer import (
     WRITTEN_FILE,

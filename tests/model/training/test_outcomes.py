@@ -25,7 +25,7 @@ from looktwice.model.families.family import Foreseen
 from looktwice.model.families.registry import family_named
 from looktwice.model.formats.replay import decisions
 from looktwice.model.network.checkpoint import load
-from looktwice.model.network.settings import NANO_SETTINGS
+from looktwice.model.network.vla_settings import NANO_SETTINGS
 from looktwice.model.training.batches import collate
 from looktwice.model.training.outcomes import OutcomeLearner
 from looktwice.model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_with

@@ -13,9 +13,9 @@ from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
 from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.own_plans import OwnPlans
+from looktwice.model.training.response_targets import Target
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.sampler import Item
-from looktwice.model.training.targets import Target
 from looktwice.model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
 

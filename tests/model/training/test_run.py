@@ -20,8 +20,8 @@ from looktwice.model.driving.reflection_store import LabelledReflection, write_r
 from looktwice.model.driving.scene import LabelledScene, NextFrame
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.network.checkpoint import load, with_sketches
-from looktwice.model.network.settings import NANO_SETTINGS
 from looktwice.model.network.visual_codes import VisualCodes
+from looktwice.model.network.vla_settings import NANO_SETTINGS
 from looktwice.model.training.recipes import NANO, Recipe
 from looktwice.model.training.run import RunSettings, last_whole_state, run
 from tests.checkpoints import write_untrained

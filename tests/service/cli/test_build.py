@@ -23,7 +23,7 @@ from looktwice.model.driving.reflection_store import read_reflections, write_ref
 from looktwice.model.driving.scene_store import read_scenes, write_scenes
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.network.checkpoint import read_config
-from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.service.cli.commands import app
 from looktwice.service.cli.stages import progress_bar
 from looktwice.service.operations.settings import Settings

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from looktwice.clients.labelling.build_outcomes import Followed
 from looktwice.clients.labelling.ledger import FILE, Ledger
-from looktwice.clients.labelling.outcomes import Followed
 from looktwice.model.bundled import CHECKPOINT, SCENES
 from looktwice.model.driving.reflection_store import read_reflections
 from looktwice.model.driving.scene_store import MANIFEST

@@ -14,8 +14,8 @@ from looktwice.model.driving.images import decode_image, encode_png
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, LabelledScene, NextFrame
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.network.checkpoint import load, save
-from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.service.cli.commands import app
 from tests.checkpoints import write_untrained
 from tests.model.driving.drives import agent, labelled_scene

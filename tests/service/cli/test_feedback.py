@@ -8,7 +8,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from looktwice.service.cli.commands import app
-from looktwice.service.routes.examples import example_feedback
+from looktwice.service.routes.request_examples import example_feedback
 
 RUNNER = CliRunner()
 

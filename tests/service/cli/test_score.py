@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from looktwice.model.bundled import SCENES
 from looktwice.service.cli.commands import app
-from looktwice.service.routes.examples import example_score
+from looktwice.service.routes.request_examples import example_score
 
 RUNNER = CliRunner()
 

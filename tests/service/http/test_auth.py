@@ -10,7 +10,7 @@ import pytest
 from looktwice.service.http.auth import OPEN_PATHS
 from looktwice.service.operations.keys import Keys, hashed, new_line
 from looktwice.service.operations.settings import Settings
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
 

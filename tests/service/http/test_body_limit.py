@@ -9,7 +9,7 @@ import httpx
 import pytest
 
 from looktwice.service.operations.settings import Settings
-from tests.service.http.test_errors import JSON, problem
+from tests.service.http.test_problem_documents import JSON, problem
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body, serve
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from looktwice.clients.wire import MSGPACK_MEDIA_TYPE, Problem
 from looktwice.service.http.documents import MAX_MEMBERS, MAX_OBJECTS, MAX_VALUES, read_json, read_msgpack
 from looktwice.service.problems import ProblemError
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body
 

@@ -10,7 +10,7 @@ from starlette.responses import Response
 from looktwice.model.engines.engine import EngineError
 from looktwice.service.http.idempotency import Idempotency
 from looktwice.service.operations.settings import Settings
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scripted_engine import KEEP_ON, ScriptedEngine
 from tests.service.serving import Served, body, serve
 

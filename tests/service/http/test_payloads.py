@@ -11,7 +11,7 @@ import pytest
 from looktwice.clients.wire import MSGPACK_MEDIA_TYPE, PlanResponse
 from looktwice.service.http import payloads
 from looktwice.service.http.body_limit import LARGE_BYTES
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body

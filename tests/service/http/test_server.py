@@ -38,7 +38,7 @@ from looktwice.service.operations.keys import new_line
 from looktwice.service.operations.settings import Settings
 from tests.checkpoints import noisy_scene
 from tests.model.driving.drives import labelled_scene
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body, serve
 from tests.sockets import free_port, listening

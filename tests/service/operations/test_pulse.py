@@ -14,7 +14,7 @@ import pytest
 from looktwice.model.engines.engine import EngineLoad
 from looktwice.service.http.documents import read_json
 from looktwice.service.operations.settings import Settings
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import body, serve
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from looktwice.clients.labelling.teachers.feedback import FeedbackQuestion
+from looktwice.clients.labelling.teachers.feedback_teacher import FeedbackQuestion
 from looktwice.clients.labelling.teachers.openai import OpenAiTeacher
 from looktwice.clients.labelling.teachers.teacher import Question
 from looktwice.clients.wire import Controls

@@ -11,7 +11,7 @@ from looktwice.model.engines.engine import EngineError
 from looktwice.service.operations.settings import Settings
 from looktwice.service.planning.events import Arrival
 from looktwice.service.planning.submitting import SceneSubmitter
-from tests.service.http.test_errors import BOMB, problem
+from tests.service.http.test_problem_documents import BOMB, problem
 from tests.service.scenes import scene
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, body

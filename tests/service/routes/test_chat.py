@@ -23,7 +23,7 @@ from looktwice.service.operations.keys import new_line
 from looktwice.service.operations.settings import Settings
 from looktwice.service.problems import INVALID_IMAGE, at
 from tests.checkpoints import made_up_tracks, noisy_scene
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body, serve

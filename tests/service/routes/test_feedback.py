@@ -19,9 +19,9 @@ from looktwice.clients.wire_feedback import FeedbackRequest, FeedbackResponse
 from looktwice.model.driving.pdm.feedback import Feedback, RuleFeedback, parse_feedback
 from looktwice.service.operations.no_model import NoModel
 from looktwice.service.operations.settings import Settings
-from looktwice.service.routes.examples import example_feedback, example_score
+from looktwice.service.routes.request_examples import example_feedback, example_score
 from tests.clients.labelling.builds import ChatServer
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.serving import Served, serve
 from tests.sockets import listening
 

@@ -34,13 +34,13 @@ from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.engines.torch.shortcuts import Shortcuts
 from looktwice.model.families.picture_codes import BLANK, LEVELS, levels_of
 from looktwice.model.network.checkpoint import load, save
-from looktwice.model.network.settings import VlaSettings
 from looktwice.model.network.visual_codes import VisualCodes, load_visual_codes
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.service.operations.no_model import NoModel
 from looktwice.service.operations.settings import Settings
-from looktwice.service.routes.examples import example_imagining
+from looktwice.service.routes.request_examples import example_imagining
 from tests.checkpoints import write_untrained
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scenes import scene
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import Served, body, serve

@@ -11,7 +11,7 @@ from looktwice.clients.wire import LabelResponse
 from looktwice.model.driving.outcome import in_words
 from looktwice.model.driving.plan import parse_plan
 from looktwice.service.operations.settings import Settings
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body, serve
 

@@ -15,7 +15,7 @@ from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import SceneError
 from looktwice.model.driving.trajectory import TEN_HZ_S
 from looktwice.model.engines.engine import EngineError, RequestError
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body

@@ -27,12 +27,12 @@ from looktwice.clients.wire_refine import DraftJudged, RefineRequest, RefineResp
 from looktwice.model.driving.pdm.feedback import Feedback, parse_feedback
 from looktwice.model.driving.scene import Track
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
-from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.service.operations.no_model import NoModel
 from looktwice.service.operations.settings import Settings
-from looktwice.service.routes.examples import example_refinement
+from looktwice.service.routes.request_examples import example_refinement
 from tests.checkpoints import write_untrained
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scenes import scene
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import Served, serve

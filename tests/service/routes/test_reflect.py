@@ -6,7 +6,7 @@ import pytest
 
 from looktwice.clients.wire import ReflectResponse
 from looktwice.model.driving.plan import parse_plan
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body
 

@@ -19,7 +19,7 @@ from looktwice.service.problems import ProblemError
 from looktwice.service.scenes import files
 from looktwice.service.scenes.bundled import BundledScenes, view
 from looktwice.service.scenes.files import scenes_of_file
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import ScriptedEngine
 from tests.service.serving import Served, serve

@@ -16,8 +16,8 @@ from looktwice.clients.planner import PlannerClient
 from looktwice.clients.wire_scores import ScoreRequest
 from looktwice.service.operations.no_model import NoModel
 from looktwice.service.operations.settings import Settings
-from looktwice.service.routes.examples import example_score
-from tests.service.http.test_errors import problem
+from looktwice.service.routes.request_examples import example_score
+from tests.service.http.test_problem_documents import problem
 from tests.service.serving import Served, body, serve
 from tests.waiting import until
 

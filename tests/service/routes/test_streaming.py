@@ -9,7 +9,7 @@ import pytest
 
 import looktwice.clients.wire as wire
 from looktwice.model.engines.engine import EngineError
-from tests.service.http.test_errors import problem
+from tests.service.http.test_problem_documents import problem
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, body
 

@@ -16,8 +16,8 @@ from starlette.responses import StreamingResponse
 from starlette.types import ASGIApp
 
 from looktwice.clients.labelling.checks import FailedCheck, check_reflection
-from looktwice.clients.labelling.teachers.facts import phrases_of
 from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
+from looktwice.clients.labelling.teachers.phrase_answers import phrases_of
 from looktwice.clients.labelling.teachers.teacher import (
     Answer,
     Question,

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from looktwice.model.driving.pdm.comfort import Version
+from looktwice.model.driving.pdm.plan_simulator import reference_poses, simulate
 from looktwice.model.driving.pdm.scoring import (
     COMFORT,
     EXTENDED_COMFORT,
@@ -19,7 +20,6 @@ from looktwice.model.driving.pdm.scoring import (
     Scores,
     score,
 )
-from looktwice.model.driving.pdm.simulator import reference_poses, simulate
 from tests.model.driving.pdm.frozen import FULL_STATES, NAMES, SCORE, STATE_STEPS, WORLDS
 from tests.model.driving.pdm.worlds import Case, case
 

@@ -44,7 +44,7 @@ from looktwice.model.formats.replay import decisions
 from looktwice.model.formats.text import parse
 from looktwice.model.network.card import CheckpointError
 from looktwice.model.network.checkpoint import load, read_parts
-from looktwice.model.network.settings import NANO_SETTINGS, VlaSettings
+from looktwice.model.network.vla_settings import NANO_SETTINGS, VlaSettings
 from looktwice.model.training.batches import collate
 from looktwice.model.training.learner import ResponseLearner
 from looktwice.model.training.rollouts import rollout

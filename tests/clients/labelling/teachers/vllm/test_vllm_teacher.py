@@ -36,7 +36,7 @@ from looktwice.clients.labelling.teachers.teacher import (
     TeacherError,
     ask,
 )
-from looktwice.model.network.corpus import nano_corpus
+from looktwice.model.network.nano_corpus import nano_corpus
 from looktwice.model.network.vocabulary import build_nano_tokenizer
 from looktwice.service.operations.settings import Settings
 from tests.clients.labelling.builds import GOOD

@@ -3,7 +3,7 @@ from __future__ import annotations
 from prometheus_client.openmetrics import parser as openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
-from looktwice.service.operations.metrics import LATENCY_BUCKETS_S
+from looktwice.service.operations.service_metrics import LATENCY_BUCKETS_S
 from tests.service.serving import Served, body
 
 

@@ -19,8 +19,8 @@ from looktwice.model.driving.trajectory import (
     constant_velocity,
 )
 from looktwice.model.engines.engine import Controls, Draw, DrawFinished, Event, PlanRequest
-from looktwice.model.evaluation.failures import MeasuredStage, evaluate_stage, formats_of, stage_variants
 from looktwice.model.evaluation.failures_report import FailuresReport, failures_report
+from looktwice.model.evaluation.stage_results import MeasuredStage, evaluate_stage, formats_of, stage_variants
 from looktwice.model.network.model_card import ModelCard
 from tests.model.evaluation.fakes import FakeEngine, draw_of
 from tests.model.evaluation.test_scores import braking_for_a_wall, cruising

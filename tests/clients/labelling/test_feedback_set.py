@@ -18,7 +18,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 from starlette.requests import ClientDisconnect
 
-from looktwice.clients.labelling.failures import (
+from looktwice.clients.labelling.feedback_set import (
     FeedbackSample,
     Inference,
     feedback_config,
@@ -29,7 +29,7 @@ from looktwice.clients.labelling.failures import (
     sampled,
 )
 from looktwice.clients.labelling.ledger import Ledger, StageRun
-from looktwice.clients.labelling.teachers.feedback import check_feedback, question_of
+from looktwice.clients.labelling.teachers.feedback_teacher import check_feedback, question_of
 from looktwice.clients.labelling.teachers.openai import OpenAiSettings, OpenAiTeacher
 from looktwice.model.driving.feedback_store import FeedbackFileError, read_feedback, write_feedback
 from looktwice.model.driving.pdm.feedback import Feedback

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from looktwice.model.driving.outcome import FailureName, Outcome
-from looktwice.model.evaluation.outcomes import FollowedDraw, outcome_table
 from looktwice.model.evaluation.perception import auc
+from looktwice.model.evaluation.second_looks import FollowedDraw, outcome_table
 
 
 def outcome(*fails: FailureName) -> Outcome:

@@ -134,7 +134,7 @@ def _navsim_seconds(repeats: int, folders: Sequence[Path], python: Path | None) 
     command = [
         str(python or sys.executable),
         "-m",
-        "looktwice.model.bench.scoring",
+        "looktwice.model.bench.scoring_speed",
         str(repeats),
         *map(str, folders),
     ]

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+from looktwice.model.bench.bench_run import BenchRow, Deadlines, PlannerLatency
 from looktwice.model.bench.roofline import Machine, PlanCost
-from looktwice.model.bench.run import BenchRow, Deadlines, PlannerLatency
 from looktwice.model.driving.columns import aligned, interval_cell
 
 

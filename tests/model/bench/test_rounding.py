@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from looktwice.model.bench.precision import measure
+from looktwice.model.bench.rounding import measure
 from tests.checkpoints import noisy_scene
 
 

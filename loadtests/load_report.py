@@ -7,7 +7,7 @@ from typing import Any
 
 from looktwice.loadtests.accounting import PERCENTILES, Latencies, Summary
 from looktwice.loadtests.exchange import BRANCHES, OUTCOMES
-from looktwice.loadtests.run import Result, Setup
+from looktwice.loadtests.load_run import Result, Setup
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from starlette.responses import Response
 from looktwice.clients.wire import PROBLEM_MEDIA_TYPE, Fault, Problem
 from looktwice.service.http.callers import CALLER_LEFT_STATUS, CallerLeft
 from looktwice.service.http.dialect import dialect_error, dialect_status, in_dialect
-from looktwice.service.operations.metrics import Metrics
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.problems import (
     BODY_TIMEOUT,
     BODY_TOO_LARGE,

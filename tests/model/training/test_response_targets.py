@@ -16,7 +16,7 @@ from looktwice.model.families.family import Counterfactual, Lesson
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.pieces import FormatError, Values
 from looktwice.model.formats.text import parse
-from looktwice.model.training.targets import make_target
+from looktwice.model.training.response_targets import make_target
 from tests.model.formats.vocabulary import ByteVocabulary
 
 VOCABULARY = ByteVocabulary()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from looktwice.model.families.registry import family_named
-from looktwice.model.network.settings import VlaSettings
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.network.vocabulary import (
     HISTORY,
     HISTORY_END,

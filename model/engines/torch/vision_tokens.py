@@ -13,7 +13,7 @@ from torch import Tensor
 
 from looktwice.model.driving.scene import Scene
 from looktwice.model.engines.torch.clips import ClipCache, digest
-from looktwice.model.engines.torch.frames import Frames
+from looktwice.model.engines.torch.picture_cache import Frames
 from looktwice.model.network.checkpoint import Loaded
 
 

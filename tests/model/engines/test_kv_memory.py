@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from looktwice.model.engines.torch.memory import Memory, Pool, RowInput
+from looktwice.model.engines.torch.kv_memory import Memory, Pool, RowInput
 
 
 def memory(rows: int, kv_length: int = 20) -> Memory:

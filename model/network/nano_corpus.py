@@ -13,8 +13,8 @@ from typing import Final
 from looktwice.model.driving.plan import TICKS, WORDS, format_tick
 from looktwice.model.driving.scene import CAMERAS
 from looktwice.model.families.registry import family_named
-from looktwice.model.network.prompts import SYSTEM, prompt_text
-from looktwice.model.network.settings import NANO_SETTINGS, VlaSettings
+from looktwice.model.network.chat_prompt import SYSTEM, prompt_text
+from looktwice.model.network.vla_settings import NANO_SETTINGS, VlaSettings
 
 _SLOTS: Final[dict[str, tuple[str, ...]]] = {
     "agent": (

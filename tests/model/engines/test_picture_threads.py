@@ -9,7 +9,7 @@ import pytest
 
 from looktwice.model.driving.images import ImageError, decode_image, encode_jpeg
 from looktwice.model.engines.engine import EngineError
-from looktwice.model.engines.pictures import LARGE_PIXELS, THREADS, PictureThreads
+from looktwice.model.engines.picture_threads import LARGE_PIXELS, THREADS, PictureThreads
 
 
 def test_work_runs_on_threads_of_its_own_and_tells_how_long_it_waits() -> None:

@@ -13,10 +13,10 @@ from transformers import DynamicCache
 
 from looktwice.model.engines.binding import Binding, binding_of
 from looktwice.model.engines.engine import PlanRequest
+from looktwice.model.engines.engine_requests import drawn_as, leads_to_reflection
 from looktwice.model.engines.least_error import LeastError, least_error
 from looktwice.model.engines.logprobs import reported
 from looktwice.model.engines.reason_mask import ReasonMask, reason_mask_of
-from looktwice.model.engines.requests import drawn_as, leads_to_reflection
 from looktwice.model.engines.response import Response, SectionText
 from looktwice.model.engines.sampling import choose, probabilities, uniform
 from looktwice.model.families.family import Family

@@ -6,12 +6,16 @@ import asyncio
 from typing import Final
 
 import looktwice.clients.wire_feedback as wire_feedback
-from looktwice.clients.labelling.teachers.feedback import FeedbackQuestion, FeedbackTeacher, ask_feedback
+from looktwice.clients.labelling.teachers.feedback_teacher import (
+    FeedbackQuestion,
+    FeedbackTeacher,
+    ask_feedback,
+)
 from looktwice.clients.labelling.teachers.teacher import ReflectionRefused
 from looktwice.clients.retries import with_retries
 from looktwice.clients.wire import TeacherName
 from looktwice.model.driving.pdm.feedback import Feedback
-from looktwice.service.operations.metrics import Metrics
+from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.problems import FEEDBACK_REFUSED, at
 from looktwice.service.scoring.rule_feedback import Given, sections_of
 from looktwice.service.teaching.asking import PATIENCE_S, asking

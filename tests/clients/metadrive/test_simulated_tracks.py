@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from looktwice.clients.metadrive.scenes.tracks import tracks_at
+from looktwice.clients.metadrive.scenes.simulated_tracks import tracks_at
 from looktwice.clients.metadrive.scenes.windows import _Moment
 from looktwice.clients.metadrive.world.episode import run_episode
 from looktwice.model.driving.tracks import tracks_of

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from looktwice.model.bench.scoring import measure, scene
+from looktwice.model.bench.scoring_speed import measure, scene
 from looktwice.model.driving.pdm.scoring import Others, score
 
 

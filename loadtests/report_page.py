@@ -15,8 +15,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullForma
 
 from looktwice.loadtests.accounting import PERCENTILES, Latencies, Summary
 from looktwice.loadtests.exchange import BRANCHES, OUTCOMES, Exchange
-from looktwice.loadtests.report import LoadReport, latency_rows
-from looktwice.loadtests.run import Result
+from looktwice.loadtests.load_report import LoadReport, latency_rows
+from looktwice.loadtests.load_run import Result
 
 _COLOURS: Final = {
     "direct": "#2b6cb0",

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from looktwice.model.bench.bench_report import BenchReport, Roofline
+from looktwice.model.bench.bench_run import BenchJob, BenchRow, can_do, run
 from looktwice.model.bench.contenders import SHORTCUTS
-from looktwice.model.bench.memory import peak_bytes
-from looktwice.model.bench.report import BenchReport, Roofline
+from looktwice.model.bench.process_memory import peak_bytes
 from looktwice.model.bench.roofline import Machine, PlanCost
-from looktwice.model.bench.run import BenchJob, BenchRow, can_do, run
 from looktwice.model.bench.workload import Workload
 from looktwice.model.bundled import SCENES
 from looktwice.model.engines.torch.shortcuts import Shortcuts
@@ -78,7 +78,7 @@ def test_memory_of_this_process_is_known() -> None:
 
 
 _PEAKS = """
-from looktwice.model.bench.memory import forget_peaks, peak_bytes
+from looktwice.model.bench.process_memory import forget_peaks, peak_bytes
 forget_peaks()
 before = peak_bytes()
 much = b"x" * (300 << 20)

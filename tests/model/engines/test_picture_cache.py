@@ -16,7 +16,7 @@ from looktwice.model.driving.images import ImageError
 from looktwice.model.driving.scene import Clip, Scene
 from looktwice.model.engines.engine import Controls, DrawFinished, PlanRequest
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
-from looktwice.model.engines.torch.frames import Frames
+from looktwice.model.engines.torch.picture_cache import Frames
 from looktwice.model.network.checkpoint import load
 from looktwice.model.network.inputs import InputBuilder
 from tests.checkpoints import noisy_scene

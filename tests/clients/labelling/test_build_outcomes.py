@@ -7,16 +7,16 @@ from typing import Any
 
 import pytest
 
-from looktwice.clients.labelling.export import held_plans
-from looktwice.clients.labelling.filtering import filtered_by_outcome, summary
-from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError
-from looktwice.clients.labelling.outcomes import (
+from looktwice.clients.labelling.build_outcomes import (
     Followed,
     config_of,
     followed_plans,
     plans_that_fail,
     plans_that_hold,
 )
+from looktwice.clients.labelling.export import held_plans
+from looktwice.clients.labelling.filtering import filtered_by_outcome, summary
+from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError
 from looktwice.model.driving.outcome import FailureName, Outcome
 from tests.clients.labelling.builds import GO_FASTER, rolled_out, rollout_record
 from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN

@@ -21,7 +21,7 @@ from looktwice.clients.answers import PlannedDraw
 from looktwice.clients.labelling.ledger import Entry, Ledger, Record, StageRun
 from looktwice.clients.labelling.pipeline import CannotBeDone, Job, StageStopped
 from looktwice.clients.labelling.rollout import key_of, of_the_service
-from looktwice.clients.labelling.teachers.feedback import FeedbackTeacher, ask_feedback, question_of
+from looktwice.clients.labelling.teachers.feedback_teacher import FeedbackTeacher, ask_feedback, question_of
 from looktwice.clients.labelling.teachers.teacher import (
     ATTEMPTS,
     ReflectionRefused,

@@ -13,9 +13,9 @@ import looktwice.clients.wire_scores as wire_scores
 from looktwice.model.driving.pdm.failures import failures_of
 from looktwice.model.driving.pdm.geometry import crosses_itself
 from looktwice.model.driving.pdm.labelled import first_speed_mps, plans_of, world_of
+from looktwice.model.driving.pdm.plan_simulator import reference_poses, simulate
 from looktwice.model.driving.pdm.profiles import SolveError
 from looktwice.model.driving.pdm.scoring import Others, Scores, score
-from looktwice.model.driving.pdm.simulator import reference_poses, simulate
 from looktwice.model.driving.pdm.world import (
     ACCELERATION,
     ACCELERATION_Y,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from looktwice.clients.summaries.short_term import format_short_term, short_term_figures
+from looktwice.clients.summaries.short_term_errors import format_short_term, short_term_figures
 from looktwice.model.driving.agents import Agent
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import SceneFileError, write_scenes

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from looktwice.model.engines.torch.attention import DecodeAttention
+from looktwice.model.engines.torch.cached_attention import DecodeAttention
 from looktwice.model.engines.torch.kv import KvRows
+from looktwice.model.engines.torch.kv_memory import Memory, RowInput, SlotMapping
 from looktwice.model.engines.torch.layout import Layout, Part, Shape, bucket, bucketed_layout, compact_layout
-from looktwice.model.engines.torch.memory import Memory, RowInput, SlotMapping
 
 PROMPTS = (5, 3, 9)
 HEADS, GROUPS, WIDTH = 4, 2, 8
