@@ -186,10 +186,10 @@ async def _sends_slowly(target: ServiceTarget, call: Call, seconds: float) -> Co
 
 
 async def _ending(
-    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, patience_s: float = _DRIP_S
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, timeout_s: float = _DRIP_S
 ) -> Counter[str]:
     try:
-        line = await asyncio.wait_for(reader.readline(), patience_s)
+        line = await asyncio.wait_for(reader.readline(), timeout_s)
         said = line.split()
         end = said[1].decode() if len(said) > 1 and said[1].isdigit() else "closed"
     except TimeoutError:

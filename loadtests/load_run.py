@@ -8,7 +8,7 @@ from typing import Any
 
 from looktwice.loadtests.accounting import Summary, faults, summarise
 from looktwice.loadtests.exchange import Exchange
-from looktwice.loadtests.loads import Crew, Load, LoadPhase, Window, windows
+from looktwice.loadtests.loads import Load, LoadPhase, Window, WorkerPool, windows
 from looktwice.loadtests.mix import Mix
 from looktwice.loadtests.sending import ServiceTarget
 from looktwice.model.driving.scene import LabelledScene
@@ -126,7 +126,7 @@ def run(
     Raises:
         WorkerDied: a process of the generator did.
     """
-    with Crew(load, setup.target, setup.workers) as crew:
+    with WorkerPool(load, setup.target, setup.workers) as crew:
         starts_at = crew.begin()
         if meanwhile is not None:
             meanwhile(starts_at)

@@ -185,12 +185,12 @@ class GeneratorDied(RuntimeError):
     """A process of the generator ended before its load did."""
 
 
-class Crew:
+class WorkerPool:
     """Worker processes for one run.
 
     ::
 
-        with Crew(load, target, workers=2) as crew:
+        with WorkerPool(load, target, workers=2) as crew:
             starts_at = crew.begin()   # time.monotonic() of the run's start
             exchanges = crew.finish()
     """
@@ -206,7 +206,7 @@ class Crew:
             theirs.close()
             self._crew.append((process, ours))
 
-    def __enter__(self) -> Crew:
+    def __enter__(self) -> WorkerPool:
         return self
 
     def __exit__(self, *_: object) -> None:

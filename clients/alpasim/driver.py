@@ -179,11 +179,11 @@ class Egodriver:
         debug = _debug(result, chosen, controls, 1000 * (time.perf_counter() - began_s))
         return Driven(moment, trajectories, chosen, debug | {"seen": session.counts()})
 
-    async def drain(self, patience_s: float) -> None:
+    async def drain(self, timeout_s: float) -> None:
         """Take no new sessions, and wait until the open ones are closed, at most so long."""
         self._draining = True
         try:
-            await asyncio.wait_for(self._empty.wait(), patience_s)
+            await asyncio.wait_for(self._empty.wait(), timeout_s)
         except TimeoutError:
             return
 

@@ -34,7 +34,7 @@ from looktwice.model.driving.feedback_store import FeedbackRow
 from looktwice.model.driving.hashing import hash_of, judged_hash
 from looktwice.model.driving.pdm.comfort import Version
 from looktwice.model.driving.pdm.judged import THRESHOLD, JudgedPlan
-from looktwice.model.driving.pdm.judging import Said, judged_in_scene
+from looktwice.model.driving.pdm.judging import PlanExplanation, judged_in_scene
 from looktwice.model.driving.pdm.labelled import plans_of
 from looktwice.model.driving.pdm.profiles import SolveError
 from looktwice.model.driving.pdm.rule_teacher import NAME, REVISION, feedback_on
@@ -156,7 +156,7 @@ def judge(
 ) -> list[JudgedPlan]:
     """Responses of a scene with facts, measured against the expert; raises `CannotBeDone`."""
     plans = np.array([draw["trajectory"] for draw in draws], np.float64)
-    said = [Said(draw["plan"], draw["think"]) for draw in draws]
+    said = [PlanExplanation(draw["plan"], draw["think"]) for draw in draws]
     try:
         return judged_in_scene(labelled, plans, version, threshold, said)
     except (ScoreError, SolveError) as error:

@@ -16,7 +16,7 @@ MEASURED = "measured"
 
 
 def poisson(setup: Setup) -> Result:
-    """Offer the mix at a steady rate; raises `WorkerDied`, `ValueError`."""
+    """Offer the mix at a steady rate; raises `GeneratorDied`, `ValueError`."""
     ran = run_steady(setup)
     overall = ran.summary(setup.goal_s, MEASURED)
     return Result("poisson", overall, {}, tuple(check(overall, setup)), exchanges=ran.exchanges)
@@ -41,7 +41,7 @@ UNLOADED, BURST, AFTER = "unloaded", "burst", "after"
 
 
 def burst(setup: Setup, factor: float, burst_s: float) -> Result:
-    """Offer ``factor`` times the rate for ``burst_s``; raises `WorkerDied`, `ValueError`."""
+    """Offer ``factor`` times the rate for ``burst_s``; raises `GeneratorDied`, `ValueError`."""
     phases = [
         LoadPhase(WARM_UP, setup.warm_up_s, setup.rate_rps),
         LoadPhase(UNLOADED, setup.seconds, setup.rate_rps),

@@ -86,7 +86,7 @@ class Point:
 
 
 def sweep(setup: Setup, search: KneeSearch) -> Result:
-    """Find the highest rate that is sustained; raises `WorkerDied`, `ValueError`."""
+    """Find the highest rate that is sustained; raises `GeneratorDied`, `ValueError`."""
     setup.tell(f"writing {setup.distinct} requests")
     calls = tuple(make_calls(setup.scenes, setup.mix.kinds(setup.distinct, setup.seed), setup.seed))
     points: dict[float, Point] = {}

@@ -11,7 +11,7 @@ from looktwice.model.engines.torch.threads import CpuTimes, cpu_times
 _LOOK_S: Final = 0.25
 _IDLE: Final = 0.1
 """Of a core, that a machine at rest uses."""
-_PATIENCE_S: Final = 3.0
+_MAX_WAIT_S: Final = 3.0
 
 
 def wait_until_quiet(
@@ -26,7 +26,7 @@ def wait_until_quiet(
         Whether they did: not where the kernel does not tell, nor where they went on for 3 s.
     """
     before = read()
-    for _ in range(round(_PATIENCE_S / _LOOK_S)):
+    for _ in range(round(_MAX_WAIT_S / _LOOK_S)):
         if before is None:
             return False
         sleep(_LOOK_S)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 from looktwice.model.driving.claims import claims, unfounded
-from looktwice.model.driving.direction import agrees, asked_changes
+from looktwice.model.driving.direction import agrees, requested_changes
 from looktwice.model.driving.labeller import label_plan
 from looktwice.model.driving.phrases import agrees as changes_as_stated
 from looktwice.model.driving.phrases import facts_of
@@ -107,7 +107,7 @@ def reason_and_change(thinking: str, plan: Plan, revised: Plan) -> bool | None:
     if (facts := facts_of(thinking)) is not None:
         return changes_as_stated(facts, plan, revised)
     if plan == revised:
-        return False if asked_changes(thinking) else None
+        return False if requested_changes(thinking) else None
     return agrees(thinking, plan, revised)
 
 

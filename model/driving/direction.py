@@ -196,7 +196,7 @@ def needed(before: Plan, change: Change) -> int:
     return done(before, change) + MIN_TICKS
 
 
-def told_changes(text: str) -> dict[Change, int]:
+def stated_changes(text: str) -> dict[Change, int]:
     """How often a text speaks for each change, less how often it speaks against it."""
     told = dict.fromkeys(_WORDS, 0)
     plain = " ".join(text.casefold().replace("-", " ").split())
@@ -211,7 +211,7 @@ def told_changes(text: str) -> dict[Change, int]:
     return told
 
 
-def asked_changes(text: str) -> set[Change]:
+def requested_changes(text: str) -> set[Change]:
     """What a text asks for in so many words: "I should …", "so …", and sentences that begin with the verb."""
     found: set[Change] = set()
     plain = " ".join(text.casefold().replace("-", " ").split())
@@ -236,10 +236,10 @@ def agrees(text: str, before: Plan, after: Plan) -> bool:
     Nor may it speak against one. Speaking against the opposite of a change is speaking for it. What a text
     only sees ("the road bends left") it does not ask for.
     """
-    told, wanted = told_changes(text), wanted_changes(before, after)
+    told, wanted = stated_changes(text), wanted_changes(before, after)
     about = {each for changes in wanted for change in changes for each in (change, *_OPPOSITES[change])}
     about |= {_ALIKE[change] for change in about if change in _ALIKE} | _done_in(after)
-    if asked_changes(text) - about:
+    if requested_changes(text) - about:
         return False
     spoken = False
     for changes in wanted:

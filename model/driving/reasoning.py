@@ -21,7 +21,7 @@ from looktwice.model.driving.lane_graph import LaneGraph, Way
 from looktwice.model.driving.lead import LANE_HALF_WIDTH_M
 from looktwice.model.driving.phrases import Side, State
 from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, LabelledScene
-from looktwice.model.driving.seen import SLOWER_BY_MS, STANDING_MS, told_m
+from looktwice.model.driving.seen import SLOWER_BY_MS, STANDING_MS, estimated_m
 from looktwice.model.driving.sentences import EDGE_FARTHEST_M, EDGE_STEP_M
 from looktwice.model.driving.thoughts import (
     Beside,
@@ -95,7 +95,7 @@ def thoughts_of(labelled: LabelledScene) -> Thoughts | None:
     known = {id(each.agent) for each in (leader, merging) if each is not None}
     return Thoughts(
         edges=edges_of(labelled.drivable),
-        leader=None if leader is None else Leader(_state(leader, speed_ms), told_m(leader.gap_m)),
+        leader=None if leader is None else Leader(_state(leader, speed_ms), estimated_m(leader.gap_m)),
         merging=None if merging is None else Merging(_side(merging.left_m), _merges_at(merging)),
         crossing=_crossing([each for each in placed if id(each.agent) not in known], way, speed_ms),
         road=_road(graph, way),
@@ -246,7 +246,7 @@ def _crosses(each: _Placed, way: Way, speed_ms: float) -> tuple[float, Crossing]
         meets_s = each.gap_m / (speed_ms - each.along_ms)
         if meets_s > FORESIGHT_S:
             return None
-        return meets_s, Crossing(kind, "oncoming", told_m(each.gap_m), first=False)
+        return meets_s, Crossing(kind, "oncoming", estimated_m(each.gap_m), first=False)
     future = each.agent.future[:, :2].astype(np.float64)
     there = np.isfinite(future[:, 0])
     if not there.any():
@@ -263,14 +263,14 @@ def _crosses(each: _Placed, way: Way, speed_ms: float) -> tuple[float, Crossing]
     ahead_m = max(0.0, float(along_m[first]) - EGO_LENGTH_M / 2)
     origin: Origin = _side(each.left_m)
     before = bool(there_s[first] < ours_s[first])
-    return float(there_s[first]), Crossing(kind, origin, told_m(ahead_m), before)
+    return float(there_s[first]), Crossing(kind, origin, estimated_m(ahead_m), before)
 
 
 def _road(graph: LaneGraph, way: Way) -> Road:
     bend, bend_m = bend_along(way.ahead)
     sides = beside_of(list(graph.lines))
     beside: Beside = "none" if not sides else "both" if len(sides) == 2 else min(sides)
-    return Road(bend, None if bend is None else told_m(bend_m), beside)
+    return Road(bend, None if bend is None else estimated_m(bend_m), beside)
 
 
 def _obstacle(placed: Iterable[_Placed]) -> Obstacle | None:
@@ -279,7 +279,7 @@ def _obstacle(placed: Iterable[_Placed]) -> Obstacle | None:
         kind = kinds.get(each.track.kind)
         still = abs(each.track.speed_ms) < STANDING_MS
         if kind is not None and still and each.in_lane and each.along_m > 0 and each.gap_m < LEADS_WITHIN_M:
-            return Obstacle(kind, told_m(each.gap_m))
+            return Obstacle(kind, estimated_m(each.gap_m))
     return None
 
 
@@ -288,4 +288,4 @@ def _side(left_m: float) -> Side:
 
 
 def _merges_at(merging: _Placed) -> int:
-    return 0 if merging.gap_m < BESIDE_M else told_m(merging.gap_m)
+    return 0 if merging.gap_m < BESIDE_M else estimated_m(merging.gap_m)

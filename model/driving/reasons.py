@@ -27,7 +27,15 @@ from looktwice.model.driving.phrases import (
     Straight,
     Thing,
 )
-from looktwice.model.driving.seen import LANES, SLOWER_BY_MS, STANDING_MS, is_clear, spot_of, state_of, told_m
+from looktwice.model.driving.seen import (
+    LANES,
+    SLOWER_BY_MS,
+    STANDING_MS,
+    estimated_m,
+    is_clear,
+    spot_of,
+    state_of,
+)
 from looktwice.model.driving.tracks import Track
 from looktwice.model.driving.trajectory import FloatArray, present_speed
 from looktwice.model.driving.view import Place, Sight, View, bend_of, view_along
@@ -192,11 +200,11 @@ def _holds_up(sight: Sight, view: View) -> bool:
 
 
 def _thing(sight: Sight, view: View) -> Thing:
-    return Thing(sight.kind, spot_of(sight), told_m(sight.ahead_m), state_of(sight, view))
+    return Thing(sight.kind, spot_of(sight), estimated_m(sight.ahead_m), state_of(sight, view))
 
 
 def _bend(side: Side, view: View) -> Bend:
-    return Bend(side, told_m(view.bend_m) or None)
+    return Bend(side, estimated_m(view.bend_m) or None)
 
 
 def _road(told: Mapping[str, float]) -> Array:

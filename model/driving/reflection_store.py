@@ -35,7 +35,7 @@ class LabelledReflection:
         reflection: a teacher's paragraph; empty where the plan is right and is to be acted on.
         expert_plan: what it leads to: the expert's plan, of which a reflection in phrases takes over the
             tracks that it speaks of.
-        judged: whether it is known that the plan deserves a second look, or none; see `Reflection`.
+        judged: whether it is known that the plan deserves a second look, or none; see `Counterfactual`.
         key: of the label in the ledger it comes from.
         model, model_revision: who planned.
         teacher, teacher_revision: who wrote; empty where nobody did.

@@ -43,8 +43,8 @@ def shown(cue: Cue, view: View) -> bool:
                 and _moves(sight, state, view)
                 for sight in view.sights
             )
-        case Bend(side, told_m):
-            return view.bend == side and is_near(told_m, view.bend_m)
+        case Bend(side, estimated_m):
+            return view.bend == side and is_near(estimated_m, view.bend_m)
         case Junction(side):
             return side in view.turns
         case Room(side):
@@ -70,7 +70,7 @@ def is_clear(view: View, place: Place) -> bool:
     return not any(sight.place == place and sight.ahead_m < CLEAR_WITHIN_M for sight in view.sights)
 
 
-def told_m(metres: float) -> int:
+def estimated_m(metres: float) -> int:
     """A distance as one can estimate it, in steps of `STEP_M`."""
     return min(FARTHEST_M, STEP_M * round(metres / STEP_M))
 

@@ -23,8 +23,8 @@ from looktwice.model.engines.reason_mask import ReasonMask
 from looktwice.model.engines.response import Response, SectionText
 from looktwice.model.families.family import Attempt, Branch, Family, PictureRequest
 from looktwice.model.formats.cursor import CompiledFormat, Cursor
+from looktwice.model.formats.fixed import FixedValues
 from looktwice.model.formats.pieces import NOTHING, FormatError
-from looktwice.model.formats.said import Said
 from looktwice.model.formats.text import parse
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.model_card import ModelCard
@@ -40,7 +40,7 @@ PictureCodes: TypeAlias = tuple[int, ...] | None
 """Those of a picture that is expected, or None."""
 
 
-def begin(
+def start_cursor(
     request: PlanRequest,
     card: ModelCard,
     families: Mapping[str, Family],
@@ -67,7 +67,7 @@ def begin(
     picks = decided(request, family)
     try:
         start = formats[request.format].start(
-            given_plans(request, family), picks, said(request, family, expected)
+            given_plans(request, family), picks, fixed_values(request, family, expected)
         )
     except FormatError as error:
         raise RequestError(f"prefill: {error}") from error
@@ -98,13 +98,13 @@ def decided(request: PlanRequest, family: Family) -> dict[str, str]:
     return {}
 
 
-def said(request: PlanRequest, family: Family, expected: PictureCodes) -> Said:
+def fixed_values(request: PlanRequest, family: Family, expected: PictureCodes) -> FixedValues:
     """What sections say that is decided beforehand."""
     controls = request.controls
     thoughts = family.unthought if controls.thinking == "never" else {}
     if family.imagination is None or controls.imagine == "never":
         return thoughts
-    return {**family.imagination.said(expected, controls.motion, controls.picture), **thoughts}
+    return {**family.imagination.fixed_values(expected, controls.motion, controls.picture), **thoughts}
 
 
 def drawn_as(request: PlanRequest, family: Family, cursor: Cursor, draws: Sequence[int]) -> Sequence[int]:
@@ -126,7 +126,7 @@ def leads_to_reflection(branch: Branch, cursor: Cursor, token: int) -> bool:
     return branch.reflecting in cursor.option_texts(token)
 
 
-def told(
+def events_of(
     request: PlanRequest,
     family: Family,
     response: Response,
@@ -143,11 +143,13 @@ def told(
         draws: their indices.
         vocabulary: of the checkpoint.
     """
-    said, indices = NOTHING, list(draws)
+    values, indices = NOTHING, list(draws)
     if request.live and finished:
-        said = response.values(vocabulary, given_plans(request, family))
+        values = response.values(vocabulary, given_plans(request, family))
     events: list[Event] = [
-        SectionFinished(index, *section, said.all(section.name)) for section in finished for index in indices
+        SectionFinished(index, *section, values.all(section.name))
+        for section in finished
+        for index in indices
     ]
     if request.live and (new := response.new_text(vocabulary)):
         events += [TextWritten(index, *new) for index in indices]

@@ -18,6 +18,7 @@ from looktwice.model.families.prompts import Attempt as Attempt
 from looktwice.model.families.prompts import PictureRequest as PictureRequest
 from looktwice.model.families.prompts import Situation as Situation
 from looktwice.model.families.prompts import TextInputs as TextInputs
+from looktwice.model.formats.fixed import Decided, FixedValues, with_fixed
 from looktwice.model.formats.pieces import (
     Format,
     FormatError,
@@ -31,7 +32,6 @@ from looktwice.model.formats.pieces import (
     walk,
     with_picks,
 )
-from looktwice.model.formats.said import Decided, Said, with_said
 
 
 class FamilyError(ValueError):
@@ -95,12 +95,12 @@ class Imagination:
         """What stands up to the picture, and the picture; the choice has a section of its name."""
         return frozenset((self.perception, self.prediction, self.name, self.section))
 
-    def said(
+    def fixed_values(
         self,
         expected: tuple[int, ...] | None,
         motion: Motion | None = None,
         picture: tuple[int, ...] | None = None,
-    ) -> Said:
+    ) -> FixedValues:
         """What is decided beforehand.
 
         Args:
@@ -341,7 +341,7 @@ class Family:
     dialects: Mapping[ReflectionLanguage, Format] = field(default_factory=dict)
     refines: bool = False
     imagination: Imagination | None = None
-    unthought: Said = field(default_factory=dict)
+    unthought: FixedValues = field(default_factory=dict)
     actions: Actions | None = None
     rewards: Callable[[FloatArray, Reading], Mapping[str, float]] | None = None
     corpus: Corpus | None = None
@@ -371,7 +371,7 @@ class Family:
         if imagination is not None:
             self._check_imagination(imagination)
         try:
-            with_said(self.format.body, self.unthought)
+            with_fixed(self.format.body, self.unthought)
         except FormatError as error:
             raise FamilyError(f"family {self.name!r}: unthought: {error}") from None
 

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from looktwice.model.driving.plan import Plan
+from looktwice.model.formats.fixed import FixedValues, with_fixed
 from looktwice.model.formats.free_text import BEGUN, Alphabet, TextRules, TextState
 from looktwice.model.formats.lengths import longest
 from looktwice.model.formats.pieces import (
@@ -35,7 +36,6 @@ from looktwice.model.formats.pieces import (
     with_picks,
 )
 from looktwice.model.formats.plan_tracks import with_given
-from looktwice.model.formats.said import Said, with_said
 from looktwice.model.formats.starts import check, first_bytes
 from looktwice.model.formats.trie import Node, build_trie
 from looktwice.model.formats.writing import Token as Token
@@ -152,22 +152,22 @@ class CompiledFormat:
         self,
         given: Mapping[str, Plan] | None = None,
         picks: Mapping[str, str] | None = None,
-        said: Said | None = None,
+        fixed: FixedValues | None = None,
     ) -> Cursor:
         """A cursor at the beginning; plans of the sections in ``given`` are forced, equal neighbours joined.
 
         Args:
             given: plans by section.
             picks: by the name of a choice, the text of the option that is to be taken.
-            said: what further sections say; see `with_said`.
+            fixed: what further sections say; see `with_fixed`.
 
         Raises:
             FormatError: ``given`` names a section without a plan, or a plan beyond the format; or ``picks`` a
-                choice or an option that there is not; or ``said`` what a section cannot say.
+                choice or an option that there is not; or ``fixed`` what a section cannot say.
         """
         body = self.body(given)
         body = with_picks(body, picks) if picks else body
-        return self._enter((with_said(body, said) if said else body, "", None), None)
+        return self._enter((with_fixed(body, fixed) if fixed else body, "", None), None)
 
     def body(self, given: Mapping[str, Plan] | None = None) -> Piece:
         """The format's declaration, with the plans of the sections in ``given`` forced; see `start`."""

@@ -49,7 +49,7 @@ def longest(compiled: CompiledFormat, piece: Piece) -> int:
 
 
 def _longest_line(compiled: CompiledFormat, group: Group) -> int:
-    """Tokens of the longest meta-action of a group, all its pieces as `Track` writes them."""
+    """Tokens of the longest meta-action of a group, all its pieces as `TrackRest` writes them."""
     starts = max(len(compiled.literal(f"  - {format_tick(tick)}s-")) for tick in range(TICKS))
     ends = max(len(compiled.literal(format_tick(tick))) for tick in range(1, TICKS + 1))
     words = max(len(compiled.literal(f" {word}")) for word in WORDS[group])

@@ -36,7 +36,7 @@ def write_card(folder: Path, settings: VlaSettings, parameters: int, details: Ma
     (folder / CARD_FILE).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
 
 
-def write_about(folder: Path, settings: VlaSettings, details: Mapping[str, Any]) -> dict[str, Any]:
+def update_card(folder: Path, settings: VlaSettings, details: Mapping[str, Any]) -> dict[str, Any]:
     """Renew a card's name, formats and revision, add to what it tells beside the weights, and return it.
 
     Raises:

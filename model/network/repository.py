@@ -17,7 +17,7 @@ from looktwice.model.families.family import Family
 from looktwice.model.families.registry import family_named
 from looktwice.model.families.trajectory_codes import CODES, TRAJECTORY
 from looktwice.model.formats.pieces import Codes, walk
-from looktwice.model.network.card import CheckpointError, read_card, write_about
+from looktwice.model.network.card import CheckpointError, read_card, update_card
 from looktwice.model.network.chat_prompt import chat_template
 from looktwice.model.network.processor import LookTwiceProcessor, processor_config
 from looktwice.model.network.vla import LookTwiceVla
@@ -69,7 +69,7 @@ def write_repository(
         raise CheckpointError(f"{folder} does not write {asked}: it writes {', '.join(settings.formats)}")
     settings = replace(settings, name=name or settings.name, formats=kept)
     config[CONFIG_KEY] |= {"name": settings.name, "formats": list(kept)}
-    card = write_about(folder, settings, {} if figures is None else {"figures": dict(figures)})
+    card = update_card(folder, settings, {} if figures is None else {"figures": dict(figures)})
     config["auto_map"] = {auto: f"{_MODEL_CODE}.{LookTwiceVla.__name__}" for auto in _AUTO_MODELS}
     _write(path, json.dumps(config, indent=2, sort_keys=True))
     _write(folder / "processor_config.json", json.dumps(processor_config(settings), indent=2, sort_keys=True))

@@ -15,19 +15,19 @@ from looktwice.model.training.examples import Examples
 from looktwice.model.training.reflections import places_of, plain
 
 
-class AttemptsOn(NamedTuple):
+class PlacedAttempts(NamedTuple):
     """Attempts, and the place of the example that each is on, int64 [m]."""
 
     examples: npt.NDArray[np.int64]
     attempts: list[JudgedAttempt]
 
 
-def attempts_on(
+def place_attempts(
     examples: Examples,
     rows: Iterable[FeedbackRow],
     times_s: Sequence[float],
     taught: npt.NDArray[np.bool_],
-) -> AttemptsOn:
+) -> PlacedAttempts:
     """Answers with their feedback, in plain punctuation, with the examples of their scenes.
 
     Wrong answers are taught by the expert's response, so those in scenes that tell none are left out.
@@ -44,7 +44,7 @@ def attempts_on(
     told = list(rows)
     places = places_of(examples, (row.scene_id for row in told), "feedback")
     kept = [number for number, row in enumerate(told) if row.correct or taught[places[number]]]
-    return AttemptsOn(places[kept], [_attempt(told[number], times_s) for number in kept])
+    return PlacedAttempts(places[kept], [_attempt(told[number], times_s) for number in kept])
 
 
 def _attempt(row: FeedbackRow, times_s: Sequence[float]) -> JudgedAttempt:

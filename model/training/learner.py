@@ -23,7 +23,7 @@ _PLACES_STEP: Final = 256
 """Predicted places are filled up to multiples of this, for the reason that `WIDTH_STEP` gives."""
 
 
-class _Lie(NamedTuple):
+class _ResponseLayout(NamedTuple):
     """How responses lie behind their prompts.
 
     Attributes:
@@ -41,7 +41,7 @@ class _Lie(NamedTuple):
     mask: Tensor | None
 
     @classmethod
-    def of(cls, parts: Tensor) -> _Lie:
+    def of(cls, parts: Tensor) -> _ResponseLayout:
         """From what each token belongs to; see `collate`."""
         rows, width = parts.shape
         place = torch.arange(width, device=parts.device)
@@ -113,13 +113,13 @@ class ResponseLearner(nn.Module):
         patches: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """The loss of a batch from `collate`, and its parts: `ResponseLoss` and the head's ADE."""
-        lie = _Lie.of(parts)
-        hidden = self._hidden(lie, input_ids, parts, history, route, tracks, seen, patches)
+        layout = _ResponseLayout.of(parts)
+        hidden = self._hidden(layout, input_ids, parts, history, route, tracks, seen, patches)
         labels, weights = input_ids.flatten(), loss_weights.flatten()
         # Logits only where a token is predicted that counts: a third of the positions.
         places = weights.nonzero()[:, 0]
         filling = -len(places) % _PLACES_STEP
-        logits = self.vla.lm_head(hidden.flatten(0, 1)[F.pad(lie.before[places], (0, filling))])
+        logits = self.vla.lm_head(hidden.flatten(0, 1)[F.pad(layout.before[places], (0, filling))])
         labels, weights = F.pad(labels[places], (0, filling)), F.pad(weights[places], (0, filling))
         # The start of each trajectory in codes, which of them are to be learned, and whose they are.
         row, place = ((input_ids == self._future_start_id) & (parts > 0)).nonzero(as_tuple=True)
@@ -159,9 +159,9 @@ class ResponseLearner(nn.Module):
             temperature: that they were drawn at.
         """
         parts = batch["parts"]
-        lie = _Lie.of(parts)
+        layout = _ResponseLayout.of(parts)
         given = {name: batch.get(name) for name in ("history", "route", "tracks", "seen", "patches")}
-        hidden = self._hidden(lie, batch["input_ids"], parts, **given).flatten(0, 1)
+        hidden = self._hidden(layout, batch["input_ids"], parts, **given).flatten(0, 1)
         starts = [
             int((row == part).nonzero()[0]) + number * parts.shape[1]
             for number, row in enumerate(parts)
@@ -169,7 +169,7 @@ class ResponseLearner(nn.Module):
         ]
         found = []
         for start, decisions in zip(starts, responses, strict=True):
-            logits = self.vla.lm_head(hidden[lie.before[[start + each.position for each in decisions]]])
+            logits = self.vla.lm_head(hidden[layout.before[[start + each.position for each in decisions]]])
             each = [
                 log_probability(
                     row[torch.from_numpy(decision.ids).to(row.device)], decision.place, temperature
@@ -181,7 +181,7 @@ class ResponseLearner(nn.Module):
 
     def _hidden(
         self,
-        lie: _Lie,
+        layout: _ResponseLayout,
         input_ids: Tensor,
         parts: Tensor,
         history: Tensor | None,
@@ -199,8 +199,8 @@ class ResponseLearner(nn.Module):
             vision_tokens = vla.vision(patches, torch.tensor([grid] * clips))
         states: Tensor = self._decoder[0](
             inputs_embeds=vla.embed(input_ids, vision_tokens, history, route, tracks),
-            attention_mask=lie.mask,
-            position_ids=vla.position_ids(input_ids, parts >= 0) - lie.moved,
+            attention_mask=layout.mask,
+            position_ids=vla.position_ids(input_ids, parts >= 0) - layout.moved,
             use_cache=False,
         ).last_hidden_state
         return states

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from looktwice.model.driving.pdm.judging import Said, SceneJudge
+from looktwice.model.driving.pdm.judging import PlanExplanation, SceneJudge
 from looktwice.model.driving.pdm.labelled import plans_of
 from looktwice.model.driving.pdm.rule_teacher import critique, verdict_with_truth
 from looktwice.model.driving.scene import LabelledScene
@@ -228,7 +228,7 @@ class OutcomeLearner(nn.Module):
     def _attempt(self, judge: SceneJudge, draft: Draw, writer: FeedbackWriter) -> Attempt:
         """A draft with feedback, measured against the expert."""
         plan = None if draft.plan is None else str(draft.plan)
-        said = [Said(plan, draft.thinking)]
+        said = [PlanExplanation(plan, draft.thinking)]
         [judged] = judge.judged(plans_of(draft.scored[None]), self._settings.version, said=said)
         feedback = str(critique(judged)) if writer == "teacher" else verdict_with_truth(judged)
         return Attempt(draft.trajectory, feedback)
@@ -282,8 +282,8 @@ class OutcomeLearner(nn.Module):
         """The decisions of a draw that were drawn: all but codes of least expected error."""
         imagination = self._family.imagination
         # Nobody asks for a camera, so nothing is expected of its picture.
-        said = {} if imagination is None else imagination.said(None)
-        found = decisions(self._data.formats[self._task].start(said=said), draw.ids)
+        fixed = {} if imagination is None else imagination.fixed_values(None)
+        found = decisions(self._data.formats[self._task].start(fixed=fixed), draw.ids)
         if self._settings.codes == "drawn":
             return found
         alphabets = self._loaded.vocabulary.alphabets

@@ -39,7 +39,7 @@ def mirrored(reflection: Counterfactual) -> Counterfactual:
     )
 
 
-class OnExamples(NamedTuple):
+class PlacedReflections(NamedTuple):
     """Reflections, and the place of the example that each is on, int64 [m]."""
 
     examples: npt.NDArray[np.int64]
@@ -71,7 +71,7 @@ def places_of(examples: Examples, scene_ids: Iterable[str], what: str) -> npt.ND
     return np.array(places, np.int64)
 
 
-def reflections_on(examples: Examples, found: Iterable[LabelledReflection]) -> OnExamples:
+def place_reflections(examples: Examples, found: Iterable[LabelledReflection]) -> PlacedReflections:
     """Reflections, in plain punctuation, with the examples of their scenes.
 
     Raises:
@@ -83,4 +83,4 @@ def reflections_on(examples: Examples, found: Iterable[LabelledReflection]) -> O
         thinking = plain(each.reflection)
         revised = None if facts_of(thinking) is None else each.expert_plan
         reflections.append(Counterfactual(each.predicted_plan, thinking, revised, each.judged))
-    return OnExamples(places, reflections)
+    return PlacedReflections(places, reflections)

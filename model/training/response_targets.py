@@ -68,8 +68,8 @@ def make_target(
     taught = {section: 0.0 if section in untaught else weight for section, weight in weights.items()}
     ids, given = tuple(token.id for token in tokens), set[int]()
     if family.imagination is not None and family.imagination.section in values:
-        said = family.imagination.said(lesson.expected)
-        made = {decision.position for decision in decisions(compiled.start(plans, said=said), ids)}
-        given = {place for place, token in enumerate(tokens) if token.section in said and place not in made}
+        fixed = family.imagination.fixed_values(lesson.expected)
+        made = {decision.position for decision in decisions(compiled.start(plans, fixed=fixed), ids)}
+        given = {place for place, token in enumerate(tokens) if token.section in fixed and place not in made}
     weighed = (0.0 if place in given else taught[token.section] for place, token in enumerate(tokens))
     return Target(ids, tuple(weighed))

@@ -156,7 +156,7 @@ class ResponseDataset(Dataset[ResponseSample]):
             reflections.append(Counterfactual(own, "", judged=False))
         tried = None if item.attempt is None else self._attempts[item.attempt]
         soft = [self._soft.draw(vector, self.random) for _ in reflections]
-        camera = picture.camera if picture is not None and item.asked else None
+        camera = picture.camera if picture is not None and item.camera_requested else None
         attempt = None if tried is None else tried.attempt
         expected = self._expected_codes(item, camera, history) if camera is not None else None
         lessons = [

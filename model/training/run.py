@@ -40,7 +40,7 @@ from looktwice.model.network.visual_codes import load_visual_codes
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.network.vla_settings import EXPANDED_SETTINGS, NANO_SETTINGS
 from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
-from looktwice.model.training.attempts import AttemptsOn, attempts_on
+from looktwice.model.training.attempts import PlacedAttempts, place_attempts
 from looktwice.model.training.batches import collate
 from looktwice.model.training.dense import DENSE_SHAPE
 from looktwice.model.training.examples import Examples, load_examples
@@ -63,7 +63,7 @@ from looktwice.model.training.open_loop_validation import open_loop
 from looktwice.model.training.outcomes import OutcomeLearner, ScenePlaces, collate_places
 from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.recipes import Recipe
-from looktwice.model.training.reflections import OnExamples, reflections_on
+from looktwice.model.training.reflections import PlacedReflections, place_reflections
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.sampler import TaskSampler
 from looktwice.model.training.trainer import LearnerTrainer, Validate
@@ -206,11 +206,11 @@ def run(
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
     taught = _taught_by(recipe, examples)
-    on_examples = None if reflections is None else reflections_on(examples, read_reflections(reflections))
+    on_examples = None if reflections is None else place_reflections(examples, read_reflections(reflections))
     tried = None
     if failures is not None and recipe.attempting is not None:
         times_s = family_named(recipe.attempting).times_s
-        tried = attempts_on(examples, read_feedback(failures), times_s, taught)
+        tried = place_attempts(examples, read_feedback(failures), times_s, taught)
     learner, dataset, sampler, collator = _prepare(
         recipe, loaded, scenes, examples, taught, on_examples, tried, settings
     )
@@ -333,8 +333,8 @@ def _prepare(
     scenes: Path,
     examples: Examples,
     taught: npt.NDArray[np.bool_],
-    on_examples: OnExamples | None,
-    tried: AttemptsOn | None,
+    on_examples: PlacedReflections | None,
+    tried: PlacedAttempts | None,
     settings: RunSettings,
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
     if recipe.goal == "ground":
@@ -448,8 +448,8 @@ def _about(
     recipe: Recipe,
     examples: Examples,
     taught: npt.NDArray[np.bool_],
-    on_examples: OnExamples | None,
-    tried: AttemptsOn | None,
+    on_examples: PlacedReflections | None,
+    tried: PlacedAttempts | None,
 ) -> Mapping[str, Any]:
     about = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     about |= {"tasks": dict(recipe.tasks), "weights": dict(recipe.weights)}

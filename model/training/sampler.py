@@ -31,7 +31,7 @@ class Item:
         blur: of the history only the present speed is left.
         pictures: whether the prompt has the example's pictures, where any prompt has.
         camera: whose picture half a second later is taught; None for no picture.
-        asked: whether the prompt asks for that camera.
+        camera_requested: whether the prompt asks for that camera.
         reflections: places of reflections on it, whose responses all follow the same prompt; without any,
             the response is the expert's own.
         attempt: place of the attempt on it that is refined; None where the format refines none.
@@ -46,7 +46,7 @@ class Item:
     blur: bool = False
     pictures: bool = True
     camera: str | None = None
-    asked: bool = False
+    camera_requested: bool = False
     attempt: int | None = None
 
 
@@ -174,7 +174,7 @@ class TaskSampler(BatchSampler):
                 blur=bool(blur[place]),
                 pictures=bool(self._pictured[example[place]]),
                 camera=taught[place][0],
-                asked=taught[place][1],
+                camera_requested=taught[place][1],
             )
             for place in random.permutation(len(example))
         ]

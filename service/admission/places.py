@@ -18,7 +18,7 @@ _MEMORY: Final = 0.1
 """Weight of the latest observation in a running mean."""
 _FIRST_DRAW_S: Final = 0.1
 """That a draw keeps its place, before any was seen."""
-PATIENCE_S: Final = 1.0
+MAX_WAIT_S: Final = 1.0
 """That a batch's next scene lets others go first."""
 
 
@@ -69,7 +69,7 @@ class Admission:
 
     Draws are what costs: memory in the engine and time in every pass, so a scene takes as many places as
     it asks draws for. Scenes are bounded too, since each is held with its pictures. Scenes of batches wait
-    for places that others leave; one that is next for `PATIENCE_S` goes before whoever comes, so that a
+    for places that others leave; one that is next for `MAX_WAIT_S` goes before whoever comes, so that a
     batch gets on under any load.
 
     Args:
@@ -184,7 +184,7 @@ class Admission:
     def _free_is_reserved(self) -> bool:
         """Whether what is free is kept for a batch's next scene."""
         first_s = self._turns[0].first_s if self._turns else None
-        return first_s is not None and self._clock() - first_s > PATIENCE_S
+        return first_s is not None and self._clock() - first_s > MAX_WAIT_S
 
     def _check_batch(self, scenes: int) -> None:
         if self._batched and self._batched + scenes > self.scenes:

@@ -24,13 +24,13 @@ def feedback(
     from looktwice.service.http.problem_documents import validated
     from looktwice.service.problems import ProblemError
     from looktwice.service.scenes.bundled import BundledScenes
-    from looktwice.service.scoring.rule_feedback import feedback_given
+    from looktwice.service.scoring.rule_feedback import answer_feedback
 
     with reported_errors():
         text = sys.stdin.read() if str(request) == "-" else request.read_text()
         try:
             asked = validated(FeedbackRequest, json.loads(text))
-            found = feedback_given(asked, BundledScenes(scenes), "command-line").response
+            found = answer_feedback(asked, BundledScenes(scenes), "command-line").response
         except ProblemError as error:
             raise ValueError(f"{error.kind.title}: {error.detail}") from error
         if as_json:

@@ -29,7 +29,7 @@ Tell = Callable[[SceneEvent], Awaitable[Sequence[tuple[str, Data]]]]
 """What an event of a scene is in the wire's words: events with their data, none where it is not told of."""
 
 
-async def told_events(
+async def wire_events(
     first: SceneEvent, events: AsyncGenerator[SceneEvent], tell: Tell[Data], metrics: Metrics
 ) -> AsyncGenerator[tuple[str, Data] | PlannedScene]:
     """What happens to a scene, told; at last the whole of it. Closing it early frees everything.
@@ -99,7 +99,7 @@ async def streamed(
     except CallerLeft:
         await events.aclose()
         raise
-    told = told_events(first, events, tell, metrics)
+    told = wire_events(first, events, tell, metrics)
     return StreamingResponse(sent(told), media_type=wire.SSE_MEDIA_TYPE, headers=_NO_BUFFERING)
 
 

@@ -36,7 +36,9 @@ class BundledScenes:
         try:
             return self._scenes
         except SceneFileError as error:
-            raise ProblemError(SCENES_UNREADABLE, told(error, self._path, self._path.name)) from error
+            raise ProblemError(
+                SCENES_UNREADABLE, file_error_text(error, self._path, self._path.name)
+            ) from error
 
     def one(self, scene_id: str) -> LabelledScene:
         """The scene of that name; raises `ProblemError`."""
@@ -71,7 +73,7 @@ def view(labelled: LabelledScene) -> wire.LabelledScene:
     )
 
 
-def told(error: SceneFileError, path: Path, name: str) -> str:
+def file_error_text(error: SceneFileError, path: Path, name: str) -> str:
     """What is wrong with the file at ``path``, under another name."""
     # Where files lie on the server is nobody's business.
     return str(error).replace(str(path), name).strip()

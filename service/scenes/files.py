@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 import looktwice.clients.wire as wire
 from looktwice.model.driving.scene_store import SceneFileError, count_scenes, read_scenes
 from looktwice.service.problems import INVALID_SCENE_FILE, ProblemError
-from looktwice.service.scenes.bundled import MAX_SCENES_SHOWN, told, view
+from looktwice.service.scenes.bundled import MAX_SCENES_SHOWN, file_error_text, view
 
 MAX_SCENES_IN_FILE: Final = 1000
 MAX_UNPACKED_BYTES: Final = 256_000_000
@@ -28,7 +28,7 @@ MAX_UNPACKED_BYTES: Final = 256_000_000
 MAX_MEMORY_BYTES: Final = 512_000_000
 """Of data; about 150 MB are taken by libraries, and 130 MB more by 60 scenes."""
 MAX_CPU_S: Final = 20
-PATIENCE_S: Final = 3 * MAX_CPU_S
+MAX_WAIT_S: Final = 3 * MAX_CPU_S
 """On a machine that is busy otherwise, where who reads goes last."""
 MAX_ANSWER_BYTES: Final = 64_000_000
 _PARQUET: Final = b"PAR1"
@@ -61,16 +61,16 @@ async def read_scene_file(content: bytes) -> bytes:
             limit=MAX_ANSWER_BYTES,
         )
         try:
-            async with asyncio.timeout(PATIENCE_S):
-                told, complaint = await reader.communicate()
+            async with asyncio.timeout(MAX_WAIT_S):
+                answer, complaint = await reader.communicate()
         except TimeoutError:
-            raise _refusal(f"the file takes longer than {PATIENCE_S} s to read") from None
+            raise _refusal(f"the file takes longer than {MAX_WAIT_S} s to read") from None
         finally:
             with contextlib.suppress(ProcessLookupError):
                 reader.kill()
             await reader.wait()
     if reader.returncode == 0:
-        return told
+        return answer
     if reader.returncode == REFUSED:
         raise _refusal(complaint.decode(errors="replace"))
     raise _refusal("the file takes too much memory or time to read")
@@ -86,7 +86,7 @@ def scenes_of_file(path: Path) -> list[wire.LabelledScene]:
         _refuse_bombs(path)
         return [view(scene) for scene in islice(read_scenes(path, dense=False), MAX_SCENES_SHOWN)]
     except SceneFileError as error:
-        raise ProblemError(INVALID_SCENE_FILE, told(error, path, "the file")) from error
+        raise ProblemError(INVALID_SCENE_FILE, file_error_text(error, path, "the file")) from error
 
 
 def _refuse_bombs(path: Path) -> None:
@@ -105,12 +105,12 @@ def main(path: Path) -> int:
     for kind, limit in ((resource.RLIMIT_DATA, MAX_MEMORY_BYTES), (resource.RLIMIT_CPU, MAX_CPU_S)):
         resource.setrlimit(kind, (limit, limit))
     try:
-        told = wire.SceneFile(scenes=scenes_of_file(path)).model_dump_json().encode()
+        answer = wire.SceneFile(scenes=scenes_of_file(path)).model_dump_json().encode()
     except ProblemError as error:
         sys.stderr.write(error.detail)
         return REFUSED
-    if len(told) > MAX_ANSWER_BYTES:
-        sys.stderr.write(f"the file's scenes are {len(told)} bytes to tell; at most {MAX_ANSWER_BYTES} are")
+    if len(answer) > MAX_ANSWER_BYTES:
+        sys.stderr.write(f"the file's scenes are {len(answer)} bytes to tell; at most {MAX_ANSWER_BYTES} are")
         return REFUSED
-    sys.stdout.buffer.write(told)
+    sys.stdout.buffer.write(answer)
     return 0

@@ -26,13 +26,13 @@ from looktwice.clients.wire import Fault
 from looktwice.service.problems import INVALID_LABELS, KINDS, ProblemError
 from looktwice.service.scenes.bundled import BundledScenes
 from looktwice.service.scoring.request_scores import scored
-from looktwice.service.scoring.rule_feedback import Given, feedback_given
+from looktwice.service.scoring.rule_feedback import FeedbackAnswer, answer_feedback
 
 MAX_MEMORY_BYTES: Final = 768_000_000
 """Of data; about 150 MB are taken by libraries."""
 MAX_CPU_S: Final = 20
 """Four thousand plans on a usual map take one second."""
-_PATIENCE_S: Final = 3 * MAX_CPU_S
+_MAX_WAIT_S: Final = 3 * MAX_CPU_S
 """On a machine that is busy otherwise."""
 _LENGTH: Final = struct.Struct(">I")
 _DONE, _REFUSED, _FAILED = b"d", b"r", b"f"
@@ -64,19 +64,19 @@ class Scorer:
         told = await self._work(_SCORE, asked, request_id)
         return wire_scores.ScoreResponse.model_validate_json(told)
 
-    async def feedback(self, asked: wire_feedback.FeedbackRequest, request_id: str) -> Given:
+    async def feedback(self, asked: wire_feedback.FeedbackRequest, request_id: str) -> FeedbackAnswer:
         """Feedback by rule on one request's trajectories, and what another teacher would be asked.
 
         Raises:
-            ProblemError: what `feedback_given` refuses, and what takes too much to be scored.
+            ProblemError: what `answer_feedback` refuses, and what takes too much to be scored.
         """
-        return Given.of_json(await self._work(_FEEDBACK, asked, request_id))
+        return FeedbackAnswer.of_json(await self._work(_FEEDBACK, asked, request_id))
 
     async def _work(self, what: str, asked: BaseModel, request_id: str) -> bytes:
         content = json.dumps([what, request_id, asked.model_dump()]).encode()
         async with self._turn:
             try:
-                async with asyncio.timeout(_PATIENCE_S):
+                async with asyncio.timeout(_MAX_WAIT_S):
                     kind, told = await self._ask(content)
             except (TimeoutError, asyncio.IncompleteReadError, ConnectionError):
                 await self._end()
@@ -142,7 +142,7 @@ def _answer(content: bytes, scenes: BundledScenes) -> tuple[bytes, bytes]:
     try:
         if what == _FEEDBACK:
             wanted = wire_feedback.FeedbackRequest.model_validate(document)
-            return _DONE, feedback_given(wanted, scenes, request_id).to_json()
+            return _DONE, answer_feedback(wanted, scenes, request_id).to_json()
         asked = wire_scores.ScoreRequest.model_validate(document)
         return _DONE, scored(asked, scenes, request_id).model_dump_json().encode()
     except ProblemError as problem:

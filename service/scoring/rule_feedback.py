@@ -18,7 +18,7 @@ from looktwice.model.driving.pdm.course import Course
 from looktwice.model.driving.pdm.failures import Fact
 from looktwice.model.driving.pdm.feedback import Feedback, FeedbackError, RuleFeedback, parse_feedback
 from looktwice.model.driving.pdm.judged import JudgedPlan, Measurement
-from looktwice.model.driving.pdm.judging import Said, judged_plans
+from looktwice.model.driving.pdm.judging import PlanExplanation, judged_plans
 from looktwice.model.driving.pdm.rule_teacher import NAME, REVISION, feedback_on
 from looktwice.model.driving.pdm.world import ScoreError
 from looktwice.service.problems import INVALID_FEEDBACK, INVALID_LABELS, OTHER_PLAN, at
@@ -32,7 +32,7 @@ _DECIMALS: Final = 6
 
 
 @dataclass(frozen=True)
-class Given:
+class FeedbackAnswer:
     """Feedback by rule, and for each trajectory what another teacher would be asked; None where nothing."""
 
     response: wire_feedback.FeedbackResponse
@@ -44,7 +44,7 @@ class Given:
         return json.dumps([self.response.model_dump(), questions]).encode()
 
     @classmethod
-    def of_json(cls, content: bytes) -> Given:
+    def of_json(cls, content: bytes) -> FeedbackAnswer:
         """What `to_json` made bytes of."""
         response, questions = json.loads(content)
         return cls(
@@ -57,7 +57,9 @@ def _question(prompt: str, numbers: list[list[object]], names: list[str]) -> Fee
     return FeedbackQuestion(prompt, tuple(Measurement(*each) for each in numbers), tuple(names))  # type: ignore[arg-type]
 
 
-def feedback_given(asked: wire_feedback.FeedbackRequest, bundled: BundledScenes, request_id: str) -> Given:
+def answer_feedback(
+    asked: wire_feedback.FeedbackRequest, bundled: BundledScenes, request_id: str
+) -> FeedbackAnswer:
     """The answer to one request, the built-in teacher having written.
 
     Raises:
@@ -79,7 +81,7 @@ def feedback_given(asked: wire_feedback.FeedbackRequest, bundled: BundledScenes,
             found.others,
             threshold=asked.threshold,
             truth=truth,
-            said=[Said(each.plan, each.think) for each in said],
+            said=[PlanExplanation(each.plan, each.think) for each in said],
             command=asked.command,
             centre=found.centre,
         )
@@ -122,7 +124,7 @@ def feedback_given(asked: wire_feedback.FeedbackRequest, bundled: BundledScenes,
         teacher=TeacherName(name=NAME, revision=REVISION),
         feedback=told,
     )
-    return Given(response, tuple(questions))
+    return FeedbackAnswer(response, tuple(questions))
 
 
 def plan_id_of(trajectory: list[list[float]]) -> str:

@@ -14,7 +14,7 @@ from looktwice.service.problems import TEACHER_AWAY, TEACHER_REFUSED, ProblemErr
 
 log = structlog.stdlib.get_logger()
 
-PATIENCE_S: Final = 30.0
+RETRY_FOR_S: Final = 30.0
 """That a teacher may be busy or away before its caller is told."""
 
 

@@ -31,7 +31,7 @@ from looktwice.service.problems import (
     ProblemError,
     at,
 )
-from looktwice.service.teaching.asking import PATIENCE_S, asking
+from looktwice.service.teaching.asking import RETRY_FOR_S, asking
 
 _TOLD: Final = {
     "collision": ("collided_s", "hit"),
@@ -56,7 +56,7 @@ async def label(
     question = await asyncio.to_thread(_question, asked)
     with asking(teacher, metrics) as answers:
         try:
-            reflection = await with_retries(lambda: ask(teacher, question, answers), PATIENCE_S)
+            reflection = await with_retries(lambda: ask(teacher, question, answers), RETRY_FOR_S)
         except AnnotationsMissing as error:
             raise ProblemError(NEEDS_ANNOTATIONS, f"{teacher.name}: {error}") from None
         except NothingInView as error:

@@ -17,14 +17,16 @@ from looktwice.clients.wire import TeacherName
 from looktwice.model.driving.pdm.feedback import Feedback
 from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.problems import FEEDBACK_REFUSED, at
-from looktwice.service.scoring.rule_feedback import Given, sections_of
-from looktwice.service.teaching.asking import PATIENCE_S, asking
+from looktwice.service.scoring.rule_feedback import FeedbackAnswer, sections_of
+from looktwice.service.teaching.asking import RETRY_FOR_S, asking
 
 ASKED_AT_ONCE: Final = 4
 """Questions of one request that a teacher has at a time."""
 
 
-async def taught(given: Given, teacher: FeedbackTeacher, metrics: Metrics) -> wire_feedback.FeedbackResponse:
+async def taught(
+    given: FeedbackAnswer, teacher: FeedbackTeacher, metrics: Metrics
+) -> wire_feedback.FeedbackResponse:
     """The answer with an outside teacher's sections in the place of the built-in one's.
 
     Raises:
@@ -62,7 +64,7 @@ async def _asked(
 ) -> tuple[Feedback, int]:
     with asking(teacher, metrics) as answers:
         try:
-            written = await with_retries(lambda: ask_feedback(teacher, question, answers), PATIENCE_S)
+            written = await with_retries(lambda: ask_feedback(teacher, question, answers), RETRY_FOR_S)
         except ReflectionRefused as error:
             metrics.feedback_failed(teacher.name, [each.check for each in error.failed])
             raise at(

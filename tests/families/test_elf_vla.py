@@ -24,14 +24,14 @@ from looktwice.model.driving.reasoning import thoughts_of
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.thoughts import Thoughts, read_thoughts
 from looktwice.model.engines.engine import Controls, Draw, PlanRequest, RequestError
-from looktwice.model.engines.engine_requests import begin
+from looktwice.model.engines.engine_requests import start_cursor
 from looktwice.model.engines.torch.decoder import Decoder
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.engines.torch.runner import PromptRequest, Runner
 from looktwice.model.evaluation.open_loop import evaluate_draws
 from looktwice.model.evaluation.variants import standard_variants
 from looktwice.model.families.elf_vla import ELF_VLA, ELF_VLA_REFINE
-from looktwice.model.families.elf_vla.format import TIMES_S, read_poses, told_poses
+from looktwice.model.families.elf_vla.format import TIMES_S, pose_values, read_poses
 from looktwice.model.families.elf_vla.inputs import command_of
 from looktwice.model.families.elf_vla.targets import WEIGHTS
 from looktwice.model.families.family import Attempt, FamilyError, Lesson
@@ -135,7 +135,7 @@ def test_attempts_are_refused_where_they_do_not_belong(
     compiled = {name: CompiledFormat(family.format, elf.vocabulary) for name, family in families.items()}
     request = PlanRequest("a", noisy_scene(1), format, attempt=attempt)
     with pytest.raises(RequestError, match=message):
-        begin(request, elf.card, families, compiled)
+        start_cursor(request, elf.card, families, compiled)
 
 
 @pytest.mark.parametrize(
@@ -212,10 +212,10 @@ def test_the_command_is_where_the_route_leads(left_m: float, command: str) -> No
 @given(st.lists(st.tuples(*[st.floats(-30, 30, width=32)] * 2, st.floats(-3, 3, width=32)), min_size=1))
 def test_poses_are_told_to_the_decimetre(poses: list[tuple[float, float, float]]) -> None:
     trajectory = np.array([(max(x, -20), y, 0, heading) for x, y, heading in poses], np.float32)
-    read = read_poses(told_poses(trajectory))
+    read = read_poses(pose_values(trajectory))
     assert np.abs(read - trajectory)[:, :2].max() <= 0.0501
     assert np.abs(read - trajectory)[:, 3].max() <= 0.0101
-    assert told_poses(read) == told_poses(trajectory)
+    assert pose_values(read) == pose_values(trajectory)
 
 
 def lesson(labelled: LabelledScene, thoughts: Thoughts | None) -> Lesson:

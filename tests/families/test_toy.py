@@ -43,7 +43,7 @@ from looktwice.service.operations.service_metrics import Metrics
 from looktwice.service.operations.settings import Settings
 from looktwice.service.planning.events import Judged, SceneEvent
 from looktwice.service.planning.telling import PlanTeller
-from looktwice.service.routes.streaming import told_events
+from looktwice.service.routes.streaming import wire_events
 from tests.checkpoints import noisy_scene, write_untrained
 from tests.families.toy import TOY, drive, turned, turns_of
 from tests.model.driving.drives import MIDDLES_S, labelled_scene
@@ -147,7 +147,7 @@ def test_it_is_streamed_in_the_words_of_the_wire(toy: Loaded) -> None:
                 yield event
 
         first, metrics = SectionFinished(0, "mood", "Hmm,", ("Hmm,",)), Metrics(CollectorRegistry())
-        return [event async for event in told_events(first, events(), PlanTeller("toy"), metrics)]
+        return [event async for event in wire_events(first, events(), PlanTeller("toy"), metrics)]
 
     branch, it, rains, trajectory = asyncio.run(told())
     assert branch == ("branch", wire.BranchTaken(index=0, branch="Thinking:"))

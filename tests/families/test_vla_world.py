@@ -23,7 +23,7 @@ from looktwice.model.driving.perceived import perceived_of
 from looktwice.model.driving.scene import Clip, LabelledScene, NextFrame, mirrored_camera
 from looktwice.model.driving.short_term import INERTIA
 from looktwice.model.engines.engine import Controls, Decision, Draw, PlanRequest, RequestError
-from looktwice.model.engines.engine_requests import begin, painted
+from looktwice.model.engines.engine_requests import painted, start_cursor
 from looktwice.model.engines.torch.deadlines import LatencyModel
 from looktwice.model.engines.torch.decoder import Decoder
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
@@ -346,7 +346,7 @@ def test_training_shows_what_the_asked_camera_may_see_as_the_engine_does(paintin
     labelled = replace(plain, scene=scene, future=future, next_frames=nexts)
     data = dataset(painting, [labelled], painting.visual_codes)
     for camera, mirror in (("front_left", False), ("back", False), ("front_left", True)):
-        item = Item(0, "vla_world", True, camera=camera, asked=True, mirror=mirror)
+        item = Item(0, "vla_world", True, camera=camera, camera_requested=True, mirror=mirror)
         seen = labelled
         if mirror:
             flipped = encode_png(np.ascontiguousarray(decode_image(left)[:, ::-1]))
@@ -379,7 +379,7 @@ def test_what_cannot_be_imagined_is_refused_by_name(world: Loaded) -> None:
     for controls in (Controls(imagine="always"), Controls(imagine="never"), Controls(camera="front")):
         asked = PlanRequest("a", noisy_scene(), "cf_vla", controls)
         with pytest.raises(RequestError, match="'cf_vla' imagine no pictures"):
-            begin(asked, world.card, plain, compiled)
+            start_cursor(asked, world.card, plain, compiled)
     imagination = VLA_WORLD.imagination
     assert imagination is not None
     with pytest.raises(FamilyError, match="imagination: the format has no choice 'see'"):
@@ -521,7 +521,7 @@ def test_pictures_half_a_second_ahead_are_taught_as_codes(world: Loaded) -> None
     codes = VisualCodes(24).eval()
     labelled = replace(training_scene(1), next_frames=(NextFrame("back_left", encode_png(frame)),))
     data = dataset(world, [labelled], codes)
-    item = Item(0, "vla_world", True, camera="back_left", asked=True)
+    item = Item(0, "vla_world", True, camera="back_left", camera_requested=True)
     # A mirror shows what the camera of the other side sees.
     for mirror, camera, seen in ((False, "back_left", frame), (True, "back_right", frame[:, ::-1])):
         sample = data[replace(item, mirror=mirror)]
@@ -532,7 +532,7 @@ def test_pictures_half_a_second_ahead_are_taught_as_codes(world: Loaded) -> None
         assert f"visual tokens of CAM_{camera.upper()} image" in text
         assert f"Camera: CAM_{camera.upper()}\n" in world.vocabulary.decode(sample.prompt)
     # Nobody asks, or nothing is taught: the prompt names no camera.
-    chosen, unseen = data[replace(item, asked=False)], data[Item(0, "vla_world", True)]
+    chosen, unseen = data[replace(item, camera_requested=False)], data[Item(0, "vla_world", True)]
     assert "Camera: ANY\n" in world.vocabulary.decode(chosen.prompt)
     assert chosen.responses == data[item].responses
     assert unseen.prompt == chosen.prompt

@@ -92,7 +92,7 @@ class Shot:
 class _Plans:
     made: list[Planned] = field(default_factory=list)
 
-    def told(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         if not self.made:
             return {}
         rates = [planned.think_rate for planned in self.made if planned.think_rate is not None]
@@ -178,7 +178,7 @@ def drive(
         max(0.0, world.ego.progress - began_m),
         left_road,
         *_comfort(world.log().ego[TAKE_OVER:]),
-        **plans.told(),
+        **plans.summary(),
         hit=None if world.hit is None else kind_of(world.hit),
     )
 

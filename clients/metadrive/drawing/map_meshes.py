@@ -23,7 +23,7 @@ _YELLOW: Final = (0.90, 0.70, 0.16)
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """Colours and light of one episode."""
 
     sky: tuple[float, float, float]
@@ -35,7 +35,7 @@ class Look:
     ambient: float
 
 
-def make_look(seed: int) -> Look:
+def make_appearance(seed: int) -> Appearance:
     """The look of the episode of ``seed``."""
     rng = np.random.default_rng([seed, 3])
     skies = [
@@ -56,7 +56,7 @@ def make_look(seed: int) -> Look:
     ground = np.array(grounds[int(rng.integers(5))]) * rng.uniform(0.85, 1.15)
     warm = rng.uniform(-0.06, 0.06)
     sun = np.clip(rng.uniform(0.45, 0.75) + np.array([warm, 0.0, -warm]), 0, 1)
-    return Look(
+    return Appearance(
         _rgb(sky),
         _rgb(ground),
         float(rng.uniform(0.26, 0.42)),

@@ -38,7 +38,7 @@ class Stage:
         self._log, self._rig = log, rig
         core = simulator.panda()
         self._world = rig.root.attachNewNode("episode")
-        look = map_meshes.make_look(log.seed)
+        look = map_meshes.make_appearance(log.seed)
         rig.set_sky(look.sky)
         self._flat(
             map_meshes.ground_mesh(log.road_map, look.ground),
@@ -67,7 +67,7 @@ class Stage:
             node.setTexture(texture)
         node.reparentTo(self._world)
 
-    def _light(self, core: Any, look: map_meshes.Look) -> None:
+    def _light(self, core: Any, look: map_meshes.Appearance) -> None:
         ambient = core.AmbientLight("ambient")
         ambient.setColor((look.ambient, look.ambient, look.ambient * 1.05, 1))
         sun = core.DirectionalLight("sun")

@@ -25,14 +25,14 @@ SCORE_DECIMALS: Final = 6
 
 
 @dataclass(frozen=True)
-class Said:
+class PlanExplanation:
     """What a planner says of one plan: in words, and how it came to it; None where it says nothing."""
 
     words: str | None = None
     think: str | None = None
 
 
-_NOTHING: Final = Said()
+_NOTHING: Final = PlanExplanation()
 
 
 def judged_plans(
@@ -43,7 +43,7 @@ def judged_plans(
     *,
     threshold: float = THRESHOLD,
     truth: Array | None = None,
-    said: Sequence[Said] | None = None,
+    said: Sequence[PlanExplanation] | None = None,
     command: str | None = None,
     centre: bool = False,
 ) -> list[JudgedPlan]:
@@ -137,7 +137,7 @@ class SceneJudge:
         plans: Array,
         version: Version,
         threshold: float = THRESHOLD,
-        said: Sequence[Said] | None = None,
+        said: Sequence[PlanExplanation] | None = None,
     ) -> list[JudgedPlan]:
         """The same plans with what a teacher is told of each; raises as `judged_plans` does, too."""
         return judged_plans(
@@ -157,7 +157,7 @@ def judged_in_scene(
     plans: Array,
     version: Version,
     threshold: float = THRESHOLD,
-    said: Sequence[Said] | None = None,
+    said: Sequence[PlanExplanation] | None = None,
 ) -> list[JudgedPlan]:
     """What `SceneJudge` says of the plans of one scene, judged once."""
     return SceneJudge(labelled).judged(plans, version, threshold, said)

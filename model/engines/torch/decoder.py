@@ -22,7 +22,7 @@ from looktwice.model.engines.engine import (
     RequestError,
     Started,
 )
-from looktwice.model.engines.engine_requests import begin, read
+from looktwice.model.engines.engine_requests import read, start_cursor
 from looktwice.model.engines.least_error import LeastError
 from looktwice.model.engines.logprobs import reported
 from looktwice.model.engines.reason_mask import reason_mask_of
@@ -134,7 +134,9 @@ class Decoder:
             raise RequestError(f"request id {plan_request.request_id} is in use")
         loaded = self._runner.loaded
         expected = loaded.inputs.expected(plan_request.scene, plan_request.controls.view)
-        origin = begin(plan_request, loaded.card, self._runner.families, self._runner.formats, expected)
+        origin = start_cursor(
+            plan_request, loaded.card, self._runner.families, self._runner.formats, expected
+        )
         arrived_s = self._clock() if submitted_s is None else submitted_s
         family = self._runner.families[plan_request.format]
         request = Request(plan_request, family, origin, arrived_s, self._least_error)

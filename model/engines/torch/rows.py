@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from looktwice.model.engines.engine import Event
-from looktwice.model.engines.engine_requests import drawn_as, leads_to_reflection, told
+from looktwice.model.engines.engine_requests import drawn_as, events_of, leads_to_reflection
 from looktwice.model.engines.least_error import least_error
 from looktwice.model.engines.response import Response, SectionText
 from looktwice.model.engines.sampling import choose, probabilities, uniforms
@@ -147,7 +147,9 @@ class Row(Response):
         self.pending += [token.id for token in self.tokens[written:]]
         if self.draft:
             return []
-        return told(self.request.plan_request, self.request.family, self, finished, self.draws, vocabulary)
+        return events_of(
+            self.request.plan_request, self.request.family, self, finished, self.draws, vocabulary
+        )
 
     def _controlled(
         self, allowed: Allowed, logits: npt.NDArray[np.float64], time_for: TimeFor

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from looktwice.model.engines.torch.request import Phase, Request, Tree
 
-PATIENCE_S: Final = 4.0
+MAX_WAIT_S: Final = 4.0
 """A request without a deadline waits as if it had this one, so that others cannot starve it."""
 
 
@@ -19,8 +19,8 @@ def urgency(request: Request, now_s: float) -> tuple[float, int]:
 
     A request whose deadline has passed counts as one without: served first it would make others late too.
     """
-    patience_s = request.submitted_s + PATIENCE_S
-    due_s = patience_s if request.deadline_s < now_s else min(request.deadline_s, patience_s)
+    latest_s = request.submitted_s + MAX_WAIT_S
+    due_s = latest_s if request.deadline_s < now_s else min(request.deadline_s, latest_s)
     return due_s, request.arrival
 
 

@@ -25,10 +25,10 @@ class Encoded(NamedTuple):
 
 
 class _Opened(NamedTuple):
-    """A scene's slices by digest, the vision tokens that are kept, and the patches of the others."""
+    """A scene's slices by digest, the vision tokens that are cached, and the patches of the others."""
 
     keys: list[bytes]
-    kept: dict[bytes, Tensor]
+    cached: dict[bytes, Tensor]
     patches: dict[bytes, npt.NDArray[np.uint8]]
 
 
@@ -38,7 +38,7 @@ class VisionEncoder:
     Args:
         loaded: the network.
         frames: where pictures are decoded.
-        clip_bytes: of vision tokens kept.
+        clip_bytes: of vision tokens cached.
         products: what matrix products are worked out in; None for the weights' own type.
         one_by_one: whether the tower sees one slice at a time, so that no sum depends on the others.
     """
@@ -74,7 +74,7 @@ class VisionEncoder:
             if isinstance(each, Exception):
                 encoded.append(each)
                 continue
-            tokens = [each.kept[key] if key in each.kept else made[key] for key in each.keys]
+            tokens = [each.cached[key] if key in each.cached else made[key] for key in each.keys]
             encoded.append(Encoded(torch.cat(tokens), b"".join(each.keys)))
         for key, tokens_of in made.items():
             # A copy: a part of a tensor would keep all of it.
@@ -82,19 +82,19 @@ class VisionEncoder:
         return encoded
 
     def _open(self, scene: Scene) -> _Opened | Exception:
-        """A scene's pictures: what is kept of them, and the patches of the others."""
+        """A scene's pictures: what is cached of them, and the patches of the others."""
         try:
             slices = self._loaded.inputs.slices(scene)
             keys = [digest(pictures) for pictures in slices]
-            kept = {key: tokens for key in keys if (tokens := self._clips.get(key)) is not None}
+            cached = {key: tokens for key in keys if (tokens := self._clips.get(key)) is not None}
             patches = {
                 key: self._frames.patches(pictures)
                 for key, pictures in zip(keys, slices, strict=True)
-                if key not in kept
+                if key not in cached
             }
         except Exception as error:  # one scene that cannot be read must not end the others
             return error
-        return _Opened(keys, kept, patches)
+        return _Opened(keys, cached, patches)
 
     def _tokens(self, patches: Mapping[bytes, npt.NDArray[np.uint8]]) -> dict[bytes, Tensor]:
         """Vision tokens of slices, each [k, hidden]."""

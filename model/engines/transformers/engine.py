@@ -22,12 +22,12 @@ from looktwice.model.engines.engine import (
 )
 from looktwice.model.engines.engine_requests import (
     PictureCodes,
-    begin,
+    events_of,
     inputs_of,
     painted,
     prompt_tokens,
     read,
-    told,
+    start_cursor,
 )
 from looktwice.model.engines.gate import Gate
 from looktwice.model.engines.picture_threads import PictureThreads
@@ -123,7 +123,7 @@ class TransformersEngine:
             raise EngineError("the engine is not running")
         if request.request_id in self._running:
             raise RequestError(f"request id {request.request_id} is in use")
-        start = begin(request, self._card, self._families, self._formats)
+        start = start_cursor(request, self._card, self._families, self._formats)
         if request.controls.deadline_ms is not None:
             raise RequestError("deadline_ms needs the torch engine: this one makes no drafts")
         events: asyncio.Queue[Event | Exception] = asyncio.Queue()
@@ -135,7 +135,7 @@ class TransformersEngine:
                     partial(self._inputs, request), request.scene.pictures
                 )
                 if expected is not None:
-                    start = begin(request, self._card, self._families, self._formats, expected)
+                    start = start_cursor(request, self._card, self._families, self._formats, expected)
                 loop = asyncio.get_running_loop()
 
                 def tell(event: Event | Exception) -> bool:
@@ -196,7 +196,7 @@ class TransformersEngine:
         passes = 0
         for step in self._decoding.write(asked, index):
             passes += 1
-            yield from told(
+            yield from events_of(
                 asked.request, asked.family, step.response, step.finished, (index,), self._loaded.vocabulary
             )
         yield DrawFinished(

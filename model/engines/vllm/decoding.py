@@ -20,7 +20,7 @@ from looktwice.model.engines.engine import (
     PlanRequest,
     Started,
 )
-from looktwice.model.engines.engine_requests import leads_to_reflection, read, told
+from looktwice.model.engines.engine_requests import events_of, leads_to_reflection, read
 from looktwice.model.engines.least_error import Expected, LeastError, least_error
 from looktwice.model.engines.logprobs import reported
 from looktwice.model.engines.reason_mask import ReasonMask
@@ -283,7 +283,7 @@ class Decoding:
 
     def _tell(self, draw: _Walk, finished: Sequence[SectionText]) -> None:
         vocabulary = self._parts.vocabulary
-        for event in told(self._request, self._family, draw, finished, (draw.index,), vocabulary):
+        for event in events_of(self._request, self._family, draw, finished, (draw.index,), vocabulary):
             self._happened.put_nowait(event)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from looktwice.model.driving.scene import Scene
 from looktwice.model.engines.engine import EngineError, EngineLoad, Event, PlanRequest, RequestError
-from looktwice.model.engines.engine_requests import begin, inputs_of, painted, prompt_tokens
+from looktwice.model.engines.engine_requests import inputs_of, painted, prompt_tokens, start_cursor
 from looktwice.model.engines.least_error import LeastError
 from looktwice.model.engines.picture_threads import PictureThreads
 from looktwice.model.engines.reason_mask import reason_mask_of
@@ -152,7 +152,7 @@ class VllmEngine:
         llm = self.llm
         if request.request_id in self._running:
             raise RequestError(f"request id {request.request_id} is in use")
-        start = begin(request, self._card, self._families, self._formats)
+        start = start_cursor(request, self._card, self._families, self._formats)
         if request.controls.deadline_ms is not None:
             raise RequestError("deadline_ms needs the torch engine: vLLM cannot cut a text short and go on")
         if request.controls.imagine_once:
@@ -177,7 +177,7 @@ class VllmEngine:
                 scene.pictures,
             )
             if expected is not None:
-                start = begin(request, self._card, self._families, self._formats, expected)
+                start = start_cursor(request, self._card, self._families, self._formats, expected)
             async with aclosing(decoding.events(prompt, start)) as events:
                 async for event in events:
                     yield event

@@ -58,7 +58,7 @@ def poses(count: int, *, tokens: bool = False) -> Repeat:
     return Repeat(_pose(tokens=tokens), count, count, between=", ")
 
 
-def told_poses(trajectory: FloatArray) -> tuple[dict[str, float], ...]:
+def pose_values(trajectory: FloatArray) -> tuple[dict[str, float], ...]:
     """Poses [t, 4] as a value of `poses`, as near as they can be said: what lies beyond is cut off."""
     seen = trajectory.astype(np.float64)
     seen[:, 3] = wrap_angle(seen[:, 3])

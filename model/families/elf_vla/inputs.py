@@ -7,7 +7,7 @@ from typing import Final, Literal, get_args
 from looktwice.model.driving.pdm.feedback import BEGIN, END
 from looktwice.model.driving.short_term import mission_goal
 from looktwice.model.driving.trajectory import FloatArray, present_acceleration, present_speed
-from looktwice.model.families.elf_vla.format import TIMES_S, poses, told_poses
+from looktwice.model.families.elf_vla.format import TIMES_S, pose_values, poses
 from looktwice.model.families.family import FamilyError, Situation, TextInputs
 from looktwice.model.formats import pieces
 from looktwice.model.formats.compounds import Number
@@ -40,7 +40,7 @@ def _base(situation: Situation) -> dict[str, Value]:
         "command": command_of(situation.route),
         "velocity": _SPEED_MS.nearest(present_speed(history)),
         "acceleration": _ACCELERATION_MS2.nearest(present_acceleration(history)),
-        "past": told_poses(history[list(_PAST_STEPS)]),
+        "past": pose_values(history[list(_PAST_STEPS)]),
     }
 
 
@@ -54,7 +54,7 @@ def describe_attempt(situation: Situation) -> Values:
     attempt = situation.attempt
     if attempt is None:
         raise FamilyError("there is no attempt to be refined: give a draft and feedback on it")
-    draft, feedback = told_poses(attempt.trajectory), _told(attempt.feedback)
+    draft, feedback = pose_values(attempt.trajectory), _told(attempt.feedback)
     return Values.of(_base(situation) | {"draft": draft, "feedback": feedback})
 
 

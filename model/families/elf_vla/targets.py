@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Final
 
 from looktwice.model.driving.trajectory import TEN_HZ_S, at_times
-from looktwice.model.families.elf_vla.format import ANSWER, THINK, TIMES_S, told_poses
+from looktwice.model.families.elf_vla.format import ANSWER, THINK, TIMES_S, pose_values
 from looktwice.model.families.family import FamilyError, Lesson
 from looktwice.model.formats.pieces import Values
 
@@ -25,8 +25,8 @@ def teach(lesson: Lesson) -> Values:
     """
     tried = lesson.attempt
     if tried is not None and tried.correct:
-        return Values.of({THINK: tried.thinking, ANSWER: told_poses(tried.attempt.trajectory)})
+        return Values.of({THINK: tried.thinking, ANSWER: pose_values(tried.attempt.trajectory)})
     if lesson.thoughts is None:
         raise FamilyError("no thoughts: the scene lacks agents, lanes or road, or its expert is on no lane")
     poses = at_times(lesson.future, TEN_HZ_S, TIMES_S)
-    return Values.of({THINK: str(lesson.thoughts), ANSWER: told_poses(poses)})
+    return Values.of({THINK: str(lesson.thoughts), ANSWER: pose_values(poses)})

@@ -1,6 +1,6 @@
 """VLA-World's responses (figure 5b): what is there, what will be, how that looks, and what to do about it.
 
-Its axes are the paper's: (lateral, forward) in metres, what lies to the left is negative. `told_points` and
+Its axes are the paper's: (lateral, forward) in metres, what lies to the left is negative. `point_values` and
 `read_trajectory` are the border to ours.
 """
 
@@ -98,7 +98,7 @@ def _tagged(section: str, *parts: Piece) -> Section:
 
 
 def points(count: int, *, tokens: bool = False) -> Repeat:
-    """So many points, as `told_points` makes them, their numbers in digits or as one token each."""
+    """So many points, as `point_values` makes them, their numbers in digits or as one token each."""
     return Repeat(_point(tokens), count, count, between=", ")
 
 
@@ -203,7 +203,7 @@ VLA_WORLD_TOKENS: Final = _vla_world(tokens=True)
 """For small checkpoints: metres as one token each."""
 
 
-def told_thoughts(value: Value) -> str:
+def thoughts_text(value: Value) -> str:
     """The text of the thoughts of a value of notable objects."""
     start, at, effects, end = _THOUGHT
     return " ".join(
@@ -213,7 +213,7 @@ def told_thoughts(value: Value) -> str:
     )
 
 
-def told_points(xy_m: npt.ArrayLike) -> tuple[dict[str, float], ...]:
+def point_values(xy_m: npt.ArrayLike) -> tuple[dict[str, float], ...]:
     """Points [n, 2] in the ego frame (ahead, left) as values of points, as near as they can be written.
 
     What lies beyond what can be written is moved to its border. Raises `FormatError` for what is not finite.
@@ -228,7 +228,7 @@ def told_points(xy_m: npt.ArrayLike) -> tuple[dict[str, float], ...]:
 
 
 def read_points(value: Value) -> npt.NDArray[np.float64]:
-    """Points [n, 2] in the ego frame (ahead, left) of a value of points: `told_points` undone."""
+    """Points [n, 2] in the ego frame (ahead, left) of a value of points: `point_values` undone."""
     told = cast("Several[dict[str, float]]", value)
     return from_paper_axes([[each["lateral_m"], each["forward_m"]] for each in told])
 

@@ -11,7 +11,7 @@ from typing import Final
 from looktwice.model.driving.short_term import mission_goal
 from looktwice.model.driving.trajectory import STEP_S, FloatArray, present_acceleration, present_speed
 from looktwice.model.families.family import Situation, TextInputs
-from looktwice.model.families.vla_world.format import CAMERA_OPTIONS, points, told_points
+from looktwice.model.families.vla_world.format import CAMERA_OPTIONS, point_values, points
 from looktwice.model.formats.compounds import Number
 from looktwice.model.formats.pieces import (
     Choice,
@@ -52,7 +52,7 @@ def describe(situation: Situation) -> Values:
             "velocity": _SPEED_MS.nearest(present_speed(history)),
             "yaw_rate": _YAW_RATE_RADS.nearest(yaw_rate),
             "acceleration": _ACCELERATION_MS2.nearest(present_acceleration(history)),
-            "past": told_points(history[list(_PAST_STEPS), :2]),
+            "past": point_values(history[list(_PAST_STEPS), :2]),
             "goal": goal_of(situation.route),
             "camera": ANY_CAMERA if situation.camera is None else CAMERA_OPTIONS[situation.camera],
         }

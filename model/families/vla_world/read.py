@@ -10,8 +10,8 @@ from looktwice.model.families.family import Decode, Foreseen, NextPicture, Predi
 from looktwice.model.families.picture_codes import PICTURE_CODES, beside
 from looktwice.model.families.vla_world import format as its
 from looktwice.model.families.vla_world.actions import Action, counted
+from looktwice.model.formats.fixed import Decided
 from looktwice.model.formats.pieces import Value, Values
-from looktwice.model.formats.said import Decided
 
 _CAMERAS = {written: camera for camera, written in its.CAMERA_OPTIONS.items()}
 
@@ -27,7 +27,7 @@ def read(values: Values, decode: Decode) -> Reading:
 def thoughts_text(values: tuple[Value, ...]) -> str | None:
     """The text of its thoughts; None where nobody comes near."""
     [notable] = values
-    return its.told_thoughts(notable) or None
+    return its.thoughts_text(notable) or None
 
 
 def perceived(values: tuple[Value, ...], thoughts: Value = ()) -> Perceived:
@@ -45,7 +45,7 @@ def predicted(values: tuple[Value, ...]) -> Predicted:
 
 def predicting(x_m: float, y_m: float) -> tuple[Value, ...]:
     """The first value of a prediction: where the ego will be."""
-    return (its.told_points([[x_m, y_m]])[0],)
+    return (its.point_values([[x_m, y_m]])[0],)
 
 
 def expecting(expected: tuple[int, ...] | None, given: tuple[int, ...] | None) -> tuple[Decided, ...]:

@@ -32,7 +32,7 @@ def teach(lesson: Lesson) -> Values:
     if perceived is None:
         raise FamilyError("nothing to perceive: the scene lacks the edges of the road")
     waypoints = at_times(lesson.future, TEN_HZ_S, its.TIMES_S)[:, :2]
-    action, points = action_of(waypoints), its.told_points(waypoints)
+    action, points = action_of(waypoints), its.point_values(waypoints)
     agents = perceived.agents[: its.MAX_OBJECTS]
     objects = tuple(
         {"kind": agent.kind, "object_id": float(number), **_place(agent), **_size(agent)}
@@ -55,7 +55,7 @@ def teach(lesson: Lesson) -> Values:
 
 
 def _place(agent: PerceivedAgent) -> Mapping[str, float]:
-    [point] = its.told_points([[agent.x_m, agent.y_m]])
+    [point] = its.point_values([[agent.x_m, agent.y_m]])
     return point
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from torch import Tensor, nn
 
 from looktwice.model.engines.engine import Draw, PlanRequest
-from looktwice.model.engines.engine_requests import decided, given_plans, read, said
+from looktwice.model.engines.engine_requests import decided, fixed_values, given_plans, read
 from looktwice.model.engines.sampling import probabilities
 from looktwice.model.engines.transformers.plain_decoder import PlainDecoder
 from looktwice.model.families.family import Family
@@ -75,7 +75,7 @@ def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> t
     compiled = CompiledFormat(family.format, loaded.vocabulary)
     expected = loaded.inputs.expected(request.scene, controls.view)
     start = compiled.start(
-        given_plans(request, family), decided(request, family), said(request, family, expected)
+        given_plans(request, family), decided(request, family), fixed_values(request, family, expected)
     )
     asked = decoding.begin(request, family, start, inputs)
     shares: Shares = {}

@@ -29,10 +29,10 @@ from looktwice.model.families.vla_world.format import (
     UNSEEN,
     VLA_WORLD_FORMAT,
     VLA_WORLD_TOKENS,
+    point_values,
     read_points,
     read_trajectory,
-    told_points,
-    told_thoughts,
+    thoughts_text,
 )
 from looktwice.model.families.vla_world.inputs import describe
 from looktwice.model.families.vla_world.read import read
@@ -175,7 +175,7 @@ def test_a_picture_is_98_codes_and_nothing_else() -> None:
 
 def test_thoughts_are_read_in_the_words_that_are_written() -> None:
     reading = read(SAMPLE, lambda codes: pytest.fail("there are no codes"))
-    assert VLA_WORLD.reflected(SAMPLE) == told_thoughts(SAMPLE["think"])
+    assert VLA_WORLD.reflected(SAMPLE) == thoughts_text(SAMPLE["think"])
     assert f"<think>{VLA_WORLD.reflected(SAMPLE)}</think>" in written(SAMPLE)
     assert (reading.trajectory.shape, reading.codes, reading.branch) == ((6, 4), (), None)
     np.testing.assert_allclose(reading.trajectory[:, :2], [[0.5, 0.1]] * 6, rtol=1e-6)
@@ -190,16 +190,16 @@ def test_every_camera_can_be_asked_for() -> None:
 
 @given(st.lists(st.tuples(st.floats(-49, 119), st.floats(-49, 49)), min_size=1, max_size=6))
 def test_points_are_told_to_a_twentieth_of_a_metre(points: list[tuple[float, float]]) -> None:
-    np.testing.assert_allclose(read_points(told_points(points)), points, atol=0.0501)
+    np.testing.assert_allclose(read_points(point_values(points)), points, atol=0.0501)
 
 
 def test_points_beyond_are_at_the_border_and_left_is_negative() -> None:
-    assert told_points([[10.0, 2.0], [500.0, -500.0]]) == (
+    assert point_values([[10.0, 2.0], [500.0, -500.0]]) == (
         {"lateral_m": -2.0, "forward_m": 10.0},
         {"lateral_m": 50.0, "forward_m": 120.0},
     )
     with pytest.raises(FormatError, match="finite"):
-        told_points([[np.nan, 0.0]])
+        point_values([[np.nan, 0.0]])
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_headings_follow_the_way(speed: float, yaw_rate: float) -> None:
     _, history = drive(speed, yaw_rate)
     rows = [round(time_s / 0.1) - 1 for time_s in TIMES_S]
     expected = constant_turn_rate(history)[rows]
-    trajectory = read_trajectory(told_points(expected[:, :2]))
+    trajectory = read_trajectory(point_values(expected[:, :2]))
     np.testing.assert_allclose(trajectory[:, :2], expected[:, :2], atol=0.0501)
     # Each is the heading of the chord behind, half a step's turn late, and of rounded points.
     assert np.abs(trajectory[:, 3] - expected[:, 3]).max() < abs(yaw_rate) * 0.25 + 0.11
@@ -367,7 +367,7 @@ def reading_of(waypoints: list[list[float]], **foreseen: Any) -> Reading:
     x_m, y_m = waypoints[0]
     told = {"x_m": x_m, "y_m": y_m, "direction": action.direction} | foreseen
     seen = Foreseen(SEEN, picture=None, **told)
-    return Reading(read_trajectory(told_points(waypoints)), foreseen=seen, action=counted(action))
+    return Reading(read_trajectory(point_values(waypoints)), foreseen=seen, action=counted(action))
 
 
 EXPERT = FUTURE[4:30:5, :2].tolist()
@@ -411,4 +411,4 @@ def test_a_trajectory_loses_by_distance_and_by_jerks() -> None:
 
 def test_responses_that_foresee_nothing_have_no_rewards() -> None:
     with pytest.raises(FamilyError, match="nothing is foreseen"):
-        rewards(FUTURE, Reading(read_trajectory(told_points(EXPERT))))
+        rewards(FUTURE, Reading(read_trajectory(point_values(EXPERT))))

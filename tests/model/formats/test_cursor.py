@@ -11,9 +11,9 @@ from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.families.cf_vla.format import MAX_THINKING_TOKENS
 from looktwice.model.families.cf_vla.traj_only import TRAJ_ONLY
 from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.fixed import FixedValues
 from looktwice.model.formats.pieces import Format, FormatError, Value, Values
 from looktwice.model.formats.plan_tracks import MAX_SEGMENTS
-from looktwice.model.formats.said import Said
 from looktwice.model.formats.text import parse
 from tests.model.formats.strategies import VOCABULARY, branching_formats, cf_vla_values, plans
 from tests.model.formats.test_laws import walk
@@ -197,19 +197,19 @@ def test_only_options_that_there_are_can_be_picked(picks: dict[str, str], messag
         ({"plan": ("Keep Lane",)}, "a plan is needed, not 'Keep Lane'"),
     ],
 )
-def test_only_what_a_section_can_say_is_decided(said: Said, message: str) -> None:
+def test_only_what_a_section_can_say_is_decided(said: FixedValues, message: str) -> None:
     with pytest.raises(FormatError, match=message):
-        COMPILED.start(said=said)
+        COMPILED.start(fixed=said)
 
 
 def test_codes_may_be_decided() -> None:
     compiled = CompiledFormat(TRAJ_ONLY.format, VOCABULARY)
     values = Values({"trajectory": ((3, 1, 4, 1, 5, 9),)})
-    forced, cursor = compiled.start(said=values.by_section).forced()
+    forced, cursor = compiled.start(fixed=values.by_section).forced()
     assert cursor.done
     assert forced == compiled.render(values)
     with pytest.raises(FormatError, match=r"6 codes are needed, not \(1, 2\)"):
-        compiled.start(said={"trajectory": ((1, 2),)})
+        compiled.start(fixed={"trajectory": ((1, 2),)})
 
 
 @given(cf_vla_values())

@@ -57,7 +57,7 @@ def test_what_is_decided_is_forced_and_the_rest_is_not(data: st.DataObject, comp
     section = data.draw(st.sampled_from([*values, "nowhere"]))
     count = data.draw(st.integers(0, len(values.all(section))))
     try:
-        cursor = compiled.start(said={section: values.all(section)[:count]})
+        cursor = compiled.start(fixed={section: values.all(section)[:count]})
     except FormatError:
         # In free words nothing can be decided, nor in sections that stand in several places.
         assume(False)

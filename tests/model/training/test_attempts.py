@@ -16,7 +16,7 @@ from looktwice.model.driving.trajectory import HALF_SECONDS_S
 from looktwice.model.families.elf_vla.targets import WEIGHTS
 from looktwice.model.families.family import JudgedAttempt
 from looktwice.model.network.checkpoint import Loaded, load, with_formats
-from looktwice.model.training.attempts import attempts_on
+from looktwice.model.training.attempts import place_attempts
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.recipes import NANO
 from looktwice.model.training.responses import ResponseDataset
@@ -64,7 +64,7 @@ def elf(resampling_checkpoint: Path) -> Loaded:
 
 def dataset(elf: Loaded, rows: list[FeedbackRow]) -> ResponseDataset:
     examples = Examples.from_scenes(SCENES, elf.settings.cameras)
-    found = attempts_on(examples, rows, HALF_SECONDS_S, ALL)
+    found = place_attempts(examples, rows, HALF_SECONDS_S, ALL)
     return ResponseDataset(
         examples,
         elf.codec,
@@ -79,7 +79,7 @@ def dataset(elf: Loaded, rows: list[FeedbackRow]) -> ResponseDataset:
 
 def test_answers_find_their_scenes_and_times() -> None:
     dense = [[0.8 * step, 0.5, 0.02] for step in range(1, 65)]
-    found = attempts_on(
+    found = place_attempts(
         EXAMPLES, [row("scene-4"), replace(row("scene-0"), trajectory=dense)], HALF_SECONDS_S, ALL
     )
     assert found.examples.tolist() == [4, 0]
@@ -87,14 +87,14 @@ def test_answers_find_their_scenes_and_times() -> None:
         np.testing.assert_allclose(each.attempt.trajectory[:, [0, 1, 3]], EIGHT, rtol=1e-6)
         assert "It's too fast." in each.attempt.feedback
     with pytest.raises(ValueError, match="feedback on scene nowhere, which is not among"):
-        attempts_on(EXAMPLES, [row("nowhere")], HALF_SECONDS_S, ALL)
+        place_attempts(EXAMPLES, [row("nowhere")], HALF_SECONDS_S, ALL)
     with pytest.raises(ValueError, match="draw 1 in scene scene-4 is right and has no thoughts"):
-        attempts_on(EXAMPLES, [row("scene-4", correct=True, think=None)], HALF_SECONDS_S, ALL)
+        place_attempts(EXAMPLES, [row("scene-4", correct=True, think=None)], HALF_SECONDS_S, ALL)
 
 
 def test_wrong_answers_are_left_out_where_the_expert_tells_no_thoughts() -> None:
     rows = [row("scene-4"), row("scene-4", correct=True), row("scene-0")]
-    found = attempts_on(EXAMPLES, rows, HALF_SECONDS_S, np.arange(len(EXAMPLES)) != 4)
+    found = place_attempts(EXAMPLES, rows, HALF_SECONDS_S, np.arange(len(EXAMPLES)) != 4)
     assert [(int(place), each.correct) for place, each in zip(*found, strict=True)] == [(4, True), (0, False)]
 
 
@@ -114,7 +114,7 @@ def test_what_was_wrong_is_corrected_and_what_was_right_is_said_again(elf: Loade
 
 def test_training_reads_the_prompts_that_the_engine_reads(elf: Loaded) -> None:
     rows = [row("scene-4")]
-    [tried] = attempts_on(EXAMPLES, rows, HALF_SECONDS_S, ALL).attempts
+    [tried] = place_attempts(EXAMPLES, rows, HALF_SECONDS_S, ALL).attempts
     built = elf.inputs.build(SCENES[4].scene, "elf_vla_refine", tried.attempt)
     assert dataset(elf, rows)[Item(4, "elf_vla_refine", True, attempt=0)].prompt == built.prompt.ids.tolist()
 
@@ -189,6 +189,6 @@ def test_a_run_learns_to_refine_and_tells_so(resampling_checkpoint: Path, tmp_pa
 
 
 def test_a_right_answer_is_told_as_it_was(elf: Loaded) -> None:
-    [tried] = attempts_on(EXAMPLES, [row("scene-4", correct=True)], HALF_SECONDS_S, ALL).attempts
+    [tried] = place_attempts(EXAMPLES, [row("scene-4", correct=True)], HALF_SECONDS_S, ALL).attempts
     assert isinstance(tried, JudgedAttempt)
     assert tried.thinking == str(SOME)

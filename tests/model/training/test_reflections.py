@@ -8,7 +8,7 @@ from looktwice.model.driving.reflection_store import LabelledReflection
 from looktwice.model.driving.scene import FRONT_WIDE
 from looktwice.model.families.family import Counterfactual
 from looktwice.model.training.examples import Examples
-from looktwice.model.training.reflections import mirrored, reflections_on
+from looktwice.model.training.reflections import mirrored, place_reflections
 from tests.model.training.scenes import training_scene
 
 PLAN = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
@@ -22,7 +22,7 @@ def reflection(scene_id: str, text: str) -> LabelledReflection:
 
 
 def test_reflections_find_their_examples_in_plain_punctuation() -> None:
-    found = reflections_on(
+    found = place_reflections(
         EXAMPLES,
         [reflection(str(EXAMPLES.scene_id[2]), "The car\u2019s brake lights\u2026 I \u201cwait\u201d.")],
     )
@@ -49,4 +49,4 @@ def test_a_mirrored_reflection_says_the_other_side() -> None:
 
 def test_a_reflection_on_an_unknown_scene_is_refused() -> None:
     with pytest.raises(ValueError, match="scene nowhere, which is not among"):
-        reflections_on(EXAMPLES, [reflection("nowhere", "")])
+        place_reflections(EXAMPLES, [reflection("nowhere", "")])

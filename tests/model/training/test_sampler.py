@@ -186,8 +186,8 @@ def test_pictures_are_taught_where_there_are_any_and_asked_for_in_most_of_them()
     assert all(item.index % 2 for item in taught)
     assert abs(len(taught) / len(items) - 0.25) < 0.03
     assert abs(sum(item.camera == "back" for item in taught) / len(taught) - 0.5) < 0.05
-    assert abs(sum(item.asked for item in taught) / len(taught) - 0.8) < 0.05
-    assert not any(item.asked for item in items if item.camera is None)
+    assert abs(sum(item.camera_requested for item in taught) / len(taught) - 0.8) < 0.05
+    assert not any(item.camera_requested for item in items if item.camera is None)
     # A picture is a third of a response: those with one share batches.
     mixed = [batch for batch in batches if len({item.camera is None for item in batch}) == 2]
     assert len(mixed) <= 4 < len(batches) / 20

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from looktwice.service.admission.places import PATIENCE_S, Admission, Full, whole_seconds
+from looktwice.service.admission.places import MAX_WAIT_S, Admission, Full, whole_seconds
 
 
 @dataclass
@@ -160,7 +160,7 @@ def test_a_batch_gets_on_although_others_keep_coming() -> None:
 
         async def scene() -> None:
             async with admission.place_in_turn(4) as place:
-                assert place.waited_s == pytest.approx(PATIENCE_S + 0.1)
+                assert place.waited_s == pytest.approx(MAX_WAIT_S + 0.1)
                 began.set()
 
         with admission.place(1):
@@ -168,7 +168,7 @@ def test_a_batch_gets_on_although_others_keep_coming() -> None:
             await asyncio.sleep(0)
             assert [place.draws for place in admission.waiting] == [1, 4]
             with admission.place(3):
-                clock.now_s += PATIENCE_S + 0.1
+                clock.now_s += MAX_WAIT_S + 0.1
             # There is room for another, but the batch's scene has waited for long enough.
             with pytest.raises(Full, match="goes first"):
                 admission.check_open()

@@ -187,6 +187,6 @@ def test_a_file_with_much_to_tell_is_refused(
 
 
 def test_a_file_that_takes_too_long_is_ended(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(files, "MAX_WAIT_S", 0.01)
     with pytest.raises(ProblemError, match=r"longer than 0\.01 s"):
         asyncio.run(files.read_scene_file(scene_file.read_bytes()))

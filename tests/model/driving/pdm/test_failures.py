@@ -13,7 +13,7 @@ from looktwice.model.driving.pdm.course import course_of
 from looktwice.model.driving.pdm.failures import Fact, facts_of
 from looktwice.model.driving.pdm.feedback import Feedback, parse_feedback
 from looktwice.model.driving.pdm.judged import Measurement, foreign_numbers, numbers
-from looktwice.model.driving.pdm.judging import Said, judged_plans
+from looktwice.model.driving.pdm.judging import PlanExplanation, judged_plans
 from looktwice.model.driving.pdm.rule_teacher import SHORT, critique
 from looktwice.model.driving.pdm.scoring import (
     COLLISIONS,
@@ -166,7 +166,9 @@ def test_facts_are_the_sub_scores_below_1_and_feedback_speaks_of_nothing_else(se
 def judged_leader(think: str | None = None, truth: Array | None = None, words: str | None = None) -> Feedback:
     world = road(tracks=(replace(standing("7", 20.0), kind="vehicle"),))
     scores = score(world, straight(8)[None], "v1.1")
-    (plan,) = judged_plans(world, straight(8)[None], scores, Others(), said=[Said(words, think)], truth=truth)
+    (plan,) = judged_plans(
+        world, straight(8)[None], scores, Others(), said=[PlanExplanation(words, think)], truth=truth
+    )
     return critique(plan)
 
 

@@ -26,22 +26,22 @@ from looktwice.model.formats.writing import ByName, InOrder, ValueSource
 
 Decided: TypeAlias = "Value | tuple[int | None, ...]"
 """A value; of codes, some places may be left open."""
-Said: TypeAlias = Mapping[str, tuple[Decided, ...]]
+FixedValues: TypeAlias = Mapping[str, tuple[Decided, ...]]
 """By section its first values, in order; those behind them are left open."""
 
 
-def with_said(body: Piece, said: Said) -> Piece:
+def with_fixed(body: Piece, fixed: FixedValues) -> Piece:
     """``body`` with the first values of sections decided: nothing else can be written there.
 
     Raises:
         FormatError: there is no such section, or it stands in several places, or it cannot say this.
     """
     places = Counter(piece.name for piece in walk(body) if isinstance(piece, Section))
-    for name in said:
+    for name in fixed:
         if places[name] > 1:
             raise FormatError(f"section {name!r} stands in {places[name]} places")
     # Codes that are left open are looked at nowhere but in `_decided`.
-    values = cast("Mapping[str, tuple[Value, ...]]", said)
+    values = cast("Mapping[str, tuple[Value, ...]]", fixed)
     sources = {name: InOrder(each, f"section {name!r}") for name, each in values.items()}
     found = _decided(body, sources.get(""), sources)
     for source in sources.values():
