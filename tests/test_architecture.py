@@ -43,6 +43,10 @@ ALLOWED = {
         *("model/training", "model/evaluation", "model/engines", "model/network", "model/families"),
         *("model/formats", "model/driving"),
     ),
+    "model/training/outcome": (
+        *("model/training", "model/engines", "model/network", "model/families", "model/formats"),
+        "model/driving",
+    ),
     "clients": ("clients", "model/driving"),
     "clients/summaries": ("clients/summaries", "model/driving"),
     "clients/metadrive": (),

@@ -18,8 +18,8 @@ from looktwice.model.families.cf_vla.targets import CODE_WEIGHTS, NANO_WEIGHTS, 
 from looktwice.model.families.elf_vla import targets as elf_vla
 from looktwice.model.families.vla_world import targets as vla_world
 from looktwice.model.families.vla_world.rewards import REWARDS as VLA_WORLD_REWARDS
+from looktwice.model.training.outcome.draw_rewards import RewardWeights
 from looktwice.model.training.response_targets import SectionWeights
-from looktwice.model.training.rewards import RewardWeights
 
 Goal = Literal["ground", "read", "respond", "outcome", "code"]
 FeedbackWriter = Literal["teacher", "rule"]
@@ -28,7 +28,7 @@ FeedbackWriter = Literal["teacher", "rule"]
 @dataclass(frozen=True)
 class RefineSettings:
     """How a network's own refinements are learned from as first answers; see
-    `looktwice.model.training.outcomes`.
+    `looktwice.model.training.outcome.outcome_learner`.
 
     Attributes:
         format: that it refines in; what it writes there must be an answer in the format of its draws.
@@ -48,7 +48,7 @@ class RefineSettings:
 
 @dataclass(frozen=True)
 class OutcomeSettings:
-    """How a network learns from what comes of its own draws; see `looktwice.model.training.outcomes`.
+    """How a network learns from what comes of its own draws; see `looktwice.model.training.outcome`.
 
     Attributes:
         draws: of each scene, compared with each other.

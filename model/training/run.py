@@ -60,7 +60,7 @@ from looktwice.model.training.intents import (
 )
 from looktwice.model.training.learner import ResponseLearner
 from looktwice.model.training.open_loop_validation import open_loop
-from looktwice.model.training.outcomes import OutcomeLearner, ScenePlaces, collate_places
+from looktwice.model.training.outcome.outcome_learner import OutcomeLearner, ScenePlaces, collate_places
 from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.recipes import Recipe
 from looktwice.model.training.reflections import PlacedReflections, place_reflections

@@ -47,7 +47,7 @@ from looktwice.model.network.checkpoint import load, read_parts
 from looktwice.model.network.vla_settings import NANO_SETTINGS, VlaSettings
 from looktwice.model.training.batches import collate
 from looktwice.model.training.learner import ResponseLearner
-from looktwice.model.training.rollouts import rollout
+from looktwice.model.training.outcome.rollouts import rollout
 from tests.checkpoints import write_untrained
 from tests.model.engines.contract import CONTRACT, Check
 

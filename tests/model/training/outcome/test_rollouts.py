@@ -19,7 +19,7 @@ from looktwice.model.formats.replay import decisions
 from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.training.batches import collate
 from looktwice.model.training.learner import ResponseLearner
-from looktwice.model.training.rollouts import rollout
+from looktwice.model.training.outcome.rollouts import rollout
 from tests.model.engines.decoding import decode, request
 from tests.model.engines.reference import exactly, reference
 

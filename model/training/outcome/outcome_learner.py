@@ -1,9 +1,9 @@
 """Learning from what comes of the network's own draws: they are made, judged and learned from in one step.
 
-Words, numbers and codes are drawn, and learned from by `looktwice.model.training.policy`: plans with their
-times, the branch and the codes of CF-VLA, thoughts and poses of ELF-VLA, all of VLA-World. The policy is
-the distribution that decodes: over the tokens that the format allows, at the temperature of the draws. Beside
-it the expert is imitated a little, against drivers who find a gap in the score.
+Words, numbers and codes are drawn, and learned from by `looktwice.model.training.outcome.policy`: plans with
+their times, the branch and the codes of CF-VLA, thoughts and poses of ELF-VLA, all of VLA-World. The policy
+is the distribution that decodes: over the tokens that the format allows, at the temperature of the draws.
+Beside it the expert is imitated a little, against drivers who find a gap in the score.
 
 Where all draws of a scene fail, nothing says what would be better. There the network refines its best draw by
 feedback, of the built-in teacher or by rule, which knows what the expert did. The refinement joins the draws
@@ -37,11 +37,11 @@ from looktwice.model.formats.replay import Decision, decisions
 from looktwice.model.network.checkpoint import Loaded
 from looktwice.model.training.batches import ResponseSample, collate
 from looktwice.model.training.learner import ResponseLearner
-from looktwice.model.training.policy import advantages, divergence, policy_loss
+from looktwice.model.training.outcome.draw_rewards import Rewards, RewardWeights, family_rewards, rewards
+from looktwice.model.training.outcome.policy import advantages, divergence, policy_loss
+from looktwice.model.training.outcome.rollouts import with_draws
 from looktwice.model.training.recipes import FeedbackWriter, OutcomeSettings
 from looktwice.model.training.responses import ResponseDataset
-from looktwice.model.training.rewards import Rewards, RewardWeights, family_rewards, rewards
-from looktwice.model.training.rollouts import with_draws
 from looktwice.model.training.sampler import Item
 
 _MAX_SEED = 2**31

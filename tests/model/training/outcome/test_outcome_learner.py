@@ -27,15 +27,15 @@ from looktwice.model.formats.replay import decisions
 from looktwice.model.network.checkpoint import load
 from looktwice.model.network.vla_settings import NANO_SETTINGS
 from looktwice.model.training.batches import collate
-from looktwice.model.training.outcomes import OutcomeLearner
-from looktwice.model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_with
-from looktwice.model.training.rewards import (
+from looktwice.model.training.outcome.draw_rewards import (
     RewardWeights,
     family_rewards,
     form_reward,
     goal_reward,
     rewards,
 )
+from looktwice.model.training.outcome.outcome_learner import OutcomeLearner
+from looktwice.model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_with
 from looktwice.model.training.run import RunSettings, run
 from looktwice.model.training.sampler import Item
 from tests.checkpoints import write_untrained

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from looktwice.model.training.policy import advantages, divergence, policy_loss
+from looktwice.model.training.outcome.policy import advantages, divergence, policy_loss
 
 
 def test_draws_are_compared_with_their_own_scene() -> None:

@@ -1,0 +1,1 @@
+"""Learning from what comes of a network's own draws: rollouts, rewards, the policy loss, the learner."""
