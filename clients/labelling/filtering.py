@@ -70,7 +70,7 @@ class Filtered:
     draws: tuple[int, ...]
 
     @property
-    def kept(self) -> bool:
+    def selected(self) -> bool:
         """Whether anything of the scene is."""
         return bool(self.draws)
 
@@ -112,8 +112,8 @@ def summary(scenes: Iterable[Filtered]) -> dict[str, Any]:
         plans += len(scene.draws)
         for tag in scene.entry.record["tags"] or [QUIET]:
             total[tag] += 1
-            kept[tag] += scene.kept
-        kept[""] += scene.kept
+            kept[tag] += scene.selected
+        kept[""] += scene.selected
     return {
         "scenes": count,
         "kept": kept[""],

@@ -26,7 +26,7 @@ def scatter(scenes: Sequence[Filtered], thresholds: Thresholds | None, picture: 
     points = axes.scatter(free, prefilled, c=overlaps, s=6, cmap="viridis", vmin=0, vmax=1, linewidths=0)
     axes.set(xscale="log", yscale="log", xlim=_RANGE_M, ylim=_RANGE_M, aspect="equal")
     axes.plot(_RANGE_M, _RANGE_M, color="0.3", linewidth=0.8)
-    kept, where = f"{sum(scene.kept for scene in scenes)} of {len(scenes)}", ""
+    kept, where = f"{sum(scene.selected for scene in scenes)} of {len(scenes)}", ""
     if thresholds is None:
         where = ": their plans fail when followed"
     elif thresholds.everything:

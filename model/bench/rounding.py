@@ -13,7 +13,7 @@ from looktwice.model.driving.scene import Scene
 from looktwice.model.engines.engine import Controls, PlanRequest
 from looktwice.model.engines.sampling import probabilities, uniform
 from looktwice.model.engines.torch.batch import Batch, Feed
-from looktwice.model.engines.torch.offline import draws_of
+from looktwice.model.engines.torch.in_process import draws_of
 from looktwice.model.engines.torch.runner import PromptPrefill, PromptRequest, Runner
 from looktwice.model.network.checkpoint import load
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from looktwice.model.driving.labeller import ACCELERATION_ENTER, MIN_HEADING_CHANGE, WAIT_LEAVE
-from looktwice.model.driving.lane_graph import LaneGraph, Way
+from looktwice.model.driving.lane_graph import LaneGraph, LanePath
 from looktwice.model.driving.lead import LANE_HALF_WIDTH_M
 from looktwice.model.driving.trajectory import TEN_HZ_S, FloatArray, GeometryError, at_times, wrap_angle
 
@@ -89,7 +89,7 @@ def action_of(
         GeometryError: the trajectory ends before `HORIZON_S`.
     """
     poses = _poses(trajectory, times_s)
-    way = graph.way_along(poses[:, :2])
+    way = graph.path_along(poses[:, :2])
     return None if way is None else HighLevelAction(_longitudinal(poses), _lateral(poses, way))
 
 
@@ -132,7 +132,7 @@ def _longitudinal(poses: Array) -> Longitudinal:
     return "accelerate" if strongest > 0 else "decelerate"
 
 
-def _lateral(poses: Array, way: Way) -> Lateral:
+def _lateral(poses: Array, way: LanePath) -> Lateral:
     path = poses[:, :2]
     if np.linalg.norm(np.diff(path, axis=0), axis=1).sum() < MOVED_M:
         return "keep"

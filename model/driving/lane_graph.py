@@ -33,7 +33,7 @@ _APART_M: Final = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class LanePath:
     """Lanes one after the other.
 
     Attributes:
@@ -84,7 +84,7 @@ class LaneGraph:
         nearest = min(distances.values(), default=0.0)
         return tuple(number for number, each in distances.items() if each <= nearest + _AS_NEAR_M)
 
-    def way_along(self, path: Array) -> Way | None:
+    def path_along(self, path: Array) -> LanePath | None:
         """The lanes that a path [n, 2] from the ego's place follows; None where the ego is on no lane.
 
         The path begins on their first lane. It may leave them: for lane changes they go on beside it.
@@ -97,7 +97,7 @@ class LaneGraph:
         ]
         return min(ways, key=lambda way: _apart(way, path), default=None)
 
-    def _ways(self, lanes: tuple[int, ...], wanted_m: float, reached_m: float) -> Iterator[Way]:
+    def _ways(self, lanes: tuple[int, ...], wanted_m: float, reached_m: float) -> Iterator[LanePath]:
         line = _joined([self.lines[lane] for lane in lanes])
         nearest = int(np.linalg.norm(line, axis=1).argmin())
         left_m = float(np.linalg.norm(np.diff(line[nearest:], axis=0), axis=1).sum())
@@ -106,7 +106,7 @@ class LaneGraph:
             for lane in further:
                 yield from self._ways((*lanes, lane), wanted_m, reached_m)
         else:
-            yield Way(lanes, line, self._at_fork(lanes, reached_m))
+            yield LanePath(lanes, line, self._at_fork(lanes, reached_m))
 
     def _at_fork(self, lanes: tuple[int, ...], reached_m: float) -> bool:
         if any(lanes[0] in each and len(each) > 1 for each in self._follows):
@@ -152,5 +152,5 @@ def _joined(lines: Sequence[Array]) -> Array:
     return points[there]
 
 
-def _apart(way: Way, path: Array) -> float:
+def _apart(way: LanePath, path: Array) -> float:
     return float(np.abs(way.frame.places(path)[:, 1]).mean())

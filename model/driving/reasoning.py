@@ -17,7 +17,7 @@ import numpy.typing as npt
 from looktwice.model.driving.agents import ROAD_USERS, Agent
 from looktwice.model.driving.high_level import action_of
 from looktwice.model.driving.labeller import LANE_MOVING
-from looktwice.model.driving.lane_graph import LaneGraph, Way
+from looktwice.model.driving.lane_graph import LaneGraph, LanePath
 from looktwice.model.driving.lead import LANE_HALF_WIDTH_M
 from looktwice.model.driving.phrases import Side, State
 from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M, LabelledScene
@@ -84,7 +84,7 @@ def thoughts_of(labelled: LabelledScene) -> Thoughts | None:
     None where the scene has no annotated road, or the expert drives on no lane: then nothing can be said.
     """
     graph = LaneGraph(labelled.lane_lines)
-    way = graph.way_along(np.concatenate([np.zeros((1, 2)), labelled.future[:, :2].astype(np.float64)]))
+    way = graph.path_along(np.concatenate([np.zeros((1, 2)), labelled.future[:, :2].astype(np.float64)]))
     action = action_of(labelled.future, graph)
     if way is None or action is None or not labelled.drivable:
         return None
@@ -147,7 +147,7 @@ def _told_edge(nearest_m: float) -> float | None:
     return None if steps * EDGE_STEP_M > EDGE_FARTHEST_M else steps * EDGE_STEP_M
 
 
-def _placed(agents: tuple[Agent, ...], way: Way) -> list[_Placed]:
+def _placed(agents: tuple[Agent, ...], way: LanePath) -> list[_Placed]:
     """Visible agents relative to the ego's lane, the nearest along it first."""
     found = []
     known = [(agent, track) for agent in agents if (track := track_of(agent)) is not None]
@@ -186,7 +186,7 @@ def _state(leader: _Placed, speed_ms: float) -> State:
     return "slower" if leader.along_ms < speed_ms - SLOWER_BY_MS else ""
 
 
-def _merging(placed: Iterable[_Placed], graph: LaneGraph, way: Way, speed_ms: float) -> _Placed | None:
+def _merging(placed: Iterable[_Placed], graph: LaneGraph, way: LanePath, speed_ms: float) -> _Placed | None:
     """The nearest vehicle in a lane beside that moves over, signals to, or whose lane ends in the ego's."""
     for each in placed:
         beside = LANE_HALF_WIDTH_M <= abs(each.left_m) < 3 * LANE_HALF_WIDTH_M
@@ -213,7 +213,7 @@ def _signals(each: _Placed) -> bool:
     return towards in lights and not {"left", "right"} <= lights
 
 
-def _lanes_merge(each: _Placed, graph: LaneGraph, way: Way, speed_ms: float) -> bool:
+def _lanes_merge(each: _Placed, graph: LaneGraph, way: LanePath, speed_ms: float) -> bool:
     """Whether its lane leads into the ego's, and both are there within `FORESIGHT_S` of each other."""
     point = np.array([each.track.x_m, each.track.y_m])
     for lane in graph.lanes_at(point, each.track.heading_rad):
@@ -226,7 +226,7 @@ def _lanes_merge(each: _Placed, graph: LaneGraph, way: Way, speed_ms: float) -> 
     return False
 
 
-def _crossing(placed: Iterable[_Placed], way: Way, speed_ms: float) -> Crossing | None:
+def _crossing(placed: Iterable[_Placed], way: LanePath, speed_ms: float) -> Crossing | None:
     """Who comes into the ego's way soonest, as it goes on along its lane at its speed."""
     speed_ms = max(speed_ms, _SLOWEST_MS)
     found = [
@@ -237,7 +237,7 @@ def _crossing(placed: Iterable[_Placed], way: Way, speed_ms: float) -> Crossing 
     return min(found, key=lambda each: each[0])[1] if found else None
 
 
-def _crosses(each: _Placed, way: Way, speed_ms: float) -> tuple[float, Crossing] | None:
+def _crosses(each: _Placed, way: LanePath, speed_ms: float) -> tuple[float, Crossing] | None:
     """When the agent comes into the ego's way, and what there is to tell of it."""
     kind: Crosser = "pedestrian" if each.track.kind == "pedestrian" else "vehicle"
     if each.in_lane:
@@ -266,7 +266,7 @@ def _crosses(each: _Placed, way: Way, speed_ms: float) -> tuple[float, Crossing]
     return float(there_s[first]), Crossing(kind, origin, estimated_m(ahead_m), before)
 
 
-def _road(graph: LaneGraph, way: Way) -> Road:
+def _road(graph: LaneGraph, way: LanePath) -> Road:
     bend, bend_m = bend_along(way.ahead)
     sides = beside_of(list(graph.lines))
     beside: Beside = "none" if not sides else "both" if len(sides) == 2 else min(sides)

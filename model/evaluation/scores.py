@@ -199,7 +199,7 @@ Planner = Callable[[LabelledScene], tuple[FloatArray, Array | None]]
 """A trajectory [8 or 64, 4], and simulated states [41, 11] of the one made `BEFORE_S` before, if known."""
 
 
-def expert_way(labelled: LabelledScene) -> tuple[FloatArray, Array | None]:
+def expert_path(labelled: LabelledScene) -> tuple[FloatArray, Array | None]:
     """The expert as a planner: half a second ago it was to drive as it did."""
     history, future = moment_before(labelled, BEFORE_S)
     return labelled.future, states_of(history, plans_of(future))
@@ -255,7 +255,7 @@ def score_table(
 
 def baseline_planners() -> dict[str, Planner]:
     """The expert and the kinematic baselines."""
-    return {EXPERT: expert_way} | {name: by_rule(baseline) for name, baseline in BASELINES.items()}
+    return {EXPERT: expert_path} | {name: by_rule(baseline) for name, baseline in BASELINES.items()}
 
 
 def scene_scores(

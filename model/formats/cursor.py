@@ -91,13 +91,13 @@ class AtCode(NamedTuple):
     place: int
 
 
-class Ways(NamedTuple):
+class AtFork(NamedTuple):
     """Where the next token tells which way a response goes: each with what comes behind it."""
 
     ways: tuple[tuple[Active, Rest], ...]
 
 
-Active = ForcedRun | AtChoice | InText | AtCode | Ways
+Active = ForcedRun | AtChoice | InText | AtCode | AtFork
 Rest = tuple[Piece, str, "Rest"] | None
 """What comes behind the active piece: a linked list of pieces with the section each stands in."""
 Written = tuple[Token, "Written"] | None
@@ -310,8 +310,10 @@ class CompiledFormat:
         ways: list[tuple[Active, Rest]] = []
         for cursor in (one, other):
             assert cursor.active is not None
-            ways += cursor.active.ways if isinstance(cursor.active, Ways) else [(cursor.active, cursor.rest)]
-        return Cursor(self, Ways(tuple(ways)), one.section, None, one.written)
+            ways += (
+                cursor.active.ways if isinstance(cursor.active, AtFork) else [(cursor.active, cursor.rest)]
+            )
+        return Cursor(self, AtFork(tuple(ways)), one.section, None, one.written)
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,7 +326,7 @@ class Cursor:
     section: str
     """The section the next token belongs to."""
     rest: Rest = field(repr=False)
-    """What comes behind the active piece; None where that is told with its `Ways`."""
+    """What comes behind the active piece; None where that is told with its `AtFork`."""
     written: Written = field(default=None, repr=False)
     """What narrows the pieces that are still to come."""
 
@@ -353,7 +355,7 @@ class Cursor:
             case AtCode(piece, place):
                 allowed = self.compiled.codes(piece, place)
                 ranks = np.arange(len(allowed)) if piece.ordered else None
-            case Ways():
+            case AtFork():
                 allowed = np.sort(np.concatenate([way.allowed().ids for way in self._ways()]))
             case None:
                 raise FormatError("the response is complete")
@@ -401,7 +403,7 @@ class Cursor:
                 if place + 1 < piece.count:
                     return self._at(AtCode(piece, place + 1), written)
                 return self.compiled._enter(self.rest, written)
-            case Ways():
+            case AtFork():
                 for way in self._ways():
                     if _holds(way.allowed().ids, token):
                         return way.advance(token)
@@ -444,7 +446,7 @@ class Cursor:
         return Cursor(self.compiled, active, self.section, self.rest, written)
 
     def _ways(self) -> list[Cursor]:
-        assert isinstance(self.active, Ways)
+        assert isinstance(self.active, AtFork)
         return [
             Cursor(self.compiled, active, self.section, rest, self.written)
             for active, rest in self.active.ways

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from looktwice.model.formats.cursor import Active, AtChoice, AtCode, Cursor, ForcedRun, InText, Rest, Ways
+from looktwice.model.formats.cursor import Active, AtChoice, AtCode, AtFork, Cursor, ForcedRun, InText, Rest
 from looktwice.model.formats.free_text import BEGUN, TextState
 from looktwice.model.formats.pieces import (
     Choice,
@@ -53,7 +53,7 @@ class _Exporter:
 
     def _from(self, active: Active | None, rest: Rest) -> str:
         """What is left of the piece that the cursor stands in, and what comes behind it."""
-        if isinstance(active, Ways):
+        if isinstance(active, AtFork):
             return self._named(" | ".join(self._from(*way) for way in active.ways))
         parts = [self._active(active)]
         while rest is not None:

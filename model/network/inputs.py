@@ -142,7 +142,7 @@ class InputBuilder:
             patches=np.concatenate([self.patches(pictures) for pictures in self.slices(scene)]),
             video_grid_thw=self.video_grid_thw,
             history=scene.history,
-            route=self.way(scene),
+            route=self.route_of(scene),
             tracks=self.tracks(scene),
         )
 
@@ -151,7 +151,7 @@ class InputBuilder:
     ) -> Prompt:
         """The prompt alone of what `build` gives; raises `FamilyError` and `FormatError` as it does."""
         camera = None if view is None else view.camera
-        situation = Situation(scene.history, self.way(scene), attempt, camera)
+        situation = Situation(scene.history, self.route_of(scene), attempt, camera)
         tracks = self.settings.with_tracks and scene.tracks is not None
         return self.prompt(format, situation, tracks=tracks)
 
@@ -175,7 +175,7 @@ class InputBuilder:
             self._expected[key] = codes
         return codes
 
-    def way(self, scene: Scene) -> FloatArray | None:
+    def route_of(self, scene: Scene) -> FloatArray | None:
         """The route [20, 2] that the network is given, or None."""
         return scene.route if self.settings.with_route else None
 

@@ -12,7 +12,7 @@ import torch
 
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.engines.engine import Controls, PlanRequest
-from looktwice.model.engines.torch.offline import draws_of
+from looktwice.model.engines.torch.in_process import draws_of
 from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.families.registry import family_named
 from looktwice.model.network.allocator import FreedMemory

@@ -202,7 +202,7 @@ def choose(
             if outcomes
             else filtered(entries, thresholds)
         )
-        ledger.select(rollout, ((scene.entry.key, scene.draws) for scene in found if scene.kept))
+        ledger.select(rollout, ((scene.entry.key, scene.draws) for scene in found if scene.selected))
         scatter(found, None if outcomes else thresholds, folder / "filter.png")
         result = summary(found)
     if as_json:

@@ -111,7 +111,7 @@ def _curve_speeds(rail: Rail, lateral: float) -> Array:
     return limits
 
 
-def in_my_way(me: Vehicle, view: RailView) -> npt.NDArray[np.bool_]:
+def in_path(me: Vehicle, view: RailView) -> npt.NDArray[np.bool_]:
     """Which of the seen lie ahead on the way that ``me`` is going to take."""
     ahead = view.s > me.s + 0.5
     touching = view.s - 0.5 * view.length - 0.3 * me.size[0]
@@ -134,7 +134,7 @@ def wanted_acceleration(
         wanted = style.acceleration * (1 - (speed / max(wish, 0.5)) ** 4)
     else:
         wanted = max(-2.5, 1.2 * (wish - speed))
-    ahead = np.flatnonzero(in_my_way(me, view))
+    ahead = np.flatnonzero(in_path(me, view))
     if len(ahead):
         gap = view.s[ahead] - me.s - 0.5 * (view.length[ahead] + me.size[0])
         if stands_off:

@@ -14,7 +14,7 @@ from looktwice.clients.metadrive.world.car_following import (
     Style,
     fixed_ahead,
     has_room,
-    in_my_way,
+    in_path,
     look,
     neighbours,
     smoothed,
@@ -173,7 +173,7 @@ class Expert:
         return 1000.0
 
     def _watch_leader(self, me: Vehicle, view: RailView) -> None:
-        ahead = np.flatnonzero(in_my_way(me, view))
+        ahead = np.flatnonzero(in_path(me, view))
         slow = False
         if len(ahead):
             first = ahead[np.argmin(view.s[ahead])]

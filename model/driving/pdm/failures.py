@@ -200,7 +200,7 @@ def facts_of(world: World, scores: Scores, others: Others = _NO_OTHERS) -> list[
     ego = ego_boxes(world, scores.states)
     found = []
     for plan in range(len(scores.score)):
-        case = _Case(world, scores, others, plan, ego[plan])
+        case = _ScoredPlan(world, scores, others, plan, ego[plan])
         facts = [
             case.fact(name, float(values[plan]))
             for name, values in scores.sub_scores.items()
@@ -211,7 +211,7 @@ def facts_of(world: World, scores: Scores, others: Others = _NO_OTHERS) -> list[
 
 
 @dataclass(frozen=True, eq=False)
-class _Case:
+class _ScoredPlan:
     """One plan in its world."""
 
     world: World

@@ -74,7 +74,7 @@ _BOUNDS: Final = {
 
 def feedback_on(judged: JudgedPlan) -> Feedback | RuleFeedback:
     """ELF-VLA section 7.2: sections on what is wrong, the verdict on what is correct."""
-    return RuleFeedback(judged.score, correct=True) if judged.correct else critique(judged)
+    return RuleFeedback(judged.score, correct=True) if judged.correct else rule_sections(judged)
 
 
 def verdict_with_truth(judged: JudgedPlan) -> str:
@@ -86,7 +86,7 @@ def verdict_with_truth(judged: JudgedPlan) -> str:
     return f"{verdict} The correct trajectory is {truth}."
 
 
-def critique(judged: JudgedPlan) -> Feedback:
+def rule_sections(judged: JudgedPlan) -> Feedback:
     """The sections on a plan; the same for the same facts."""
     return Feedback(
         *map(

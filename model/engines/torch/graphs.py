@@ -41,7 +41,7 @@ class Captured(Protocol):
     """A pass that reads its numbers where they were when it was captured."""
 
     @property
-    def output(self) -> Tensor:
+    def result(self) -> Tensor:
         """What it made last; overwritten by the next replay."""
         ...
 
@@ -69,7 +69,7 @@ class CudaGraph:
         self._graph = torch.cuda.CUDAGraph()
         # Another thread, which loads the next model, may use the device meanwhile.
         with torch.cuda.graph(self._graph, pool=CudaGraph._pool, capture_error_mode="thread_local"):
-            self.output = run()
+            self.result = run()
 
     def replay(self) -> None:
         """See `Captured.replay`."""
@@ -101,4 +101,4 @@ class Graphs:
         for kept, new in zip(own, numbers, strict=True):
             kept.copy_(new)
         captured.replay()
-        return captured.output
+        return captured.result

@@ -346,7 +346,7 @@ class Runner:
 
     def _begin_prompt(self, asked: PromptRequest, encoded: Encoded) -> PromptPrefill:
         loaded, (scene, format, kv_row, attempt, view) = self.loaded, asked
-        route, tracks = loaded.inputs.way(scene), loaded.inputs.tracks(scene)
+        route, tracks = loaded.inputs.route_of(scene), loaded.inputs.tracks(scene)
         prompt = loaded.inputs.prompt_for(scene, format, attempt, view)
         embedded = loaded.model.embed_prompt(prompt, encoded.tokens, scene.history, route, tracks)
         shown = format.encode() + encoded.digest

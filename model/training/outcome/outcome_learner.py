@@ -24,10 +24,10 @@ from torch.utils.data import Dataset
 
 from looktwice.model.driving.pdm.judging import PlanExplanation, SceneJudge
 from looktwice.model.driving.pdm.labelled import plans_of
-from looktwice.model.driving.pdm.rule_teacher import critique, verdict_with_truth
+from looktwice.model.driving.pdm.rule_teacher import rule_sections, verdict_with_truth
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.engines.engine import Controls, Draw, PlanRequest
-from looktwice.model.engines.torch.offline import draws_of
+from looktwice.model.engines.torch.in_process import draws_of
 from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.families.family import Attempt
 from looktwice.model.families.picture_codes import PICTURE
@@ -230,7 +230,7 @@ class OutcomeLearner(nn.Module):
         plan = None if draft.plan is None else str(draft.plan)
         said = [PlanExplanation(plan, draft.thinking)]
         [judged] = judge.judged(plans_of(draft.scored[None]), self._settings.version, said=said)
-        feedback = str(critique(judged)) if writer == "teacher" else verdict_with_truth(judged)
+        feedback = str(rule_sections(judged)) if writer == "teacher" else verdict_with_truth(judged)
         return Attempt(draft.trajectory, feedback)
 
     def _policy(

@@ -14,7 +14,7 @@ def entry(free_m: float, prefilled_m: float, *tags: str) -> Entry:
 
 
 def kept(thresholds: Thresholds, *pairs: tuple[float, float]) -> list[bool]:
-    return [scene.kept for scene in filtered([entry(*pair) for pair in pairs], thresholds)]
+    return [scene.selected for scene in filtered([entry(*pair) for pair in pairs], thresholds)]
 
 
 def test_kept_is_what_an_expert_s_plan_would_have_mended() -> None:

@@ -25,10 +25,10 @@ class Again:
 
     def __init__(self, run: Callable[[], Tensor]) -> None:
         self._run = run
-        self.output = run()
+        self.result = run()
 
     def replay(self) -> None:
-        self.output.copy_(self._run())
+        self.result.copy_(self._run())
 
 
 Draws = dict[tuple[str, int], Draw]

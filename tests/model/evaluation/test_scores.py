@@ -18,7 +18,7 @@ from looktwice.model.driving.pdm.scoring import (
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.evaluation.open_loop import EXPERT
-from looktwice.model.evaluation.scores import SceneScore, ScoreRow, by_scene, expert_way, score_table
+from looktwice.model.evaluation.scores import SceneScore, ScoreRow, by_scene, expert_path, score_table
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene, rectangle
 
 LANE_MAP = LaneMap(
@@ -107,7 +107,7 @@ def test_what_the_expert_fails_at_is_forgiven_on_request() -> None:
 
 def test_the_experts_earlier_plan_is_what_it_drove() -> None:
     scene = labelled_scene(10.0 + 0.5 * MIDDLES_S)
-    trajectory, before = expert_way(scene)
+    trajectory, before = expert_path(scene)
     assert before is not None
     now = states_of(scene.scene.history, plans_of(trajectory))
     # In the frame of half a second ago the same moment lies as much farther as was driven since.

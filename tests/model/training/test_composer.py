@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from looktwice.model.driving.scene import LabelledScene, NextFrame
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.engines.engine import Draw, PlanRequest
-from looktwice.model.engines.torch.offline import draws_of
+from looktwice.model.engines.torch.in_process import draws_of
 from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.families.picture_codes import LEVELS, codes_of
 from looktwice.model.network.card import LOG_FILE

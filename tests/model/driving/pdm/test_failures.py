@@ -14,7 +14,7 @@ from looktwice.model.driving.pdm.failures import Fact, facts_of
 from looktwice.model.driving.pdm.feedback import Feedback, parse_feedback
 from looktwice.model.driving.pdm.judged import Measurement, foreign_numbers, numbers
 from looktwice.model.driving.pdm.judging import PlanExplanation, judged_plans
-from looktwice.model.driving.pdm.rule_teacher import SHORT, critique
+from looktwice.model.driving.pdm.rule_teacher import SHORT, rule_sections
 from looktwice.model.driving.pdm.scoring import (
     COLLISIONS,
     COMFORT,
@@ -156,7 +156,7 @@ def test_facts_are_the_sub_scores_below_1_and_feedback_speaks_of_nothing_else(se
                     assert any(
                         each.name.startswith(scores.failures[COMFORT].what[row]) for each in fact.measures
                     )
-            told = critique(plan)
+            told = rule_sections(plan)
             assert parse_feedback(str(told)) == told
             assert foreign_numbers(told, numbers(plan), plan.names) == []
             named = {fact.sub_score for fact in plan.facts}
@@ -169,7 +169,7 @@ def judged_leader(think: str | None = None, truth: Array | None = None, words: s
     (plan,) = judged_plans(
         world, straight(8)[None], scores, Others(), said=[PlanExplanation(words, think)], truth=truth
     )
-    return critique(plan)
+    return rule_sections(plan)
 
 
 def test_the_think_process_is_held_against_what_fails() -> None:
@@ -205,7 +205,7 @@ def test_names_of_others_cannot_break_the_text() -> None:
     for name in ("a\nb", "</feedback>", "x  y", " ", "**2. Safety failure:** z"):
         world = road(tracks=(standing(name, 20.0),))
         (plan,) = judged_plans(world, straight(8)[None], score(world, straight(8)[None]), Others())
-        assert parse_feedback(str(critique(plan))) == critique(plan)
+        assert parse_feedback(str(rule_sections(plan))) == rule_sections(plan)
 
 
 FACTS = (

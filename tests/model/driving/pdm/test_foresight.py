@@ -16,7 +16,7 @@ from looktwice.model.bundled import CHECKPOINT
 from looktwice.model.driving.agents import AGENT_KINDS
 from looktwice.model.driving.pdm.foresight import world_ahead
 from looktwice.model.driving.pdm.judging import judged_plans
-from looktwice.model.driving.pdm.rule_teacher import critique
+from looktwice.model.driving.pdm.rule_teacher import rule_sections
 from looktwice.model.driving.pdm.scoring import COLLISIONS, Others, score
 from looktwice.model.driving.pdm.world import Array, World
 from looktwice.model.driving.tracks import Track
@@ -124,7 +124,7 @@ def test_every_plan_can_be_judged_and_what_is_said_of_it_fits_the_prompt(
 ) -> None:
     found = judged(world_ahead(history(speed_ms), None, tracks), steps)
     assert 0.0 <= found.score <= 1.0
-    feedback = str(critique(found))
+    feedback = str(rule_sections(found))
     assert len(feedback) <= MAX_FEEDBACK_CHARACTERS
     attempt = Attempt(np.zeros((8, 4), np.float32), feedback)
     tokens = prompt.render(WITH_ATTEMPT.values(Situation(history(speed_ms), None, attempt)))
