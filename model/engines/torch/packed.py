@@ -40,8 +40,6 @@ class Rotation(NamedTuple):
         return turned.addcmul_(x, self.cosines)
 
 
-_ALIKE: Final = 16
-"""Rows of a call where none may depend on how many there are: a tile of the matrix units."""
 _ONE_SUM: Final = 256
 """So many numbers oneDNN adds up in one order, whatever stands beside them; longer sums by how many rows
 there are (sums of 768, on AMX)."""
@@ -65,22 +63,33 @@ class _Product:
         self._by_onednn = (
             weight.device.type == "cpu" and weight.dtype == torch.bfloat16 and has_bfloat16_layout()
         )
-        self._weight = (
-            torch.ops.mkldnn._reorder_linear_weight(weight) if self._by_onednn else weight.t().contiguous()
-        )
-        self._in_parts = repeatable and self._by_onednn and self.width > _ONE_SUM
+        self._sums = [self.width]
+        if not self._by_onednn:
+            self._weights = [weight.t().contiguous()]
+            return
+        if repeatable and self.width > _ONE_SUM:
+            self._sums = [min(_ONE_SUM, self.width - at) for at in range(0, self.width, _ONE_SUM)]
+        parts = [part.contiguous() for part in torch.split(weight, self._sums, dim=1)]
+        self._weights = [torch.ops.mkldnn._reorder_linear_weight(part) for part in parts]
 
     def __call__(self, x: Tensor) -> Tensor:
-        if self._in_parts:
-            padded = functional.pad(x, (0, 0, 0, -len(x) % _ALIKE))
-            return torch.cat([self._onednn(part) for part in torch.split(padded, _ALIKE)])[: len(x)]
-        if self._by_onednn:
-            return self._onednn(x)
-        return torch.mm(x, self._weight) if self._bias is None else torch.addmm(self._bias, x, self._weight)
+        """[t, n] of x [t, m], in its type; where sums are made in parts, these are added up in float32."""
+        first, *others = self._weights
+        if not self._by_onednn:
+            return torch.mm(x, first) if self._bias is None else torch.addmm(self._bias, x, first)
+        if not others:
+            return _onednn(x, first, self._bias)
+        part, *parts = torch.split(x, self._sums, dim=1)
+        total = _onednn(part, first, self._bias).float()
+        for part, weight in zip(parts, others, strict=True):
+            total += _onednn(part, weight, None)
+        return total
 
-    def _onednn(self, x: Tensor) -> Tensor:
-        made: Tensor = torch.ops.mkldnn._linear_pointwise.default(x, self._weight, self._bias, "none", [], "")
-        return made
+
+def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """``x`` [t, m] by a weight that oneDNN has laid out."""
+    made: Tensor = torch.ops.mkldnn._linear_pointwise.default(x, weight, bias, "none", [], "")
+    return made
 
 
 class _Layer(NamedTuple):
