@@ -1,6 +1,7 @@
 """The gate: no shortcut, batch, arrival, cancellation or chunk changes a response, in any format. In float64.
 
-`LOOKTWICE_EXACTNESS_MIXES=400 pytest -s tests/model/engines/test_exactness.py` looks longer,
+`LOOKTWICE_EXACTNESS_MIXES=200 pytest -s tests/model/engines/test_exactness.py` looks longer (with
+`MALLOC_MMAP_THRESHOLD_=65536`, or what decoders free stays in holes of the memory),
 `LOOKTWICE_EXACTNESS_SEED=7` at other mixes, and `LOOKTWICE_EXACTNESS_CHECKPOINT=model/bundled/looktwice-nano`
 at a trained network, whose responses are shorter.
 """
