@@ -155,6 +155,7 @@ class LookedAt:
         trajectory: as of a `PlannedDraw`.
         times_s: as of a `PlannedDraw`.
         tokens: tokens per section.
+        cut: as of a `PlannedDraw`.
         consistent: as of a `PlannedDraw`.
         disagreements: as of a `PlannedDraw`.
         reasons: as of a `PlannedDraw`.
@@ -169,6 +170,7 @@ class LookedAt:
     changes: tuple[wire.PlanChange, ...]
     trajectory: FloatArray
     tokens: dict[str, int]
+    cut: wire.Cut | None = None
     consistent: bool | None = None
     disagreements: tuple[str, ...] = ()
     reasons: tuple[str, ...] | None = None
@@ -321,6 +323,7 @@ def _looked_at(draw: wire.Reflection) -> LookedAt:
         trajectory=check_trajectory(draw.trajectory, times_s),
         times_s=times_s,
         tokens=draw.tokens,
+        cut=draw.cut,
         consistent=draw.consistent,
         disagreements=tuple(draw.disagreements),
         reasons=None if draw.reasons is None else tuple(draw.reasons),

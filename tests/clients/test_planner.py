@@ -212,7 +212,8 @@ def test_no_answer_in_time() -> None:
 
 def test_a_plan_is_looked_at_over_a_real_connection() -> None:
     engine = ScriptedEngine()
-    controls = wire.ReflectControls(n=2, thinking="always")
+    engine.cut = "shortened"
+    controls = wire.ReflectControls(n=2, thinking="always", deadline_ms=60_000)
     with serve(engine, Settings()) as served, PlannerClient(served.url) as planner:
         result = planner.reflect(scene("a"), PREFILL, controls, request_id="mine")
         with pytest.raises(RequestRefused):
@@ -225,6 +226,7 @@ def test_a_plan_is_looked_at_over_a_real_connection() -> None:
         SLOW_DOWN,
         REASONING,
     )
+    assert look.cut == "shortened"
     assert 0 <= look.plan_iou < 1
     assert look.changes[0].proposed == "Wait"
     assert look.trajectory.shape == (64, 4)
