@@ -102,7 +102,7 @@ def test_kv_rows_have_room_for_usual_responses(exact: Loaded) -> None:
 
 
 def test_scheduling_needs_no_torch() -> None:
-    modules = ("batch", "deadlines", "drafter", "layout", "memory", "request", "rows", "scheduler")
+    modules = ("batch", "deadlines", "drafter", "kv_memory", "layout", "request", "rows", "scheduler")
     script = "import sys; sys.modules['torch'] = None\n" + "".join(
         f"import looktwice.model.engines.torch.{module}\n" for module in modules
     )
