@@ -137,7 +137,7 @@ class Row(Response):
         written, finished = len(self.tokens), list[SectionText]()
         was_text = self.cursor.stop_id is not None
         reflects = token is not None and self._reflects(token)
-        if token is not None and self.may_imagine and self._imagines(token):
+        if token is not None and self._imagines(token):
             self.passes_before_picture = self.passes
         if token is not None:
             finished += self.append(token, vocabulary, logprob)
@@ -159,10 +159,8 @@ class Row(Response):
         everything = np.ones(len(allowed.ids), np.bool_)
         family = self.request.family
         if self.may_imagine and time_for is TimeFor.END_NOW:
-            imagines = np.array([self._imagines(int(token)) for token in allowed.ids])
-            if not imagines.all():
-                self.cut = "skipped"
-                return ~imagines
+            self.cut = "skipped"
+            return np.array([not self._imagines(int(token)) for token in allowed.ids])
         if family.branch is None or allowed.choice != family.branch.name:
             if self.cursor.stop_id in allowed.ids and self._ends(time_for):
                 self.cut = "shortened"
@@ -192,9 +190,11 @@ class Row(Response):
         return leads_to_reflection(branch, self.cursor, token)
 
     def _imagines(self, token: int) -> bool:
-        """Where it decides about a picture: whether a token begins one."""
+        """Whether a token begins a picture."""
         imagination = self.request.family.imagination
-        return imagination is not None and imagination.imagined in self.cursor.option_texts(token)
+        if imagination is None or not self.may_imagine:
+            return False
+        return imagination.imagined in self.cursor.option_texts(token)
 
     def _ends(self, time_for: TimeFor) -> bool:
         """Whether a text stops here."""
