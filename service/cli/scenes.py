@@ -41,6 +41,13 @@ def generate(
     lapses: Annotated[
         bool, typer.Option(help="The expert brakes late now and then; scenes show how it brakes then.")
     ] = False,
+    speeds: Annotated[
+        bool,
+        typer.Option(
+            help="In each scene the car is slower or faster than it was, and the expert goes on from there. "
+            "Needs --no-dense --no-pictures."
+        ),
+    ] = False,
     width: Annotated[int, typer.Option(help="Width of the pictures in pixels, twice their height.")] = 224,
     dense: Annotated[
         bool,
@@ -81,6 +88,7 @@ def generate(
             dense=dense,
             drifts=drifts,
             lapses=lapses,
+            speeds=speeds,
             width_px=width,
             driver=driver,
             tracks=tracks,

@@ -27,9 +27,10 @@ from looktwice.clients.metadrive import simulator
 from looktwice.clients.metadrive.closed_loop.drives import DriveConfig
 from looktwice.clients.metadrive.closed_loop.pilots import Careless, Pilot
 from looktwice.clients.metadrive.drawing.rig import Rig
+from looktwice.clients.metadrive.generation.other_speeds import other_speeds
 from looktwice.clients.metadrive.generation.own_states import own_states
 from looktwice.clients.metadrive.scenes.windows import labelled_scenes, unpictured_scenes, window_steps
-from looktwice.clients.metadrive.world.episode import run_episode
+from looktwice.clients.metadrive.world.episode import run_episode, worlds_of_episode
 from looktwice.clients.metadrive.world.maps import MapError
 from looktwice.model.driving.cameras import FRONT_CAMERAS, SURROUND_CAMERAS
 from looktwice.model.driving.scene import LabelledScene, split_of_seed
@@ -58,6 +59,8 @@ class GenerateConfig:
         dense: also store per-pixel targets.
         drifts: the expert strays from its line now and then; scenes show how it comes back.
         lapses: it brakes late now and then; scenes show how it brakes then.
+        speeds: in each scene the car is slower or faster than it was, by chance, and the expert goes on from
+            there (`other_speeds`); such scenes have no pictures.
         width_px: of the pictures, which are twice as wide as high.
         driver: name and revision of the model that drives; scenes are then of its own states, with what the
             expert would do from there (`own_states`). None for the expert.
@@ -76,6 +79,7 @@ class GenerateConfig:
     dense: bool = True
     drifts: bool = False
     lapses: bool = False
+    speeds: bool = False
     width_px: int = 224
     driver: str | None = None
     tracks: bool = False
@@ -94,6 +98,10 @@ class GenerateConfig:
         if filmed and not self.pictures:
             raise GenerationError(
                 "without pictures there are no dense targets, cameras around or next frames"
+            )
+        if self.speeds and (self.pictures or self.driver is not None):
+            raise GenerationError(
+                "pictures do not show other speeds than the expert's: such scenes have none, and no other driver"
             )
 
 
@@ -263,6 +271,10 @@ def run_seed(
 
 
 def _of_expert(seed: int, rig: Rig | None, config: GenerateConfig) -> _EpisodeScenes:
+    if config.speeds:
+        worlds = worlds_of_episode(seed, config.duration_s, drifts=config.drifts, lapses=config.lapses)
+        scenes, log, tried = other_speeds(worlds, config.stride_s)
+        return _EpisodeScenes(scenes, log.outcome, log.road_map.blocks, tried)
     log = run_episode(seed, config.duration_s, drifts=config.drifts, lapses=config.lapses)
     if rig is None:
         scenes = list(unpictured_scenes(log, config.stride_s))

@@ -66,13 +66,19 @@ class Forked:
         return self.collided_s is None and self.off_road_s is None
 
 
-def fork_expert(world: EpisodeWorld, steps: int = FUTURE_STEPS) -> Forked:
+def fork_expert(world: EpisodeWorld, steps: int = FUTURE_STEPS, *, times_speed: float = 1.0) -> Forked:
     """Let the expert drive on from now in a copy of ``world``.
+
+    Args:
+        world: to copy.
+        steps: to drive.
+        times_speed: what the ego's speed is multiplied by at first. Its past stays in the log as it was.
 
     Raises:
         ForkError: the episode has ended.
     """
     forked = _copied(world, steps)
+    forked.ego.speed *= times_speed
     if isinstance(forked.ego, FreeVehicle):
         forked.ego = on_rails(forked.ego, forked.live.road_map)
     return _run(forked, steps, None)

@@ -1,0 +1,66 @@
+"""Scenes in which the car is slower or faster than it was, with what the expert would do from there.
+
+In a recording, speed says nearly all of what comes: who learns from recordings alone copies it. Here the world
+is forked with another speed, so what is around decides alone (LBC and "causal confusion",
+https://arxiv.org/abs/1905.11979). Pictures would still show the speed that was, so these scenes have none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from looktwice.clients.metadrive.scenes.lane_maps import LaneMaps
+from looktwice.clients.metadrive.scenes.windows import PICTURE_STEPS, blank_clips, labelled_scene
+from looktwice.clients.metadrive.world.actors import STEP_S
+from looktwice.clients.metadrive.world.episode import EpisodeWorld
+from looktwice.clients.metadrive.world.episode_log import EpisodeLog
+from looktwice.clients.metadrive.world.fork import ForkError, fork_expert
+from looktwice.model.driving.cameras import FRONT_CAMERAS
+from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS
+
+_TIMES: Final = (0.4, 1.6)
+_STANDING_MS: Final = 0.5
+
+
+def other_speeds(
+    worlds: Iterable[EpisodeWorld], stride_s: float
+) -> tuple[list[LabelledScene], EpisodeLog, int]:
+    """Scenes of an episode at other speeds; those that even the expert cannot save are left out.
+
+    Args:
+        worlds: of `worlds_of_episode`.
+        stride_s: seconds from scene to scene.
+
+    Returns:
+        The scenes, the episode as it went, and how many moments were tried.
+
+    Raises:
+        MapError: no map fits the seed.
+    """
+    scenes: list[LabelledScene] = []
+    tried = 0
+    lane_maps: LaneMaps | None = None
+    stride = max(PICTURE_STEPS, round(stride_s / STEP_S / PICTURE_STEPS) * PICTURE_STEPS)
+    for world in worlds:
+        step = world.now - (HISTORY_STEPS - 1)
+        if step < 0 or step % stride or world.ego.speed < _STANDING_MS:
+            continue
+        times = float(np.random.default_rng([world.live.seed, world.now]).uniform(*_TIMES))
+        try:
+            forked = fork_expert(world, times_speed=times)
+        except ForkError:
+            break
+        tried += 1
+        if not forked.is_safe or len(forked.trajectory) < FUTURE_STEPS:
+            continue
+        lane_maps = lane_maps or LaneMaps(world.live)
+        made = labelled_scene(forked.log, world.now, blank_clips(FRONT_CAMERAS), lane_maps.at(world.now))
+        if made is not None:
+            history = made.scene.history * np.array([times, times, times, 1.0], np.float32)
+            scenes.append(replace(made, scene=replace(made.scene, history=history)))
+    return scenes, world.log(), tried
