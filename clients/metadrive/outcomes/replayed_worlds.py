@@ -103,6 +103,10 @@ def setting_of(scenes: Path) -> EpisodeSetting:
             f"{manifest.parent} was made by generator {made_by}, this is generator {GENERATOR_VERSION}: "
             "its worlds cannot be made again"
         )
+    if whole["speeds"]:
+        raise ReplayError(
+            f"{manifest.parent} holds scenes at other speeds than were driven: no world is as they tell"
+        )
     if simulated_by != simulator.described():
         raise ReplayError(f"{manifest.parent} was made with {simulated_by}, here is {simulator.described()}")
     if unknown := set(config) - {field.name for field in fields(GenerateConfig)}:
@@ -114,6 +118,10 @@ def setting_of(scenes: Path) -> EpisodeSetting:
         raise ReplayError(
             f"{manifest.parent} holds what {whole['driver']} met when it drove: "
             "its worlds cannot be made again"
+        )
+    if whole["speeds"]:
+        raise ReplayError(
+            f"{manifest.parent} holds scenes at other speeds than were driven: no world is as they tell"
         )
     return EpisodeSetting(whole["duration_s"], whole["drifts"], whole["lapses"])
 

@@ -173,6 +173,7 @@ def test_a_folder_tells_how_its_episodes_were_set(tmp_path: Path) -> None:
         ({"generator_version": "0"}, "generator 0"),
         ({"simulator": "metadrive-simulator 0.1"}, "0.1"),
         ({"config": {"wind": 3}}, "wind"),
+        ({"config": {"speeds": True}}, "other speeds than were driven"),
         ({"config": None}, "not a manifest"),
     ):
         with pytest.raises(ReplayError, match=why):
