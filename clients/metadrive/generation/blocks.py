@@ -101,7 +101,8 @@ class GenerateConfig:
             )
         if self.speeds and (self.pictures or self.driver is not None):
             raise GenerationError(
-                "pictures do not show other speeds than the expert's: such scenes have none, and no other driver"
+                "pictures do not show other speeds than were driven: such scenes have none, and no driver "
+                "but the expert"
             )
 
 

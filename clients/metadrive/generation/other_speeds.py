@@ -1,8 +1,8 @@
 """Scenes in which the car is slower or faster than it was, with what the expert would do from there.
 
-In a recording, speed says nearly all of what comes: who learns from recordings alone copies it. Here the world
-is forked with another speed, so what is around decides alone (LBC and "causal confusion",
-https://arxiv.org/abs/1905.11979). Pictures would still show the speed that was, so these scenes have none.
+In a recording, speed says nearly all of what comes, so who learns from recordings alone copies it (causal
+confusion, https://arxiv.org/abs/1905.11979). Here the world is forked with another speed, and what is around
+decides. Pictures would still show the speed that was, so these scenes have none.
 """
 
 from __future__ import annotations

@@ -103,10 +103,6 @@ def setting_of(scenes: Path) -> EpisodeSetting:
             f"{manifest.parent} was made by generator {made_by}, this is generator {GENERATOR_VERSION}: "
             "its worlds cannot be made again"
         )
-    if whole["speeds"]:
-        raise ReplayError(
-            f"{manifest.parent} holds scenes at other speeds than were driven: no world is as they tell"
-        )
     if simulated_by != simulator.described():
         raise ReplayError(f"{manifest.parent} was made with {simulated_by}, here is {simulator.described()}")
     if unknown := set(config) - {field.name for field in fields(GenerateConfig)}:
@@ -120,9 +116,7 @@ def setting_of(scenes: Path) -> EpisodeSetting:
             "its worlds cannot be made again"
         )
     if whole["speeds"]:
-        raise ReplayError(
-            f"{manifest.parent} holds scenes at other speeds than were driven: no world is as they tell"
-        )
+        raise ReplayError(f"{manifest.parent} holds scenes at other speeds than were driven")
     return EpisodeSetting(whole["duration_s"], whole["drifts"], whole["lapses"])
 
 
