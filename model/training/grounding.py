@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -52,6 +53,13 @@ RARE_TIMES: Final = 3
 seven has either, and cars that plan from pictures mostly collide with these."""
 _ROUTE_SHARE: Final = 0.75
 _MIRROR_SHARE: Final = 0.5
+_LIGHT_SHARE: Final = 0.7
+_GAIN: Final = 0.15
+_TONE: Final = 0.12
+_LIFT: Final = 10.0
+_NOISE: Final = 2
+"""Of pictures in another light: how far brightness changes as a share, single colours beside it, what is
+added to all levels, and the largest noise in levels."""
 _MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
 """Of poses (x, y, z, heading)."""
 
@@ -86,7 +94,7 @@ class GroundingItem:
 
 
 class GroundingDataset(Dataset[GroundingSample]):
-    """All examples, each time mirrored or not and with or without its route, by chance."""
+    """All examples, each time mirrored or not, with or without its route, and in another light, by chance."""
 
     def __init__(self, examples: Examples, inputs: InputBuilder, seed: int = 0) -> None:
         self._examples, self._inputs = examples, inputs
@@ -96,16 +104,17 @@ class GroundingDataset(Dataset[GroundingSample]):
         return len(self._examples)
 
     def __getitem__(self, index: int) -> GroundingSample:
-        chance = self.random.random(2)
-        return self.look(
-            GroundingItem(index, bool(chance[0] < _MIRROR_SHARE), bool(chance[1] < _ROUTE_SHARE))
-        )
+        chance = self.random.random(3)
+        look = GroundingItem(index, bool(chance[0] < _MIRROR_SHARE), bool(chance[1] < _ROUTE_SHARE))
+        return self.look(look, self.random if chance[2] < _LIGHT_SHARE else None)
 
-    def look(self, look: GroundingItem) -> GroundingSample:
-        """One example as it is asked for."""
+    def look(self, look: GroundingItem, light: np.random.Generator | None = None) -> GroundingSample:
+        """One example as it is asked for, in a light by chance or, without one, as it was."""
         examples, index = self._examples, look.index
         has_route = look.route and bool(np.isfinite(examples.route[index]).all())
         frames = example_frames(examples, index, look.mirror, self._inputs)
+        if light is not None:
+            frames = in_other_light(frames, light)
         sample = GroundingSample(
             patchify(frames, self._inputs.settings),
             examples.dense_classes[index],
@@ -118,6 +127,15 @@ class GroundingDataset(Dataset[GroundingSample]):
             examples.future[index],
         )
         return _mirror(sample) if look.mirror else sample
+
+
+def in_other_light(frames: npt.NDArray[np.uint8], random: np.random.Generator) -> npt.NDArray[np.uint8]:
+    """Pictures uint8 [f, h, w, 3] brighter or darker and in another tone, all alike, with noise."""
+    tone = 1 + random.uniform(0, _TONE) * random.uniform(-1, 1, 3)
+    gain, lift = 1 + random.uniform(-_GAIN, _GAIN), random.uniform(-_LIFT, _LIFT)
+    noise = random.integers(-_NOISE, _NOISE + 1, frames.shape, dtype=np.int8)
+    lit = frames * (gain * tone).astype(np.float32) + (np.float32(lift) + noise)
+    return lit.round().clip(0, 255).astype(np.uint8)
 
 
 def _mirror(sample: GroundingSample) -> GroundingSample:

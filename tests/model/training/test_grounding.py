@@ -17,6 +17,7 @@ from looktwice.model.training.grounding import (
     GroundingLearner,
     collate_grounding,
     fact_loss,
+    in_other_light,
     looked_at,
 )
 from tests.model.training.scenes import training_scene
@@ -41,6 +42,19 @@ def test_a_mirrored_look_swaps_everything_and_twice_is_as_before(data: Grounding
     np.testing.assert_array_equal(swapped.motion[:, 1], -plain.motion[:, 1, :, ::-1])
     np.testing.assert_array_equal(swapped.futures[:, 1], -plain.futures[:, 1])
     assert not np.array_equal(swapped.patches, plain.patches)
+
+
+def test_another_light_changes_levels_and_nothing_that_is_known(data: GroundingDataset) -> None:
+    plain, lit = data.look(GroundingItem(1)), data.look(GroundingItem(1), np.random.default_rng(3))
+    for name, was, now in zip(plain._fields, plain, lit, strict=True):
+        assert np.array_equal(was, now, equal_nan=was.dtype.kind == "f") == (name != "patches"), name
+    grey = np.full((2, 8, 8, 3), 128, np.uint8)
+    lights = np.stack([in_other_light(grey, np.random.default_rng(seed)) for seed in range(40)]).astype(int)
+    means = lights.mean(axis=(1, 2, 3))
+    assert np.abs(means - 128).max() < 128 * 0.3 + 10
+    assert means.std(axis=0).min() > 5, "scenes differ"
+    assert (means.max(axis=1) - means.min(axis=1)).max() > 5, "colours differ"
+    assert np.ptp(lights, axis=(2, 3)).max() <= 5, "one scene's pictures are in one light, but for noise"
 
 
 def test_a_route_is_given_only_where_there_is_one(data: GroundingDataset) -> None:
