@@ -18,6 +18,7 @@ from looktwice.model.driving.labeller import labelled_track
 from looktwice.model.driving.plan import GROUPS, TICKS, WORDS, Plan
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.network.intent import IntentTrunk
+from looktwice.model.network.trajectory_head import spread_of
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.intents import IntentDataset, collate_intents, read_facts
@@ -45,11 +46,12 @@ class OwnPlans:
     ) -> None:
         read = None if vision is None else read_facts(vla, examples, vision, seed)
         data = IntentDataset(examples, read, route_share=1.0)
+        spread = None if vla.sketch_books is None else spread_of(vla.sketch_books.books[0])
         self._readings = {}
         if vla.track_reader is not None:
-            self._readings[True] = _Reading(vla.track_reader, data, "tracks", seed)
+            self._readings[True] = _Reading(vla.track_reader, data, "tracks", spread, seed)
         if read is not None and vla.resampler is not None:
-            self._readings[False] = _Reading(vla.resampler.intent, data, "read", seed)
+            self._readings[False] = _Reading(vla.resampler.intent, data, "read", spread, seed)
 
     def draw(
         self, index: int, random: np.random.Generator, *, mirror: bool, route: bool, tracks: bool
@@ -67,11 +69,24 @@ class OwnPlans:
             tracks_of_groups[group] = labelled_track([WORDS[group][best] for best in each.argmax(axis=1)])
         return Plan(**tracks_of_groups)
 
+    def sketch(self, index: int, *, mirror: bool, route: bool, tracks: bool) -> FloatArray:
+        """The trajectory [d], in the codec's space, that the prompt of one example sketches.
+
+        Raises:
+            KeyError: the checkpoint has no planner for what the prompt shows.
+            ValueError: it sketches nothing.
+        """
+        sketches = self._readings[tracks].sketches
+        if sketches is None:
+            raise ValueError("this checkpoint sketches no trajectories")
+        found: FloatArray = sketches[int(mirror), int(route), index]
+        return found
+
 
 class _Reading:
     """The states of one planner for all examples, and the linear reading of plans from them."""
 
-    def __init__(self, part: Any, data: IntentDataset, around: str, seed: int) -> None:
+    def __init__(self, part: Any, data: IntentDataset, around: str, spread: Tensor | None, seed: int) -> None:
         states, bins = [], []
         with torch.inference_mode():
             for mirror in (False, True):
@@ -83,6 +98,13 @@ class _Reading:
         stacked = torch.stack(states).view(2, 2, len(data), IntentTrunk.width).clone()
         self._weight, self._bias = _fit(stacked.flatten(0, 2), torch.cat(bins).clone(), seed)
         self._states = stacked.cpu()
+        self.sketches: FloatArray | None = None
+        if spread is not None:
+            with torch.inference_mode():
+                # [mirror, route, n, d]
+                self.sketches = (
+                    (part.sketch(stacked.to(part.sketch.weight.dtype)).float() * spread).cpu().numpy()
+                )
 
     def scores(self, index: int, mirror: int, route: int) -> FloatArray:
         """How likely each word is in each tick, log [64, words of all groups]."""

@@ -61,6 +61,8 @@ class ResponseDataset(Dataset[ResponseSample]):
             not, the expert's own responses teach nothing of the branch.
         attempts: to be asked for by items, which are refined in the format ``attempting``.
         own_plans: behind which trajectories are learned too, where nothing is reflected.
+        sketched: trajectories at once, and those behind own plans, are the sketch in the prompt and not the
+            expert's.
         visual_codes: of the checkpoint, where items are to teach pictures.
         seed: of the codes that are drawn.
 
@@ -84,11 +86,12 @@ class ResponseDataset(Dataset[ResponseSample]):
         attempts: Sequence[JudgedAttempt] = (),
         attempting: str | None = None,
         own_plans: OwnPlans | None = None,
+        sketched: bool = False,
         visual_codes: VisualCodes | None = None,
         seed: int = 0,
     ) -> None:
         self._attempts = attempts
-        self._own_plans = own_plans
+        self._own_plans, self._sketched = own_plans, sketched
         self._visual_codes, self._next = visual_codes, dict[tuple[int, str, bool], NextPicture]()
         self._expected = dict[tuple[int, str, bool, bool], tuple[int, ...] | None]()
         self._examples, self._inputs, self._reflections = examples, inputs, reflections
@@ -143,7 +146,7 @@ class ResponseDataset(Dataset[ResponseSample]):
         if item.blur:
             history = steady_history(present_speed(history))
         picture = None if item.camera is None else self._next_picture(index, item.camera, item.mirror)
-        vector = self._codec.vectors(history[None], future[None])[0]
+        expert = self._codec.vectors(history[None], future[None])[0]
         found = [self._reflections[place] for place in item.reflections]
         if item.mirror:
             found = [mirrored(each) for each in found]
@@ -155,7 +158,8 @@ class ResponseDataset(Dataset[ResponseSample]):
             )
             reflections.append(Counterfactual(own, "", judged=False))
         tried = None if item.attempt is None else self._attempts[item.attempt]
-        soft = [self._soft.draw(vector, self.random) for _ in reflections]
+        vectors = [self._sketch(item, reflection, expert) for reflection in reflections]
+        soft = [self._soft.draw(vector, self.random) for vector in vectors]
         camera = picture.camera if picture is not None and item.camera_requested else None
         attempt = None if tried is None else tried.attempt
         expected = self._expected_codes(item, camera, history) if camera is not None else None
@@ -181,6 +185,18 @@ class ResponseDataset(Dataset[ResponseSample]):
             code_shares=np.stack([drawn.shares for drawn in soft]),
             code_errors_m=np.stack([drawn.errors_m for drawn in soft]),
         )
+
+    def _sketch(self, item: Item, reflection: Counterfactual | None, expert: Array) -> Array:
+        """The trajectory [d] that a response ends with: the sketch where no words of another's decide it.
+
+        What follows the expert's words, or a reflection, is the expert's.
+        """
+        own = reflection is not None and not reflection.judged
+        if not self._sketched or self._own_plans is None or item.blur:
+            return expert
+        if not own and (item.task == self.reflecting or reflection is not None):
+            return expert
+        return self._own_plans.sketch(item.index, mirror=item.mirror, route=item.route, tracks=item.tracks)
 
     def _next_picture(self, index: int, camera: str, mirror: bool) -> NextPicture:
         """What ``camera`` saw half a second later; its mirror image is that of the other side's camera."""

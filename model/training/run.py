@@ -372,6 +372,7 @@ def _prepare(
         attempts=() if tried is None else tried.attempts,
         attempting=recipe.attempting,
         own_plans=own_plans,
+        sketched=recipe.sketched,
         visual_codes=loaded.visual_codes,
         seed=recipe.seed,
     )

@@ -9,6 +9,7 @@ import pytest
 
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
+from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
 from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.training.examples import Examples
@@ -64,6 +65,48 @@ def test_a_reader_of_tracks_alone_plans_from_tracks_alone(loaded: Loaded) -> Non
     own_plans = OwnPlans(loaded.model, EXAMPLES, None)
     with pytest.raises(KeyError):
         own_plans.draw(0, np.random.default_rng(0), mirror=False, route=True, tracks=False)
+
+
+@pytest.mark.parametrize("tracks", [False, True])
+def test_sketched_trajectories_are_those_that_the_prompt_tells(
+    loaded: Loaded, own_plans: OwnPlans, tracks: bool
+) -> None:
+    """The expert's stay where the expert's words decide; a mirrored scene's sketch is that of its prompt."""
+    item = Item(1, "cf_vla", True, tracks=tracks)
+    data = {
+        sketched: ResponseDataset(
+            EXAMPLES,
+            loaded.codec,
+            loaded.inputs,
+            loaded.vocabulary,
+            PAPER_WEIGHTS,
+            pictures=True,
+            own_plans=own_plans,
+            sketched=sketched,
+        )
+        for sketched in (False, True)
+    }
+
+    def errors_m(sketched: bool, asked: Item) -> FloatArray:
+        """How far the first codes leave the trajectory of each response, [responses, codes]."""
+        found: FloatArray = data[sketched][asked].code_errors_m[:, 0]
+        return found
+
+    def apart_m(asked: Item) -> FloatArray:
+        """How far they leave the sketch."""
+        vector = own_plans.sketch(1, mirror=asked.mirror, route=asked.route, tracks=tracks)
+        apart: FloatArray = np.linalg.norm(loaded.codec.books[0] - vector, axis=1) / 8  # of 64 poses
+        return apart
+
+    expert, own = errors_m(True, item)
+    np.testing.assert_array_equal(np.stack([expert, expert]), errors_m(False, item))
+    np.testing.assert_allclose(own, apart_m(item), atol=1e-3)
+    assert np.abs(own - expert).max() > 0.1
+    for asked in (replace(item, task="traj_only"), replace(item, task="traj_only", mirror=True, route=False)):
+        np.testing.assert_allclose(errors_m(True, asked)[0], apart_m(asked), atol=1e-3)
+    # The prompt of a blurred history sketches otherwise.
+    blurred = replace(item, task="traj_only", blur=True)
+    np.testing.assert_array_equal(errors_m(True, blurred), errors_m(False, blurred))
 
 
 def test_behind_an_own_plan_nothing_but_the_trajectory_is_taught(loaded: Loaded, own_plans: OwnPlans) -> None:
