@@ -214,6 +214,8 @@ NANO: Final[Mapping[str, Recipe]] = (
                 learning_rate=2.5e-4,
                 reflections="learned",
                 own_plans=True,
+                sketched=True,
+                blur_share=0.0,  # the prompt of a blurred history sketches otherwise
             ),
         )
     }

@@ -372,7 +372,7 @@ def _prepare(
         attempts=() if tried is None else tried.attempts,
         attempting=recipe.attempting,
         own_plans=own_plans,
-        sketched=recipe.sketched,
+        sketched=recipe.sketched and loaded.settings.sketch_tokens > 0,
         visual_codes=loaded.visual_codes,
         seed=recipe.seed,
     )
