@@ -110,13 +110,14 @@ class TrajectoryCodec:
         chosen = np.asarray(codes, np.int64).reshape(-1, len(self.books))
         if chosen.size and not 0 <= chosen.min() <= chosen.max() < self.size:
             raise CodecError(f"codes must lie in 0..{self.size - 1}")
-        return self._trajectories(histories, quantiser.decode(chosen, self.books))
+        return self.trajectories(histories, quantiser.decode(chosen, self.books))
 
     def first_trajectories(self, history: npt.NDArray[np.floating]) -> FloatArray:
         """float32 [K, 64, 4]: what each first code alone stands for behind one history [16, 4]."""
-        return self._trajectories(np.asarray(history)[None], self.books[0])
+        return self.trajectories(np.asarray(history)[None], self.books[0])
 
-    def _trajectories(self, histories: npt.NDArray[np.floating], vectors: FloatArray) -> FloatArray:
+    def trajectories(self, histories: npt.NDArray[np.floating], vectors: FloatArray) -> FloatArray:
+        """Trajectories float32 [n, 64, 4] with z = 0 of vectors [n, d], as `vectors` gives them."""
         curves = (vectors @ self.axes + self.mean).reshape(-1, 3, FUTURE_STEPS)
         trajectories = np.zeros((len(curves), FUTURE_STEPS, 4), np.float32)
         trajectories[..., 0] = curves[:, 0] + _present_speeds(histories)[:, None] * _TIMES_S

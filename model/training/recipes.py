@@ -97,8 +97,8 @@ class Recipe:
         picture_share: share of the examples with pictures half a second ahead that are taught one of them.
         own_plans: learn trajectories behind plans of the model's own too, where it has small planners to draw
             them from, see `OwnPlans`.
-        sketched: trajectories that no expert's words decide are the sketch in the prompt, not the expert's:
-            what is to be copied has no noise to be learned by heart.
+        sketched: plans and trajectories are those of the sketch in the prompt, not the expert's: what is
+            to be copied has no noise to be learned by heart.
         error_weight: nats that a metre of a code's expected error counts.
         head_weight: of a regression of the trajectory where its first code is written.
         reflections: what becomes of the reflections of a build: ``learned`` as counterfactual examples, or

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final, cast
 
 import numpy as np
 from torch.utils.data import Dataset
 
+from looktwice.model.driving.labeller import label_plan
 from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import mirrored_camera
@@ -42,6 +44,8 @@ from looktwice.model.training.vision_cache import VisionCache
 
 _MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
 """Of poses (x, y, z, heading)."""
+_EXPERT_SHARE: Final = 0.5
+"""Of the plans behind which sketches are learned, so many are the expert's, with the expert's trajectory."""
 
 
 class ResponseDataset(Dataset[ResponseSample]):
@@ -61,8 +65,8 @@ class ResponseDataset(Dataset[ResponseSample]):
             not, the expert's own responses teach nothing of the branch.
         attempts: to be asked for by items, which are refined in the format ``attempting``.
         own_plans: behind which trajectories are learned too, where nothing is reflected.
-        sketched: trajectories at once, and those behind own plans, are the sketch in the prompt and not the
-            expert's.
+        sketched: plans and trajectories are those of the sketch in the prompt. Behind the expert's plan, of
+            which then nothing is taught, the trajectory is the expert's.
         visual_codes: of the checkpoint, where items are to teach pictures.
         seed: of the codes that are drawn.
 
@@ -151,26 +155,35 @@ class ResponseDataset(Dataset[ResponseSample]):
         if item.mirror:
             found = [mirrored(each) for each in found]
         reflections: list[Counterfactual | None] = [*found] or [None]
-        if not found and self._own_plans is not None and item.task == self.reflecting:
-            # Nobody knows whether it deserves a second look: nothing but the trajectory is taught behind it.
-            own = self._own_plans.draw(
-                index, self.random, mirror=item.mirror, route=item.route, tracks=item.tracks
-            )
-            reflections.append(Counterfactual(own, "", judged=False))
+        plans, vectors = [plan] * len(reflections), [expert] * len(reflections)
+        if not found and self._own_plans is not None:
+            sketch = self._sketch(item)
+            if item.task == self.reflecting:
+                # Nobody knows whether it deserves a second look: behind it the trajectory alone is taught.
+                own = self._own_plans.draw(
+                    index, self.random, mirror=item.mirror, route=item.route, tracks=item.tracks
+                )
+                behind, led_to = own, expert if sketch is None else sketch
+                if sketch is not None and self.random.random() < _EXPERT_SHARE:
+                    behind, led_to = plan, expert
+                reflections.append(Counterfactual(behind, "", judged=False))
+                plans.append(plan)
+                vectors.append(led_to)
+            if sketch is not None:
+                plans[0], vectors[0] = self._driven(sketch, history, plan), sketch
         tried = None if item.attempt is None else self._attempts[item.attempt]
-        vectors = [self._sketch(item, reflection, expert) for reflection in reflections]
         soft = [self._soft.draw(vector, self.random) for vector in vectors]
         camera = picture.camera if picture is not None and item.camera_requested else None
         attempt = None if tried is None else tried.attempt
         expected = self._expected_codes(item, camera, history) if camera is not None else None
         lessons = [
             Lesson(
-                *(plan, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived),
+                *(each, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived),
                 next_picture=picture,
                 expected=expected,
                 attempt=tried,
             )
-            for drawn, reflection in zip(soft, reflections, strict=True)
+            for each, drawn, reflection in zip(plans, soft, reflections, strict=True)
         ]
         situation = Situation(history, route if item.route else None, attempt, camera)
         return ResponseSample(
@@ -186,17 +199,16 @@ class ResponseDataset(Dataset[ResponseSample]):
             code_errors_m=np.stack([drawn.errors_m for drawn in soft]),
         )
 
-    def _sketch(self, item: Item, reflection: Counterfactual | None, expert: Array) -> Array:
-        """The trajectory [d] that a response ends with: the sketch where no words of another's decide it.
-
-        What follows the expert's words, or a reflection, is the expert's.
-        """
-        own = reflection is not None and not reflection.judged
+    def _sketch(self, item: Item) -> Array | None:
+        """The trajectory [d] that the prompt sketches, where it is to be learned."""
         if not self._sketched or self._own_plans is None or item.blur:
-            return expert
-        if not own and (item.task == self.reflecting or reflection is not None):
-            return expert
+            return None
         return self._own_plans.sketch(item.index, mirror=item.mirror, route=item.route, tracks=item.tracks)
+
+    def _driven(self, sketch: Array, history: Array, plan: Plan) -> Plan:
+        """The plan that a sketch carries out; lanes, which it does not tell, are the expert's."""
+        trajectory = self._codec.trajectories(history[None], sketch[None])[0]
+        return replace(label_plan(trajectory, history, None), lane=plan.lane)
 
     def _next_picture(self, index: int, camera: str, mirror: bool) -> NextPicture:
         """What ``camera`` saw half a second later; its mirror image is that of the other side's camera."""
