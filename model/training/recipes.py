@@ -189,6 +189,15 @@ _READ: Final = Recipe(
     mirror_share=0.5,
 )
 
+_COUNTERFACTUAL: Final = replace(
+    _NANO,
+    name="counterfactual",
+    steps=3000,
+    learning_rate=2.5e-4,
+    reflections="learned",
+    own_plans=True,
+)
+
 NANO: Final[Mapping[str, Recipe]] = (
     {
         recipe.name: recipe
@@ -207,16 +216,7 @@ NANO: Final[Mapping[str, Recipe]] = (
             replace(_READ, name="read-scene", steps=4000, batch_size=64),
             replace(_NANO, name="traj-only", steps=3000, tasks={"traj_only": 1.0}),
             replace(_NANO, name="meta-act"),
-            replace(
-                _NANO,
-                name="counterfactual",
-                steps=3000,
-                learning_rate=2.5e-4,
-                reflections="learned",
-                own_plans=True,
-                sketched=True,
-                blur_share=0.0,  # the prompt of a blurred history sketches otherwise
-            ),
+            _COUNTERFACTUAL,
         )
     }
     | {
@@ -238,6 +238,14 @@ NANO: Final[Mapping[str, Recipe]] = (
         )
     }
     | {
+        "sketched": replace(
+            _COUNTERFACTUAL,
+            name="sketched",
+            steps=1500,
+            learning_rate=3e-4,
+            sketched=True,
+            blur_share=0.0,  # the prompt of a blurred history sketches otherwise
+        ),
         "cf-rl": replace(
             _OUTCOME,
             name="cf-rl",

@@ -168,7 +168,8 @@ def run(
         FeedbackFileError: ``failures`` is missing, damaged, or of another version.
         ValueError: the recipe wants reflections and there are none, or the other way round, or they are on
             other scenes; it takes no failures, and there are some, or they are on other scenes; it teaches
-            pictures, and there are no codes for those that scenes bring; only one of ``source`` and
+            pictures, and there are no codes for those that scenes bring; it teaches sketches, and ``source``
+            has none; only one of ``source`` and
             ``vision_source`` writes sketches.
     """
     if (reflections is None) != (recipe.reflections is None):
@@ -202,6 +203,8 @@ def run(
     torch.manual_seed(recipe.seed)
     examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
     _check_pictures(recipe, examples, loaded)
+    if recipe.sketched and not loaded.settings.sketch_tokens:
+        raise ValueError(f"recipe {recipe.name} teaches sketches, and {loaded.card.name} has none")
     validate: Validate | None = None
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
@@ -372,7 +375,7 @@ def _prepare(
         attempts=() if tried is None else tried.attempts,
         attempting=recipe.attempting,
         own_plans=own_plans,
-        sketched=recipe.sketched and loaded.settings.sketch_tokens > 0,
+        sketched=recipe.sketched,
         visual_codes=loaded.visual_codes,
         seed=recipe.seed,
     )

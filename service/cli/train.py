@@ -18,7 +18,7 @@ def train(
     recipe: Annotated[
         str,
         typer.Argument(
-            help="create, language, ground, traj-only, meta-act, counterfactual, multi-round; "
+            help="create, language, ground, traj-only, meta-act, counterfactual, multi-round, sketched; "
             "ladder: all of it, then rollouts, labels and training round by round, and the table; "
             "blind, teacher: the small planners of the tables, without pictures; "
             "visual-codes: pictures as codes, for models that imagine; "
@@ -37,7 +37,7 @@ def train(
     ] = None,
     vision_from: Annotated[Path | None, typer.Option(help="Checkpoint whose vision tower is taken.")] = None,
     reflections: Annotated[
-        Path | None, typer.Option(help="A build's reflections, for counterfactual and multi-round.")
+        Path | None, typer.Option(help="A build's reflections, for counterfactual, multi-round and sketched.")
     ] = None,
     failures: Annotated[
         Path | None,

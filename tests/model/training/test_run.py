@@ -271,8 +271,21 @@ def test_reflections_are_learned_and_counted(
         )
 
 
-def reflection(labelled: LabelledScene) -> LabelledReflection:
+def test_sketches_are_learned_where_the_prompt_has_them(
+    untrained_checkpoint: Path, resampling_checkpoint: Path, scenes: Path, tmp_path: Path
+) -> None:
+    file, settings = tmp_path / "reflections.parquet", RunSettings(tmp_path / "cache", bf16=False)
+    text = "My lane is clear. Going on like this would be needlessly cautious, so I should pick up speed."
+    write_reflections(file, [reflection(SCENES[3], text)])
+    run(short("sketched", 2), scenes, resampling_checkpoint, tmp_path / "to", settings, reflections=file)
+    assert load(tmp_path / "to").card.details["stages"][-1]["sketched"]
+    with pytest.raises(ValueError, match="teaches sketches"):
+        run(short("sketched"), scenes, untrained_checkpoint, tmp_path / "no", settings, reflections=file)
+
+
+def reflection(
+    labelled: LabelledScene, text: str = "The road ahead is clear, so I should drive on."
+) -> LabelledReflection:
     """A reflection on a scene, by nobody in particular."""
     wrong, right = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n"), expert_plan(labelled)
-    text = "The road ahead is clear, so I should drive on."
     return LabelledReflection(labelled.scene.scene_id, wrong, text, right, True, *("x",) * 5, 1, "now")
