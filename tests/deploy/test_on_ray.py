@@ -36,7 +36,7 @@ ONGOING, QUEUED = SHIPPED["max_ongoing_requests"], SHIPPED["max_queued_requests"
 REPLICAS = 2
 """As many as are added to the one at the beginning make."""
 BURST = 2 * (REPLICAS * ONGOING + QUEUED)
-START_S = 180
+START_S = 600
 
 
 @pytest.fixture(scope="module")
