@@ -176,6 +176,11 @@ def present_acceleration(history: FloatArray) -> float:
     return float(along @ times / (times @ times))
 
 
+def at_speed(history: FloatArray, times: float) -> FloatArray:
+    """The history [16, 4] of an ego that came the same way at so many times its speed."""
+    return history * np.array([times] * 3 + [1.0], np.float32)
+
+
 def speeds(trajectory: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Signed forward speed in m/s [..., 64] over each step of trajectories [..., 64, 4].
 

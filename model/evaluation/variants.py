@@ -13,6 +13,7 @@ import numpy as np
 
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.scene import Clip, LabelledScene
+from looktwice.model.driving.trajectory import at_speed
 from looktwice.model.engines.engine import (
     Controls,
     Draw,
@@ -196,7 +197,7 @@ def request_for(labelled: LabelledScene, variant: Variant) -> PlanRequest:
     seed = variant.controls.seed ^ zlib.crc32(scene.scene_id.encode())
     given = labelled.given(route=variant.route, tracks=variant.tracks)
     if variant.speed != 1.0:
-        given = replace(given, history=given.history * np.array([variant.speed] * 3 + [1.0], np.float32))
+        given = replace(given, history=at_speed(given.history, variant.speed))
     return PlanRequest(
         request_id=f"{variant.name}/{scene.scene_id}",
         scene=given,

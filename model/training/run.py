@@ -169,8 +169,7 @@ def run(
         ValueError: the recipe wants reflections and there are none, or the other way round, or they are on
             other scenes; it takes no failures, and there are some, or they are on other scenes; it teaches
             pictures, and there are no codes for those that scenes bring; it teaches sketches, and ``source``
-            has none; only one of ``source`` and
-            ``vision_source`` writes sketches.
+            has none; only one of ``source`` and ``vision_source`` writes sketches.
     """
     if (reflections is None) != (recipe.reflections is None):
         wants = "needs reflections" if reflections is None else "takes no reflections"

@@ -14,14 +14,13 @@ from typing import Final
 import numpy as np
 
 from looktwice.clients.metadrive.scenes.lane_maps import LaneMaps
-from looktwice.clients.metadrive.scenes.windows import PICTURE_STEPS, blank_clips, labelled_scene
-from looktwice.clients.metadrive.world.actors import STEP_S
+from looktwice.clients.metadrive.scenes.windows import blank_clips, labelled_scene, stride_steps
 from looktwice.clients.metadrive.world.episode import EpisodeWorld
 from looktwice.clients.metadrive.world.episode_log import EpisodeLog
 from looktwice.clients.metadrive.world.fork import ForkError, fork_expert
 from looktwice.model.driving.cameras import FRONT_CAMERAS
 from looktwice.model.driving.scene import LabelledScene
-from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS
+from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, at_speed
 
 _TIMES: Final = (0.4, 1.6)
 _STANDING_MS: Final = 0.5
@@ -45,7 +44,7 @@ def other_speeds(
     scenes: list[LabelledScene] = []
     tried = 0
     lane_maps: LaneMaps | None = None
-    stride = max(PICTURE_STEPS, round(stride_s / STEP_S / PICTURE_STEPS) * PICTURE_STEPS)
+    stride = stride_steps(stride_s)
     for world in worlds:
         step = world.now - (HISTORY_STEPS - 1)
         if step < 0 or step % stride or world.ego.speed < _STANDING_MS:
@@ -61,6 +60,6 @@ def other_speeds(
         lane_maps = lane_maps or LaneMaps(world.live)
         made = labelled_scene(forked.log, world.now, blank_clips(FRONT_CAMERAS), lane_maps.at(world.now))
         if made is not None:
-            history = made.scene.history * np.array([times, times, times, 1.0], np.float32)
-            scenes.append(replace(made, scene=replace(made.scene, history=history)))
+            scene = replace(made.scene, history=at_speed(made.scene.history, times))
+            scenes.append(replace(made, scene=scene))
     return scenes, world.log(), tried

@@ -46,8 +46,12 @@ def window_steps(log: EpisodeLog, stride_s: float) -> range:
     """The steps with a whole past and a whole future; a collision at the end is in nobody's future."""
     first = HISTORY_STEPS - 1
     last = len(log.ego) - FUTURE_STEPS - (1 if log.outcome != "collision" else 10)
-    stride = max(PICTURE_STEPS, round(stride_s / STEP_S / PICTURE_STEPS) * PICTURE_STEPS)
-    return range(first, max(last, first), stride)
+    return range(first, max(last, first), stride_steps(stride_s))
+
+
+def stride_steps(stride_s: float) -> int:
+    """Steps from scene to scene: whole pictures, and at least one."""
+    return max(PICTURE_STEPS, round(stride_s / STEP_S / PICTURE_STEPS) * PICTURE_STEPS)
 
 
 def labelled_scenes(
