@@ -160,12 +160,12 @@ class ResponseDataset(Dataset[ResponseSample]):
             sketch = self._sketch(item)
             if item.task == self.reflecting:
                 # Nobody knows whether it deserves a second look: behind it the trajectory alone is taught.
-                own = self._own_plans.draw(
-                    index, self.random, mirror=item.mirror, route=item.route, tracks=item.tracks
-                )
-                behind, led_to = own, expert if sketch is None else sketch
-                if sketch is not None and self.random.random() < _EXPERT_SHARE:
-                    behind, led_to = plan, expert
+                behind, led_to = plan, expert
+                if sketch is None or self.random.random() >= _EXPERT_SHARE:
+                    behind = self._own_plans.draw(
+                        index, self.random, mirror=item.mirror, route=item.route, tracks=item.tracks
+                    )
+                    led_to = expert if sketch is None else sketch
                 reflections.append(Counterfactual(behind, "", judged=False))
                 plans.append(plan)
                 vectors.append(led_to)
