@@ -24,8 +24,9 @@ INTENT_TOKENS: Final = 2
 """Tokens of the prompt that one state becomes, without those of its sketch."""
 _TRACK_WIDTH: Final = 96
 _WIDTH: Final = 256
-_SOFTNESS: Final = 0.25
-"""Width of a sketch's mixtures, in mean squared distances from a code to the nearest other one."""
+_SOFTNESS: Final = 1e-3
+"""Width of a sketch's mixtures, in mean squared distances from a code to the nearest other one: a few
+centimetres. In wider ones the nearest code drowns: the later a token, the less of it can be copied."""
 _POSE_SCALE: Final = (10.0, 2.0, 0.3)
 _OUTLIER: Final = 6.0
 MOTION_FEATURES: Final = 3 * (2 * HISTORY_STEPS - 1) + 2 * 2 * ROUTE_POINTS + 1
@@ -123,8 +124,8 @@ class SketchCodes(NamedTuple):
     def tokens(self, sketches: Tensor) -> Tensor:
         """Tokens [b, stages, hidden] of sketches [b, d], in spreads of the first stage's codes.
 
-        Each mixes the embeddings of the codes nearest to what the stages before it left over: unlike the
-        nearest code alone, a mixture changes no more than the sketch does, in every engine alike.
+        Each is the embedding of the code nearest to what the stages before it left over. Where two codes
+        are as near, it mixes them: unlike the nearest code alone, a mixture does not jump between engines.
         """
         books, widths = self.books.float(), self.widths.float()
         tokens = []

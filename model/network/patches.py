@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -13,6 +14,9 @@ from looktwice.model.network.vla_settings import VlaSettings
 PIXEL_MEAN: Final = (0.48145466, 0.4578275, 0.40821073)
 PIXEL_STD: Final = (0.26862954, 0.26130258, 0.27577711)
 """Of RGB in 0..1; Qwen2.5-VL took them over from CLIP (transformers, `OPENAI_CLIP_MEAN`)."""
+
+PATCH_ORDER: Final = (0, 2, 5, 3, 6, 8, 1, 4, 7)
+"""Of the axes of a `patch_grid`: slice, row, column, then places within what is merged, then in a patch."""
 
 
 def resize(picture: npt.NDArray[np.uint8], settings: VlaSettings) -> npt.NDArray[np.uint8]:
@@ -29,13 +33,21 @@ def patchify(frames: npt.NDArray[np.uint8], settings: VlaSettings) -> npt.NDArra
     Frames are those of one or more clips in a row; p = f / temporal x h / patch x w / patch. Patches that
     will be merged lie side by side; within one the order is channel, time, row, column.
     """
+    parts = frames.reshape(patch_grid(frames.shape, settings))
+    return parts.transpose(PATCH_ORDER).reshape(-1, patch_width(settings))
+
+
+def patch_grid(shape: Sequence[int], settings: VlaSettings) -> tuple[int, ...]:
+    """How frames of ``shape`` [f, h, w, 3] are cut: slice, time, row, merge, y, column, merge, x, channel."""
     time, patch, merge = settings.temporal_patch_size, settings.patch_size, settings.spatial_merge_size
-    count, height, width, channels = frames.shape
+    count, height, width, channels = shape
     rows, columns = height // (patch * merge), width // (patch * merge)
-    parts = frames.reshape(count // time, time, rows, merge, patch, columns, merge, patch, channels)
-    # From (slice, time, row, merge, y, column, merge, x, channel):
-    ordered = parts.transpose(0, 2, 5, 3, 6, 8, 1, 4, 7)
-    return ordered.reshape(-1, channels * time * patch * patch)
+    return (count // time, time, rows, merge, patch, columns, merge, patch, channels)
+
+
+def patch_width(settings: VlaSettings) -> int:
+    """Values in a patch."""
+    return 3 * settings.temporal_patch_size * settings.patch_size**2
 
 
 def normalise(patches: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:

@@ -51,13 +51,13 @@ _RARE: Final = [FACTS.index(name) for name in ("walker_0_present", "own_obstacle
 RARE_TIMES: Final = 3
 """How often a scene with a walker or an obstacle ahead is looked at while others are looked at once: one in
 seven has either, and cars that plan from pictures mostly collide with these."""
-_ROUTE_SHARE: Final = 0.75
-_MIRROR_SHARE: Final = 0.5
-_LIGHT_SHARE: Final = 0.7
-_GAIN: Final = 0.15
-_TONE: Final = 0.12
-_LIFT: Final = 10.0
-_NOISE: Final = 2
+ROUTE_SHARE: Final = 0.75
+MIRROR_SHARE: Final = 0.5
+LIGHT_SHARE: Final = 0.7
+GAIN: Final = 0.15
+TONE: Final = 0.12
+LIFT: Final = 10.0
+NOISE: Final = 2
 """Of pictures in another light: how far brightness changes as a share, single colours beside it, what is
 added to all levels, and the largest noise in levels."""
 _MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
@@ -105,8 +105,8 @@ class GroundingDataset(Dataset[GroundingSample]):
 
     def __getitem__(self, index: int) -> GroundingSample:
         chance = self.random.random(3)
-        look = GroundingItem(index, bool(chance[0] < _MIRROR_SHARE), bool(chance[1] < _ROUTE_SHARE))
-        return self.look(look, self.random if chance[2] < _LIGHT_SHARE else None)
+        look = GroundingItem(index, bool(chance[0] < MIRROR_SHARE), bool(chance[1] < ROUTE_SHARE))
+        return self.look(look, self.random if chance[2] < LIGHT_SHARE else None)
 
     def look(self, look: GroundingItem, light: np.random.Generator | None = None) -> GroundingSample:
         """One example as it is asked for, in a light by chance or, without one, as it was."""
@@ -131,9 +131,9 @@ class GroundingDataset(Dataset[GroundingSample]):
 
 def in_other_light(frames: npt.NDArray[np.uint8], random: np.random.Generator) -> npt.NDArray[np.uint8]:
     """Pictures uint8 [f, h, w, 3] brighter or darker and in another tone, all alike, with noise."""
-    tone = 1 + random.uniform(0, _TONE) * random.uniform(-1, 1, 3)
-    gain, lift = 1 + random.uniform(-_GAIN, _GAIN), random.uniform(-_LIFT, _LIFT)
-    noise = random.integers(-_NOISE, _NOISE + 1, frames.shape, dtype=np.int8)
+    tone = 1 + random.uniform(0, TONE) * random.uniform(-1, 1, 3)
+    gain, lift = 1 + random.uniform(-GAIN, GAIN), random.uniform(-LIFT, LIFT)
+    noise = random.integers(-NOISE, NOISE + 1, frames.shape, dtype=np.int8)
     lit = frames * (gain * tone).astype(np.float32) + (np.float32(lift) + noise)
     return lit.round().clip(0, 255).astype(np.uint8)
 

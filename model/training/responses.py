@@ -172,7 +172,12 @@ class ResponseDataset(Dataset[ResponseSample]):
             if sketch is not None:
                 plans[0], vectors[0] = self._driven(sketch, history, plan), sketch
         tried = None if item.attempt is None else self._attempts[item.attempt]
-        soft = [self._soft.draw(vector, self.random) for vector in vectors]
+        # What the prompt sketches is copied code by code: its tokens are those of the nearest ones.
+        copied = self._inputs.settings.sketch_tokens
+        soft = [
+            self._soft.draw(vector, self.random, nearest=0 if vector is expert else copied)
+            for vector in vectors
+        ]
         camera = picture.camera if picture is not None and item.camera_requested else None
         attempt = None if tried is None else tried.attempt
         expected = self._expected_codes(item, camera, history) if camera is not None else None

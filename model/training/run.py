@@ -59,6 +59,7 @@ from looktwice.model.training.intents import (
     read_facts,
 )
 from looktwice.model.training.learner import ResponseLearner
+from looktwice.model.training.looks import LookLearner
 from looktwice.model.training.open_loop_validation import open_loop
 from looktwice.model.training.outcome.outcome_learner import OutcomeLearner, ScenePlaces, collate_places
 from looktwice.model.training.own_plans import OwnPlans
@@ -81,8 +82,9 @@ class RunSettings:
         bf16: mixed precision.
         compiled: compile the decoder; pays after a few hundred steps.
         use_cpu: stay off accelerators.
-        workers: processes that make examples into batches beside the training. Grounding has at least one:
-            decoding pictures for the tower takes a third of a step on a CPU.
+        workers: processes that make examples into batches beside the training. Grounding on CPUs has at
+            least one: decoding pictures for the tower takes a third of a step there. On an accelerator
+            they decode all pictures before it begins.
     """
 
     cache: Path
@@ -202,8 +204,11 @@ def run(
     torch.manual_seed(recipe.seed)
     examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
     _check_pictures(recipe, examples, loaded)
-    if recipe.sketched and not loaded.settings.sketch_tokens:
-        raise ValueError(f"recipe {recipe.name} teaches sketches, and {loaded.card.name} has none")
+    if recipe.sketched:
+        if loaded.model.sketch_books is None:
+            raise ValueError(f"recipe {recipe.name} teaches sketches, and {loaded.card.name} has none")
+        # Older checkpoints sketch in mixtures too wide to be copied.
+        loaded.model.sketch_books.fill(loaded.codec)
     validate: Validate | None = None
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
@@ -243,7 +248,7 @@ def run(
         save_every=settings.save_every,
         bf16=settings.bf16,
         use_cpu=settings.use_cpu,
-        workers=max(settings.workers, int(recipe.goal == "ground")),
+        workers=_workers(recipe, settings),
     )
     if trainer.is_world_process_zero():
         inherit_log(target / LOG_FILE, [source, *([vision_source] if vision_source else [])])
@@ -262,6 +267,13 @@ def run(
     # gloo's threads drop what they gathered a moment later, and need the interpreter for it: a process that
     # ends before that is aborted. So nobody ends before the checkpoint is written.
     trainer.accelerator.wait_for_everyone()
+
+
+def _workers(recipe: Recipe, settings: RunSettings) -> int:
+    """Processes that make batches of a recipe's examples."""
+    if recipe.goal != "ground":
+        return settings.workers
+    return max(settings.workers, 1) if settings.device.type == "cpu" else 0
 
 
 def _check_refining(recipe: Recipe, loaded: Loaded) -> None:
@@ -340,7 +352,10 @@ def _prepare(
     settings: RunSettings,
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
     if recipe.goal == "ground":
-        grounding = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE)
+        grounding, device = GroundingLearner(loaded.model, loaded.codec, DENSE_SHAPE), settings.device
+        if device.type != "cpu":
+            looking = LookLearner(grounding, examples, loaded.inputs, device, settings.workers)
+            return looking, ScenePlaces(looked_at(examples)), None, collate_places
         looks = GroundingDataset(examples, loaded.inputs, recipe.seed)
         return grounding, Subset(looks, looked_at(examples)), None, collate_grounding
     vision = None

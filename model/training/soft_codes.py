@@ -49,8 +49,8 @@ class SoftCodes:
             widths.append(_SOFTNESS * float((rest**2).sum(axis=1).mean()))
         self._widths = np.maximum(widths, 1e-6)
 
-    def draw(self, vector: FloatArray, random: np.random.Generator) -> SoftTarget:
-        """A target for one vector [d]."""
+    def draw(self, vector: FloatArray, random: np.random.Generator, nearest: int = 0) -> SoftTarget:
+        """A target for one vector [d]; in the first ``nearest`` stages it is the nearest code alone."""
         stages, size = self._squares.shape
         codes, shares = np.empty(stages, np.int64), np.empty((stages, size), np.float32)
         errors = np.empty((stages, size), np.float32)
@@ -59,7 +59,7 @@ class SoftCodes:
             squares = self._squares[stage] - 2 * book @ rest
             errors[stage] = np.sqrt(np.maximum(squares + rest @ rest, 0.0) / FUTURE_STEPS)
             cost = squares / self._widths[stage]
-            weights = np.exp(cost.min() - cost)
+            weights = cost == cost.min() if stage < nearest else np.exp(cost.min() - cost)
             shares[stage] = weights / weights.sum()
             codes[stage] = np.searchsorted(np.cumsum(shares[stage]), random.random() * shares[stage].sum())
             codes[stage] = min(codes[stage], size - 1)

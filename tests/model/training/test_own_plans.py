@@ -13,6 +13,7 @@ from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.families.cf_vla.targets import NANO_WEIGHTS, PAPER_WEIGHTS
 from looktwice.model.network.checkpoint import Loaded, load
+from looktwice.model.network.vla_settings import NANO_SETTINGS
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.response_targets import Target
@@ -112,6 +113,8 @@ def test_sketched_trajectories_are_those_that_the_prompt_tells(
         sample = data[True][item]
         first, second = sample.code_errors_m[:, 0]
         np.testing.assert_allclose(first, apart_m(item), atol=1e-3)
+        copied = sample.code_shares[0].max(axis=1) == 1
+        assert copied[: NANO_SETTINGS.sketch_tokens].all(), "a sketch's codes are not drawn"
         assert f"Meta Actions:\n{words}" in written(sample.responses[0])
         led_to_expert.append(bool(np.abs(second - expert).max() < 1e-3))
         if led_to_expert[-1]:

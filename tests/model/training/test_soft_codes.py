@@ -53,3 +53,18 @@ def test_draws_differ_and_are_reproducible(
     assert len(drawn) > 1
     again = np.random.default_rng(1)
     assert {tuple(soft.draw(vectors[0], again).codes) for _ in range(20)} == drawn
+
+
+def test_where_asked_for_the_first_codes_are_the_nearest_and_nothing_else(
+    fitted: tuple[TrajectoryCodec, np.ndarray],
+) -> None:
+    codec, vectors = fitted
+    soft, random = SoftCodes(codec, vectors), np.random.default_rng(0)
+    for vector in vectors[:20]:
+        drawn = soft.draw(vector, random, nearest=3)
+        rest = vector.copy()
+        for book, code, shares in zip(codec.books[:3], drawn.codes, drawn.shares, strict=False):
+            assert code == ((book - rest) ** 2).sum(axis=1).argmin()
+            np.testing.assert_array_equal(shares, np.arange(codec.size) == code)
+            rest -= book[code]
+        assert (drawn.shares[3:].max(axis=1) < 1).any()
