@@ -19,7 +19,7 @@ from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.reflection_store import LabelledReflection, write_reflections
 from looktwice.model.driving.scene import LabelledScene, NextFrame
 from looktwice.model.driving.scene_store import write_scenes
-from looktwice.model.network.checkpoint import load, with_sketches
+from looktwice.model.network.checkpoint import load, save, with_sketches
 from looktwice.model.network.visual_codes import VisualCodes
 from looktwice.model.network.vla_settings import NANO_SETTINGS
 from looktwice.model.training.recipes import NANO, Recipe
@@ -277,8 +277,19 @@ def test_sketches_are_learned_where_the_prompt_has_them(
     file, settings = tmp_path / "reflections.parquet", RunSettings(tmp_path / "cache", bf16=False)
     text = "My lane is clear. Going on like this would be needlessly cautious, so I should pick up speed."
     write_reflections(file, [reflection(SCENES[3], text)])
-    run(short("sketched", 2), scenes, resampling_checkpoint, tmp_path / "to", settings, reflections=file)
-    assert load(tmp_path / "to").card.details["stages"][-1]["sketched"]
+    wide = load(resampling_checkpoint)
+    wide_books = wide.model.sketch_books
+    assert wide_books is not None
+    wide_books.fill(wide.codec)
+    narrow = wide_books.widths.tolist()
+    torch.nn.init.constant_(wide_books.widths, 64.0)
+    save(tmp_path / "wide", wide.model, wide.vocabulary, wide.codec)
+    run(short("sketched", 2), scenes, tmp_path / "wide", tmp_path / "to", settings, reflections=file)
+    learned = load(tmp_path / "to")
+    assert learned.card.details["stages"][-1]["sketched"]
+    books = learned.model.sketch_books
+    assert books is not None
+    assert books.widths.tolist() == pytest.approx(narrow, rel=0.01), "wide mixtures cannot be copied"
     with pytest.raises(ValueError, match="teaches sketches"):
         run(short("sketched"), scenes, untrained_checkpoint, tmp_path / "no", settings, reflections=file)
 
