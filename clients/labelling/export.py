@@ -50,8 +50,7 @@ def reflections(ledger: Ledger, label: StageRun, *, by_outcome: bool = False) ->
             expert_plan=expert if facts is None else corrected(predicted, expert, facts),
             judged=not by_outcome or entry.record["failure"] is not None,
             key=entry.key,
-            model=rollout.config["model"],
-            model_revision=rollout.config["revision"],
+            **_planned_by(rollout),
             teacher=label.config["teacher"],
             teacher_revision=label.config["revision"],
             attempts=entry.record["attempts"],
@@ -96,13 +95,19 @@ def _to_act_on(rollout: StageRun, entry: Entry, plans: Iterable[str]) -> Iterato
             expert_plan=expert,
             judged=True,
             key=entry.key,
-            model=rollout.config["model"],
-            model_revision=rollout.config["revision"],
+            **_planned_by(rollout),
             teacher="",
             teacher_revision="",
             attempts=0,
             labelled_at=entry.ended_at,
         )
+
+
+def _planned_by(rollout: StageRun) -> dict[str, Any]:
+    """Whose plans they are, and what it was told."""
+    config = rollout.config
+    told = {name: config[name] for name in ("route", "tracks")}
+    return {"model": config["model"], "model_revision": config["revision"], **told}
 
 
 def _rollout_of(ledger: Ledger, label: StageRun) -> StageRun:

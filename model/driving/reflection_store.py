@@ -16,7 +16,7 @@ import pyarrow as pa
 from looktwice.model.driving.parquet_rows import read_rows, write_rows
 from looktwice.model.driving.plan import Plan, PlanError, parse_plan
 
-REFLECTION_VERSION: Final = "2"
+REFLECTION_VERSION: Final = "3"
 _VERSION_KEY: Final = b"looktwice.reflection_version"
 _ROW_GROUP: Final = 4096
 
@@ -36,6 +36,7 @@ class LabelledReflection:
         expert_plan: what it leads to: the expert's plan, of which a reflection in phrases takes over the
             tracks that it speaks of.
         judged: whether it is known that the plan deserves a second look, or none; see `Counterfactual`.
+        route, tracks: whether the model was told the route, and the tracks of what is around.
         key: of the label in the ledger it comes from.
         model, model_revision: who planned.
         teacher, teacher_revision: who wrote; empty where nobody did.
@@ -48,6 +49,8 @@ class LabelledReflection:
     reflection: str
     expert_plan: Plan
     judged: bool
+    route: bool
+    tracks: bool
     key: str
     model: str
     model_revision: str
@@ -57,9 +60,10 @@ class LabelledReflection:
     labelled_at: str
 
 
+_FLAGS: Final = ("judged", "route", "tracks")
 _SCHEMA: Final = pa.schema(
     [
-        (name, {"attempts": pa.int32(), "judged": pa.bool_()}.get(name, pa.string()))
+        (name, {"attempts": pa.int32()}.get(name, pa.bool_() if name in _FLAGS else pa.string()))
         for name in LabelledReflection.__dataclass_fields__
     ]
 )

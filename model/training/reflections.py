@@ -40,9 +40,16 @@ def mirrored(reflection: Counterfactual) -> Counterfactual:
 
 
 class PlacedReflections(NamedTuple):
-    """Reflections, and the place of the example that each is on, int64 [m]."""
+    """Reflections, the example that each is on, and what its model was told.
+
+    Attributes:
+        examples: int64 [m], places.
+        told: bool [m, 2], the route; the tracks.
+        reflections: m of them.
+    """
 
     examples: npt.NDArray[np.int64]
+    told: npt.NDArray[np.bool_]
     reflections: list[Counterfactual]
 
 
@@ -83,4 +90,5 @@ def place_reflections(examples: Examples, found: Iterable[LabelledReflection]) -
         thinking = plain(each.reflection)
         revised = None if facts_of(thinking) is None else each.expert_plan
         reflections.append(Counterfactual(each.predicted_plan, thinking, revised, each.judged))
-    return PlacedReflections(places, reflections)
+    told = np.array([(each.route, each.tracks) for each in labelled], np.bool_).reshape(-1, 2)
+    return PlacedReflections(places, told, reflections)

@@ -433,6 +433,7 @@ def _prepare(
         recipe.seed,
         processes=int(os.environ.get("WORLD_SIZE", 1)),
         reflected=np.zeros(0, np.int64) if on_examples is None else on_examples.examples,
+        told=None if on_examples is None else on_examples.told,
         reasoning=recipe.reflections == "learned",
         reflecting=responses.reflecting,
         tracks_share=recipe.tracks_share if loaded.settings.with_tracks else 0.0,

@@ -55,9 +55,10 @@ class TaskSampler(BatchSampler):
 
     Examples without pictures are always given their tracks: else there would be nothing to go by.
 
-    Reflections are examples of their own beside all others: the natural mixture of CF-VLA section 6. Those
-    on one scene share its prompt, and scenes with about as many share a batch. So are attempts, each with a
-    long prompt of its own: a batch holds fewer of them. Feedback speaks of left and right and of the speeds
+    Reflections are examples of their own beside all others: the natural mixture of CF-VLA section 6. They are
+    learned behind the prompt that their plan was made from: behind another one, the plan gives itself away.
+    Those on one scene share a prompt, and scenes with about as many share a batch. So are attempts, each with
+    a long prompt of its own: a batch holds fewer of them. Feedback speaks of left and right and of the speeds
     that were, so they are neither mirrored nor blurred.
 
     Args:
@@ -77,6 +78,7 @@ class TaskSampler(BatchSampler):
         seed: of the order; every epoch has another one.
         processes: so many batches in a row are alike, as those who share the work wait for the slowest.
         reflected: int64 [r], the example that each reflection is on.
+        told: bool [r, 2], whether its prompt has the route, and the tracks; needed with reflections.
         reflecting: the format of reflections and of examples that are learned once more; needed with them.
         reasoning: whether reflections are learned; otherwise their examples are learned once more without,
             the control "multi-round" of CF-VLA section 4.3.
@@ -96,6 +98,7 @@ class TaskSampler(BatchSampler):
         reasoning: bool = True,
         *,
         reflecting: str | None = None,
+        told: npt.NDArray[np.bool_] | None = None,
         tracks_share: float = 0.0,
         mirror_share: float = 0.0,
         blur_share: float = 0.0,
@@ -117,14 +120,16 @@ class TaskSampler(BatchSampler):
         self._mirror_reflected = mirror_reflected
         self._shares = {"tracks": tracks_share, "mirror": mirror_share, "blur": blur_share}
         self._processes, self._has_route, self._tasks = processes, has_route, tasks
-        if len(reflected) and reflecting is None:
-            raise ValueError("reflections need a format that they are written in")
+        if len(reflected) and (reflecting is None or told is None):
+            raise ValueError("reflections need a format that they are written in, and what was told")
         self._reflecting = reflecting or ""
         self._route_share, self._seed, self._epoch = route_share, seed, 0
         self._again = np.zeros(0, np.int64) if reasoning else reflected
-        self._reflections: dict[int, list[int]] = {}
-        for place, index in enumerate(reflected if reasoning else ()):
-            self._reflections.setdefault(int(index), []).append(place)
+        # Of an example, and whether route and tracks were told.
+        self._reflections: dict[tuple[int, bool, bool], list[int]] = {}
+        if reasoning and told is not None:
+            for place, (index, (route, tracks)) in enumerate(zip(reflected, told, strict=True)):
+                self._reflections.setdefault((int(index), bool(route), bool(tracks)), []).append(place)
         mean = len(reflected) / max(1, len(self._reflections))
         self._scenes_a_batch = max(1, round(batch_size / max(1.0, mean)))
         self._batch_size = batch_size
@@ -180,23 +185,22 @@ class TaskSampler(BatchSampler):
         ]
 
     def _reflected(self, random: np.random.Generator) -> list[Item]:
-        example = np.array(list(self._reflections), np.int64)
-        given = self._given(example, random)
-        tracks, mirror, blur = (self._drawn(name, len(example), random) for name in _CHANCES)
+        prompts = list(self._reflections)
+        mirror, blur = (self._drawn(name, len(prompts), random) for name in ("mirror", "blur"))
         mirror &= self._mirror_reflected
         return [
             Item(
                 index,
                 self._reflecting,
-                bool(given[place]),
-                tuple(self._reflections[index]),
-                tracks=bool(tracks[place]),
+                route and bool(self._has_route[index]),
+                tuple(self._reflections[prompts[place]]),
+                tracks=tracks or not self._pictured[index],
                 mirror=bool(mirror[place]),
                 blur=bool(blur[place]),
                 pictures=bool(self._pictured[index]),
             )
-            for place in random.permutation(len(example))
-            for index in [int(example[place])]
+            for place in random.permutation(len(prompts))
+            for index, route, tracks in [prompts[place]]
         ]
 
     def _tries(self, random: np.random.Generator) -> list[Item]:

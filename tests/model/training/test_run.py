@@ -299,4 +299,6 @@ def reflection(
 ) -> LabelledReflection:
     """A reflection on a scene, by nobody in particular."""
     wrong, right = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n"), expert_plan(labelled)
-    return LabelledReflection(labelled.scene.scene_id, wrong, text, right, True, *("x",) * 5, 1, "now")
+    return LabelledReflection(
+        labelled.scene.scene_id, wrong, text, right, True, True, False, *("x",) * 5, 1, "now"
+    )

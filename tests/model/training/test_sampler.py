@@ -46,9 +46,21 @@ def test_processes_get_batches_of_one_kind_at_a_time() -> None:
 REFLECTED = np.array([3, 3, 5], np.int64)
 
 
+def told(count: int) -> np.ndarray:
+    """The route, and no tracks."""
+    return np.tile([True, False], (count, 1))
+
+
 def test_reflections_are_examples_beside_all_others() -> None:
     sampler = TaskSampler(
-        np.ones(8, np.bool_), 1, {"cf_vla": 1.0}, 0.5, seed=0, reflected=REFLECTED, reflecting="cf_vla"
+        np.ones(8, np.bool_),
+        1,
+        {"cf_vla": 1.0},
+        0.5,
+        seed=0,
+        reflected=REFLECTED,
+        told=told(3),
+        reflecting="cf_vla",
     )
     items = [item for batch in sampler for item in batch]
     assert len(items) == len(sampler) == 10
@@ -66,6 +78,7 @@ def test_only_reflections_in_phrases_are_mirrored(phrases: bool) -> None:
         0.5,
         seed=0,
         reflected=REFLECTED,
+        told=told(3),
         mirror_share=1.0,
         reflecting="cf_vla",
         mirror_reflected=phrases,
@@ -83,6 +96,7 @@ def test_every_batch_reaches_a_process() -> None:
         seed=0,
         processes=2,
         reflected=reflected,
+        told=told(len(reflected)),
         reflecting="cf_vla",
     )
     sampler.set_epoch(1)
@@ -105,6 +119,7 @@ def test_batches_of_reflections_lie_among_the_others(processes: int) -> None:
         seed=0,
         processes=processes,
         reflected=reflected,
+        told=told(len(reflected)),
         reflecting="cf_vla",
     )
     batches = list(sampler)
@@ -126,6 +141,7 @@ def test_the_control_learns_the_same_scenes_without_reasoning() -> None:
         0.5,
         seed=0,
         reflected=REFLECTED,
+        told=told(3),
         reflecting="cf_vla",
         reasoning=False,
     )
@@ -142,6 +158,7 @@ def test_each_chance_is_taken_as_often_as_asked() -> None:
         0.8,
         seed=0,
         reflected=np.arange(0, 4000, 8),
+        told=told(500),
         reflecting="cf_vla",
         tracks_share=0.5,
         mirror_share=0.3,
@@ -154,7 +171,7 @@ def test_each_chance_is_taken_as_often_as_asked() -> None:
         assert np.mean(plain) == pytest.approx(share, abs=0.03), name
     reflected = [item for item in items if item.reflections]
     assert not any(item.mirror for item in reflected), "what was said of it names left and right"
-    assert 0.3 < np.mean([item.tracks for item in reflected]) < 0.7
+    assert not any(item.tracks for item in reflected), "its plan was made without them"
     mixed = [batch for batch in batches if len({(item.route, item.tracks) for item in batch}) > 1]
     assert len(mixed) <= 8
 
@@ -191,3 +208,29 @@ def test_pictures_are_taught_where_there_are_any_and_asked_for_in_most_of_them()
     # A picture is a third of a response: those with one share batches.
     mixed = [batch for batch in batches if len({item.camera is None for item in batch}) == 2]
     assert len(mixed) <= 4 < len(batches) / 20
+
+
+def test_reflections_are_learned_behind_what_their_model_was_told() -> None:
+    sampler = TaskSampler(
+        np.array([True, True, False]),
+        1,
+        {"cf_vla": 1.0},
+        0.5,
+        seed=0,
+        reflected=np.array([0, 0, 0, 1, 2]),
+        told=np.array([(True, True), (True, False), (True, True), (False, True), (True, False)]),
+        reflecting="cf_vla",
+        tracks_share=0.5,
+        pictured=np.array([True, True, True]),
+    )
+    items = [item for batch in sampler for item in batch if item.reflections]
+    assert {(item.index, item.reflections, item.route, item.tracks) for item in items} == {
+        (0, (0, 2), True, True),
+        (0, (1,), True, False),
+        (1, (3,), False, True),
+        (2, (4,), False, False),
+    }
+    with pytest.raises(ValueError, match="what was told"):
+        TaskSampler(
+            np.ones(3, np.bool_), 1, {"cf_vla": 1.0}, 0.5, 0, reflected=np.array([0]), reflecting="cf_vla"
+        )
