@@ -192,13 +192,17 @@ class ResponseLearner(nn.Module):
     ) -> Tensor:
         """The last states [b, t, hidden] of a batch from `collate`."""
         vla = self.vla
-        vision_tokens = None if seen is None else seen.float().flatten(0, 1)
+        vision_tokens = None if seen is None else seen.flatten(0, 1)
         if patches is not None:
             grid = vla.settings.grid
             clips = len(patches) // (grid[0] * grid[1] * grid[2])
             vision_tokens = vla.vision(patches, torch.tensor([grid] * clips))
+        # Mixed precision rounds a sketch by more than its tokens are wide, and targets are not rounded.
+        with torch.autocast(input_ids.device.type, enabled=False):
+            seen_tokens = None if vision_tokens is None else vision_tokens.float()
+            embeddings = vla.embed(input_ids, seen_tokens, history, route, tracks)
         states: Tensor = self._decoder[0](
-            inputs_embeds=vla.embed(input_ids, vision_tokens, history, route, tracks),
+            inputs_embeds=embeddings,
             attention_mask=layout.mask,
             position_ids=vla.position_ids(input_ids, parts >= 0) - layout.moved,
             use_cache=False,

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,6 +88,24 @@ def test_padding_changes_no_loss(loaded: Loaded) -> None:
         alone = [float(learner(**collate([sample]))["loss"]) for sample in samples]
         together = float(learner(**collate(samples))["loss"])
     assert together == pytest.approx(sum(alone) / 2, rel=1e-4)
+
+
+def test_mixed_precision_does_not_round_what_is_sketched(resampling_checkpoint: Path) -> None:
+    """Its tokens are centimetres wide, and bfloat16 tells 20 m to the nearest decimetre."""
+    loaded = load(resampling_checkpoint)
+    batch = collate([dataset(loaded, pictures=False)[Item(1, "traj_only", True, tracks=True)]])
+    learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec)
+    decoder: Any = loaded.model.model.language_model
+    fed: list[torch.Tensor] = []
+    decoder.register_forward_pre_hook(
+        lambda _, args, kwargs: fed.append(kwargs["inputs_embeds"]), with_kwargs=True
+    )
+    with torch.no_grad():
+        for mixed in (False, True):
+            with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+                learner(**batch)
+    exact, mixed_too = fed
+    torch.testing.assert_close(mixed_too, exact, rtol=0, atol=0)
 
 
 def test_learning_without_pictures_leaves_the_tower_alone(loaded: Loaded) -> None:
