@@ -21,6 +21,8 @@ HISTORY_STEPS: Final = 16
 FUTURE_STEPS: Final = 64
 """Rows of a trajectory; the first row lies 0.1 s ahead (CF-VLA section 7)."""
 HORIZON_S: Final = 6.4
+POSE_MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
+"""Times a pose is its mirror image, left and right swapped; its first two are those of a point (x, y)."""
 TEN_HZ_S: Final = tuple(round(STEP_S * step, 1) for step in range(1, FUTURE_STEPS + 1))
 """Times of the poses of a trajectory, unless a model family has its own."""
 HALF_SECONDS_S: Final = tuple(0.5 * step for step in range(1, 9))

@@ -25,6 +25,7 @@ from looktwice.model.driving.facts import (
     mirrored,
 )
 from looktwice.model.driving.scene import SEMANTIC_CLASSES
+from looktwice.model.driving.trajectory import POSE_MIRROR
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.fact_reader import likely
 from looktwice.model.network.inputs import InputBuilder
@@ -60,8 +61,6 @@ LIFT: Final = 10.0
 NOISE: Final = 2
 """Of pictures in another light: how far brightness changes as a share, single colours beside it, what is
 added to all levels, and the largest noise in levels."""
-_MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
-"""Of poses (x, y, z, heading)."""
 
 
 class GroundingSample(NamedTuple):
@@ -147,9 +146,9 @@ def _mirror(sample: GroundingSample) -> GroundingSample:
         range_log=np.ascontiguousarray(sample.range_log[..., ::-1]),
         motion=motion,
         facts=mirrored(sample.facts),
-        history=sample.history * _MIRROR,
-        route=sample.route * _MIRROR[:2],
-        futures=sample.futures * _MIRROR,
+        history=sample.history * POSE_MIRROR,
+        route=sample.route * POSE_MIRROR[:2],
+        futures=sample.futures * POSE_MIRROR,
     )
 
 

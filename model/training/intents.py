@@ -19,7 +19,7 @@ from torch.utils.data import Dataset
 
 from looktwice.model.driving.facts import FACTS, mirrored
 from looktwice.model.driving.plan import GROUPS, TICKS, WORDS
-from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.driving.trajectory import POSE_MIRROR, FloatArray
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.fact_reader import likely
 from looktwice.model.network.intent import IntentTrunk, present_speeds
@@ -36,8 +36,6 @@ _BATCH: Final = 64
 _DROPOUT: Final = 0.2
 _WORDS_WEIGHT: Final = 2.0
 _FACTS_WEIGHT: Final = 0.5
-_MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
-"""Of poses (x, y, z, heading)."""
 
 
 class IntentSample(NamedTuple):
@@ -88,7 +86,7 @@ class IntentDataset(Dataset[IntentSample]):
         if not has_route:
             tracks = without_route(tracks)
         if mirror:
-            history, future, way = history * _MIRROR, future * _MIRROR, way * _MIRROR[:2]
+            history, future, way = history * POSE_MIRROR, future * POSE_MIRROR, way * POSE_MIRROR[:2]
             tracks[:, MIRRORED] *= -1
             bins, facts = self._mirrored_bins[index], mirrored(facts)
         read = self._nothing if self._read is None else self._read[index, int(mirror), int(has_route)]
@@ -115,7 +113,7 @@ def read_facts(vla: LookTwiceVla, examples: Examples, vision: VisionCache, seed:
     with_pictures, device = np.flatnonzero(pictured), vla.device
     for side in range(sides):
         truth = mirrored(examples.facts) if side else examples.facts
-        flip = _MIRROR if side else np.ones(4, np.float32)
+        flip = POSE_MIRROR if side else np.ones(4, np.float32)
         history, route = examples.history * flip, np.nan_to_num(examples.route) * flip[:2]
         for has_route in range(2):
             for start in range(0, len(with_pictures), _BATCH):

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from looktwice.model.driving.facts import mirrored
+from looktwice.model.driving.trajectory import POSE_MIRROR
 from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.patches import PATCH_ORDER, patch_grid, patch_width
 from looktwice.model.network.vla_settings import VlaSettings
@@ -30,8 +31,6 @@ from looktwice.model.training.grounding import (
 )
 
 _BATCH: Final = 64
-_MIRROR: Final = (1.0, -1.0, 1.0, -1.0)
-"""Of poses (x, y, z, heading)."""
 
 
 class LookLearner(nn.Module):
@@ -96,7 +95,7 @@ class LookLearner(nn.Module):
         frames = _where(lit, in_other_lights(frames), frames)
         motion = known["motion"].float()
         sideways = motion.new_tensor([1.0, -1.0])[:, None, None]
-        poses = known["history"].new_tensor(_MIRROR)
+        poses = torch.from_numpy(POSE_MIRROR).to(places.device)
         return {
             "patches": patchified(frames.flatten(0, 1), self._settings),
             "classes": _where(mirror, known["classes"].flip(-1), known["classes"]),

@@ -13,7 +13,13 @@ from looktwice.model.driving.labeller import label_plan
 from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import mirrored_camera
-from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, STEP_S, present_speed
+from looktwice.model.driving.trajectory import (
+    FUTURE_STEPS,
+    HISTORY_STEPS,
+    POSE_MIRROR,
+    STEP_S,
+    present_speed,
+)
 from looktwice.model.families.family import (
     Counterfactual,
     FamilyError,
@@ -42,8 +48,6 @@ from looktwice.model.training.sampler import Item
 from looktwice.model.training.soft_codes import SoftCodes
 from looktwice.model.training.vision_cache import VisionCache
 
-_MIRROR: Final = np.array([1, -1, 1, -1], np.float32)
-"""Of poses (x, y, z, heading)."""
 _EXPERT_SHARE: Final = 0.5
 """Of the plans behind which sketches are learned, so many are the expert's, with the expert's trajectory."""
 
@@ -142,7 +146,7 @@ class ResponseDataset(Dataset[ResponseSample]):
         perceived = examples.perception(index)
         tracks = tracks.copy() if item.route else without_route(tracks)
         if item.mirror:
-            history, future, route = history * _MIRROR, future * _MIRROR, route * _MIRROR[:2]
+            history, future, route = history * POSE_MIRROR, future * POSE_MIRROR, route * POSE_MIRROR[:2]
             tracks[:, MIRRORED] *= -1
             plan = plan.mirrored()
             thoughts = None if thoughts is None else thoughts.mirrored()

@@ -14,12 +14,12 @@ from torch import Tensor, nn
 from looktwice.model.driving.facts import mirrored
 from looktwice.model.driving.scene_store import read_scenes, scene_files
 from looktwice.model.driving.tracks import tracks_of
-from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.driving.trajectory import POSE_MIRROR, FloatArray
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.small_planner import SmallInputs, SmallKind, SmallPlanner
 from looktwice.model.network.track_features import MIRRORED, track_features
 
-_POSE_MIRROR = torch.tensor([1.0, -1.0, 1.0, -1.0])
+_POSE_MIRROR = torch.from_numpy(POSE_MIRROR)
 
 
 @dataclass(frozen=True)
