@@ -169,9 +169,10 @@ def run(
     Raises:
         FeedbackFileError: ``failures`` is missing, damaged, or of another version.
         ValueError: the recipe wants reflections and there are none, or the other way round, or they are on
-            other scenes; it takes no failures, and there are some, or they are on other scenes; it teaches
-            pictures, and there are no codes for those that scenes bring; it teaches sketches, and ``source``
-            has none; only one of ``source`` and ``vision_source`` writes sketches.
+            other scenes, or on plans made with tracks where ``source`` takes none; it takes no failures, and
+            there are some, or they are on other scenes; it teaches pictures, and there are no codes for those
+            that scenes bring; it teaches sketches, and ``source`` has none; only one of ``source`` and
+            ``vision_source`` writes sketches.
     """
     if (reflections is None) != (recipe.reflections is None):
         wants = "needs reflections" if reflections is None else "takes no reflections"
@@ -214,6 +215,8 @@ def run(
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
     taught = _taught_by(recipe, examples)
     on_examples = None if reflections is None else place_reflections(examples, read_reflections(reflections))
+    if on_examples is not None and on_examples.told[:, 1].any() and not loaded.settings.with_tracks:
+        raise ValueError(f"{reflections} has plans made with tracks, which {loaded.card.name} cannot be told")
     tried = None
     if failures is not None and recipe.attempting is not None:
         times_s = family_named(recipe.attempting).times_s

@@ -259,6 +259,16 @@ def test_reflections_are_learned_and_counted(
             settings,
             reflections=file,
         )
+    write_reflections(file, [replace(reflection(SCENES[3]), tracks=True)])
+    with pytest.raises(ValueError, match="plans made with tracks"):
+        run(
+            short("counterfactual"),
+            scenes,
+            untrained_checkpoint,
+            tmp_path / "no",
+            settings,
+            reflections=file,
+        )
     write_reflections(file, [reflection(training_scene(99))])
     with pytest.raises(ValueError, match="not among the scenes"):
         run(
