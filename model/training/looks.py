@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
@@ -132,18 +133,16 @@ def _where(which: Tensor, there: Tensor, elsewhere: Tensor) -> Tensor:
     return torch.where(which.view(-1, *[1] * (there.ndim - 1)), there, elsewhere)
 
 
-class _DecodedPictures(Dataset[np.ndarray[tuple[int, ...], np.dtype[np.uint8]]]):
+class _DecodedPictures(Dataset[npt.NDArray[np.uint8]]):
     """Pictures of examples by their spans [n, 2], decoded; an empty one is black."""
 
-    def __init__(
-        self, examples: Examples, spans: np.ndarray[tuple[int, ...], np.dtype[np.int64]], inputs: InputBuilder
-    ) -> None:
+    def __init__(self, examples: Examples, spans: npt.NDArray[np.int64], inputs: InputBuilder) -> None:
         self._pictures, self._spans, self._inputs = examples.pictures, spans, inputs
 
     def __len__(self) -> int:
         return len(self._spans)
 
-    def __getitem__(self, place: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    def __getitem__(self, place: int) -> npt.NDArray[np.uint8]:
         settings = self._inputs.settings
         first, last = self._spans[place]
         if first == last:
@@ -153,7 +152,7 @@ class _DecodedPictures(Dataset[np.ndarray[tuple[int, ...], np.dtype[np.uint8]]])
 
 def _decoded(
     examples: Examples,
-    spans: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
+    spans: npt.NDArray[np.int64],
     inputs: InputBuilder,
     device: torch.device,
     workers: int,

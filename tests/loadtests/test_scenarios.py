@@ -107,7 +107,8 @@ def test_a_burst_is_told_apart_from_what_was_before() -> None:
     assert during_s is not None
     assert told["p95_ratio"] == pytest.approx(during_s / before_s)
     assert told["rejected"] == result.phases["burst"].count("rejected")
-    assert told["rejected"] > 20 > result.phases["unloaded"].count("rejected")
+    assert told["rejected"] > 20
+    assert result.phases["unloaded"].count("rejected") == 0
     assert result.phases["burst"].window.seconds == pytest.approx(1.5)
     assert written(result, used).tags.count("svg") == 2
 

@@ -48,7 +48,7 @@ _MAX_SEED = 2**31
 
 
 class ScenePlaces(Dataset[int]):
-    """The places of examples to learn from; what is asked of them is left to `OutcomeLearner`."""
+    """The places of examples to learn from; what is asked of them is left to the learner."""
 
     def __init__(self, places: Sequence[int]) -> None:
         self._places = places
@@ -61,7 +61,7 @@ class ScenePlaces(Dataset[int]):
 
 
 def collate_places(places: list[int]) -> dict[str, Tensor]:
-    """A batch for `OutcomeLearner`."""
+    """A batch for `OutcomeLearner` or `LookLearner`."""
     return {"places": torch.tensor(places)}
 
 

@@ -248,37 +248,17 @@ def test_reflections_are_learned_and_counted(
         target = tmp_path / name
         run(short(name, 2), scenes, untrained_checkpoint, target, settings, reflections=file)
         assert load(target).card.details["stages"][-1]["reflections_count"] == 2
-    with pytest.raises(ValueError, match="needs reflections"):
-        run(short("counterfactual"), scenes, untrained_checkpoint, tmp_path / "no", settings)
-    with pytest.raises(ValueError, match="takes no reflections"):
-        run(
-            short("meta-act"),
-            scenes,
-            untrained_checkpoint,
-            tmp_path / "no",
-            settings,
-            reflections=file,
-        )
+
+    def refused(name: str, why: str, reflections: Path | None = file) -> None:
+        with pytest.raises(ValueError, match=why):
+            run(short(name), scenes, untrained_checkpoint, tmp_path / "no", settings, reflections=reflections)
+
+    refused("counterfactual", "needs reflections", None)
+    refused("meta-act", "takes no reflections")
     write_reflections(file, [replace(reflection(SCENES[3]), tracks=True)])
-    with pytest.raises(ValueError, match="plans made with tracks"):
-        run(
-            short("counterfactual"),
-            scenes,
-            untrained_checkpoint,
-            tmp_path / "no",
-            settings,
-            reflections=file,
-        )
+    refused("counterfactual", "plans made with tracks")
     write_reflections(file, [reflection(training_scene(99))])
-    with pytest.raises(ValueError, match="not among the scenes"):
-        run(
-            short("counterfactual"),
-            scenes,
-            untrained_checkpoint,
-            tmp_path / "no",
-            settings,
-            reflections=file,
-        )
+    refused("counterfactual", "not among the scenes")
 
 
 def test_sketches_are_learned_where_the_prompt_has_them(
