@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from looktwice.model.driving.route_frame import RouteFrame
-from looktwice.model.driving.scene import EGO_LENGTH_M, LabelledScene
+from looktwice.model.driving.scene import EGO_LENGTH_M, LabelledScene, Scene
 from looktwice.model.driving.tracks import Track, tracks_of
 from looktwice.model.driving.trajectory import FloatArray
 
@@ -55,6 +55,9 @@ WALKER_SPEED_SCALE_MS: Final = 2.0
 WALKER_LEFT_SCALE_M: Final = 3.0
 ROAD_SCALE_M: Final = 10.0
 _STANDING_MS: Final = 0.5
+_WALKER_AHEAD_M: Final = 45.0
+_STANDING_AHEAD_M: Final = 60.0
+_CLOSE_M: Final = 3.5
 
 _MIRROR: Final[npt.NDArray[np.int64]] = np.array(
     [
@@ -132,6 +135,27 @@ def facts_of(tracks: Sequence[Track], route: FloatArray) -> FloatArray:
     for distance in ROAD_DISTANCES_M:
         facts[f"road_left_{distance}m"] = float(route[distance // 4 - 1, 1]) / ROAD_SCALE_M
     return np.array([facts[name] for name in FACTS], np.float32)
+
+
+def hazard_ahead(scene: Scene) -> bool:
+    """Whether somebody walks, stands or has closed the lane ahead, or the lead is a length away.
+
+    Needs the scene's route and tracks.
+    """
+    assert scene.route is not None
+    assert scene.tracks is not None
+    facts: dict[str, float] = dict(zip(FACTS, facts_of(scene.tracks, scene.route).tolist(), strict=True))
+
+    def nearer(what: str, metres: float) -> bool:
+        # What is not there is NaN, and not nearer than anything.
+        return facts[what] < math.log1p(metres)
+
+    return (
+        nearer("walker_0_along_log_m", _WALKER_AHEAD_M)
+        or nearer("own_obstacle_gap_log_m", _STANDING_AHEAD_M)
+        or nearer("own_0_gap_log_m", _CLOSE_M)
+        or (facts["own_0_standing"] == 1 and nearer("own_0_gap_log_m", _STANDING_AHEAD_M))
+    )
 
 
 def mirrored(facts: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

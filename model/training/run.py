@@ -44,6 +44,7 @@ from looktwice.model.training.attempts import PlacedAttempts, place_attempts
 from looktwice.model.training.batches import collate
 from looktwice.model.training.dense import DENSE_SHAPE
 from looktwice.model.training.examples import Examples, load_examples
+from looktwice.model.training.fact_reading import FactDataset, FactLearner, collate_facts, reading_errors
 from looktwice.model.training.grounding import (
     GroundingDataset,
     GroundingLearner,
@@ -68,7 +69,7 @@ from looktwice.model.training.reflections import PlacedReflections, place_reflec
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.sampler import TaskSampler
 from looktwice.model.training.trainer import LearnerTrainer, Validate
-from looktwice.model.training.vision_cache import open_vision
+from looktwice.model.training.vision_cache import VisionCache, open_vision
 
 
 @dataclass(frozen=True)
@@ -224,11 +225,11 @@ def run(
     learner, dataset, sampler, collator = _prepare(
         recipe, loaded, scenes, examples, taught, on_examples, tried, settings
     )
-    if isinstance(learner, IntentLearner) and validation:
+    if isinstance(learner, IntentLearner | FactLearner) and validation:
         held_out = Examples.from_scenes(validation, loaded.settings.cameras)
-        held_out_read = None
+        held_out_seen = None
         if recipe.pictures:
-            seen = open_vision(
+            held_out_seen = open_vision(
                 loaded,
                 held_out,
                 settings.cache,
@@ -236,8 +237,7 @@ def run(
                 bf16=settings.bf16,
                 workers=settings.workers,
             )
-            held_out_read = read_facts(loaded.model, held_out, seen)
-        validate = partial(read_errors, learner, held_out, held_out_read)
+        validate = _reading(learner, loaded, held_out, held_out_seen)
     trainer = LearnerTrainer(
         learner,
         recipe,
@@ -270,6 +270,17 @@ def run(
     # gloo's threads drop what they gathered a moment later, and need the interpreter for it: a process that
     # ends before that is aborted. So nobody ends before the checkpoint is written.
     trainer.accelerator.wait_for_everyone()
+
+
+def _reading(
+    learner: IntentLearner | FactLearner, loaded: Loaded, held_out: Examples, seen: VisionCache | None
+) -> Validate:
+    """How well held-out scenes are read, or planned from what is read in them."""
+    if isinstance(learner, FactLearner):
+        assert seen is not None, "facts are read from pictures"
+        return partial(reading_errors, learner, held_out, seen)
+    read = None if seen is None else read_facts(loaded.model, held_out, seen)
+    return partial(read_errors, learner, held_out, read)
 
 
 def _workers(recipe: Recipe, settings: RunSettings) -> int:
@@ -371,6 +382,11 @@ def _prepare(
             bf16=settings.bf16,
             workers=settings.workers,
         )
+    if recipe.goal == "facts":
+        assert vision is not None, "facts are read from pictures"
+        reader = FactLearner(loaded.model)
+        seen_facts = FactDataset(examples, vision, recipe.route_share, recipe.seed)
+        return reader, Subset(seen_facts, looked_at(examples)), None, collate_facts
     if recipe.goal == "read":
         source: Source = "scene" if recipe.pictures else "tracks"
         reading = IntentLearner(loaded.model, loaded.codec, source)

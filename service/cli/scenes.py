@@ -69,6 +69,19 @@ def generate(
         bool,
         typer.Option(help="--small overlooks everybody for up to two seconds now and then."),
     ] = False,
+    teacher: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of a small planner of tracks that says what --small or --service should do, in the "
+            "expert's place: at once, and in every moment."
+        ),
+    ] = None,
+    hazards: Annotated[
+        bool,
+        typer.Option(
+            help="Many hazards wait for --small or --service, and only moments with one ahead are stored."
+        ),
+    ] = False,
     pictures: Annotated[
         bool,
         typer.Option(help="Without, with --no-dense, scenes are made many times as fast."),
@@ -81,6 +94,11 @@ def generate(
         if careless and small is None:
             raise ValueError("--careless is for --small, which plans from tracks")
         driver, pilot = _driver(service, small, tracks=tracks, pictures=pictures)
+        says, taught_by = _driver(None, teacher, tracks=True, pictures=False)
+        if says is not None and not says.startswith("teacher "):
+            raise ValueError(
+                f"--teacher has to plan from tracks, and {teacher} holds a planner that does not"
+            )
         config = GenerateConfig(
             stride_s=stride,
             surround=surround,
@@ -94,9 +112,11 @@ def generate(
             tracks=tracks,
             careless=careless,
             pictures=pictures,
+            teacher=says,
+            hazards=hazards,
         )
         seeds = range(first_seed, first_seed + episodes)
-        report = generate(out, seeds, workers=workers, config=config, pilot=pilot)
+        report = generate(out, seeds, workers=workers, config=config, pilot=pilot, teacher=taught_by)
         typer.echo(str(report))
 
 

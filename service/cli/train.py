@@ -18,8 +18,8 @@ def train(
     recipe: Annotated[
         str,
         typer.Argument(
-            help="create, language, ground, traj-only, meta-act, counterfactual, multi-round, sketched; "
-            "ladder: all of it, then rollouts, labels and training round by round, and the table; "
+            help="create, language, ground, read-facts, traj-only, meta-act, counterfactual, multi-round, "
+            "sketched; ladder: all of it, then rollouts, labels and training round by round, and the table; "
             "blind, teacher: the small planners of the tables, without pictures; "
             "visual-codes: pictures as codes, for models that imagine; "
             "composer: gives these codes what was seen half a second before."

@@ -20,6 +20,7 @@ from looktwice.clients.metadrive.world.actors import STEP_S, Body
 from looktwice.clients.metadrive.world.episode import EpisodeWorld, make_world
 from looktwice.clients.metadrive.world.episode_log import EpisodeLog
 from looktwice.clients.metadrive.world.fork import kind_of
+from looktwice.clients.metadrive.world.hazards import USUAL, HazardMix
 from looktwice.clients.metadrive.world.roads import Array
 from looktwice.clients.metadrive.world.tracking import FreeVehicle, world_trajectory
 from looktwice.model.driving.cameras import FRONT_CAMERAS, CameraSpec
@@ -41,10 +42,12 @@ class DriveConfig:
     Attributes:
         duration_s: at most.
         replan_s: seconds between plans, a multiple of 0.5.
+        hazards: that wait along the route.
     """
 
     duration_s: float = 30.0
     replan_s: float = 0.5
+    hazards: HazardMix = USUAL
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ def drive(
         MapError: no map fits the seed.
         PlannerError: the pilot's service does not answer.
     """
-    world = make_world(seed, config.duration_s)
+    world = make_world(seed, config.duration_s, hazards=config.hazards)
     stage = None
     if look or on_shot is not None or (pilot is not None and pilot.needs_pictures):
         if rig is None:

@@ -69,6 +69,10 @@ class GenerateConfig:
             to brake then.
         pictures: whether scenes have any; without, they are made many times as fast, for planners that read
             tracks.
+        teacher: name and revision of the small planner of tracks that says what to do in the expert's place,
+            at once and in every moment. None for the expert.
+        hazards: many hazards wait along the route of that model, and only moments with one ahead become
+            scenes.
     """
 
     stride_s: float = 0.5
@@ -85,6 +89,8 @@ class GenerateConfig:
     tracks: bool = False
     careless: bool = False
     pictures: bool = True
+    teacher: str | None = None
+    hazards: bool = False
 
     def __post_init__(self) -> None:
         filmed = self.dense or self.surround or self.next_frames
@@ -95,6 +101,8 @@ class GenerateConfig:
             )
         if self.driver is None and self.careless:
             raise GenerationError("only a model that drives can be careless; the expert has lapses")
+        if self.driver is None and (self.hazards or self.teacher is not None):
+            raise GenerationError("the expert needs no teacher, and knows its hazards: a model has to drive")
         if filmed and not self.pictures:
             raise GenerationError(
                 "without pictures there are no dense targets, cameras around or next frames"
@@ -136,6 +144,7 @@ def generate(
     config: GenerateConfig | None = None,
     console: Console | None = None,
     pilot: Callable[[], Pilot] | None = None,
+    teacher: Callable[[], Pilot] | None = None,
 ) -> GenerateReport:
     """Generate the scenes of ``seeds`` into ``out_dir``; blocks that are there already are left alone.
 
@@ -146,6 +155,7 @@ def generate(
         config: what to generate.
         console: of the progress bar.
         pilot: makes the model that drives, where the config names one; called in every worker process.
+        teacher: makes the planner that says what to do, in the same way.
 
     Raises:
         SimulatorMissing: MetaDrive is not installed.
@@ -166,7 +176,7 @@ def generate(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
         task = progress.add_task(out_dir.name, total=len(blocks), completed=report.blocks_resumed)
-        for _ in _run_blocks(out_dir, missing, workers, config, pilot):
+        for _ in _run_blocks(out_dir, missing, workers, config, pilot, teacher):
             report.blocks_written += 1
             progress.advance(task)
             write_manifest(out_dir, config)
@@ -198,6 +208,7 @@ def _run_blocks(
     workers: int,
     config: GenerateConfig,
     pilot: Callable[[], Pilot] | None,
+    teacher: Callable[[], Pilot] | None,
 ) -> Iterator[range]:
     """Run every block in a process of its own, ``workers`` at a time; a dead worker's is tried again."""
     context = multiprocessing.get_context("spawn")
@@ -207,7 +218,7 @@ def _run_blocks(
         while waiting or running:
             while waiting and len(running) < workers:
                 block, attempt = waiting.pop(0)
-                arguments = (out_dir, block, config, pilot)
+                arguments = (out_dir, block, config, pilot, teacher)
                 process = context.Process(target=write_block, args=arguments, daemon=True)
                 process.start()
                 running[process] = (block, attempt)
@@ -231,16 +242,20 @@ def _run_blocks(
 
 
 def write_block(
-    out_dir: Path, seeds: range, config: GenerateConfig, pilot: Callable[[], Pilot] | None = None
+    out_dir: Path,
+    seeds: range,
+    config: GenerateConfig,
+    pilot: Callable[[], Pilot] | None = None,
+    teacher: Callable[[], Pilot] | None = None,
 ) -> None:
     """Generate one block in this process and put its file in place."""
     cameras = FRONT_CAMERAS + (SURROUND_CAMERAS if config.surround else ())
     rig = Rig(tuple(camera.resized(config.width_px) for camera in cameras)) if config.pictures else None
     scenes: list[LabelledScene] = []
     outcomes: list[EpisodeOutcome] = []
-    driver = None if pilot is None else pilot()
+    driver, taught_by = (None if make is None else make() for make in (pilot, teacher))
     for seed in seeds:
-        made, outcome = run_seed(seed, rig, config, driver)
+        made, outcome = run_seed(seed, rig, config, driver, taught_by)
         scenes += made
         outcomes.append(outcome)
     if rig is not None:
@@ -259,12 +274,19 @@ class _EpisodeScenes(NamedTuple):
 
 
 def run_seed(
-    seed: int, rig: Rig | None, config: GenerateConfig, pilot: Pilot | None = None
+    seed: int,
+    rig: Rig | None,
+    config: GenerateConfig,
+    pilot: Pilot | None = None,
+    teacher: Pilot | None = None,
 ) -> tuple[list[LabelledScene], EpisodeOutcome]:
     """One episode's scenes, driven by a pilot or the expert, and how it went."""
     started = time.monotonic()
     try:
-        made = _of_expert(seed, rig, config) if pilot is None else _of_pilot(seed, pilot, rig, config)
+        if pilot is None:
+            made = _of_expert(seed, rig, config)
+        else:
+            made = _of_pilot(seed, pilot, rig, config, teacher)
     except (MapError, shapely.errors.GEOSException) as error:
         return [], EpisodeOutcome(seed, type(error).__name__, "", 0, 0, time.monotonic() - started)
     count, seconds = len(made.scenes), round(time.monotonic() - started, 2)
@@ -284,10 +306,14 @@ def _of_expert(seed: int, rig: Rig | None, config: GenerateConfig) -> _EpisodeSc
     return _EpisodeScenes(scenes, log.outcome, log.road_map.blocks, len(window_steps(log, config.stride_s)))
 
 
-def _of_pilot(seed: int, pilot: Pilot, rig: Rig | None, config: GenerateConfig) -> _EpisodeScenes:
+def _of_pilot(
+    seed: int, pilot: Pilot, rig: Rig | None, config: GenerateConfig, teacher: Pilot | None
+) -> _EpisodeScenes:
     every = max(1, round(config.stride_s / DriveConfig().replan_s))
     driver = Careless(pilot, seed) if config.careless else pilot
-    scenes, drove = own_states(seed, driver, rig, DriveConfig(config.duration_s), every)
+    scenes, drove = own_states(
+        seed, driver, rig, DriveConfig(config.duration_s), every, teacher, hazards=config.hazards
+    )
     return _EpisodeScenes(scenes, drove.ended, "", drove.plans // every)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
@@ -129,6 +130,29 @@ def labelled_scene(
     """
     moment = _Moment(log, step)
     return moment.labelled(clips, Tagger(log).tags(step), lane_map) if moment.is_safe else None
+
+
+def taught_scene(log: EpisodeLog, step: int, clips: tuple[Clip, ...], future: FloatArray) -> LabelledScene:
+    """The moment at ``step`` of an episode that still goes on, with a future [64, 4] that somebody plans.
+
+    What the others will do is not known yet, and the road is left out: such a scene tells who is around now,
+    and teaches what to do about them. Nothing can be scored in it.
+    """
+    name = f"{log.seed:06d}"
+    scene = Scene(f"{name}-{step:04d}", clips, history_at(log, step), route_ahead(log, step))
+    return LabelledScene(scene, name, log.seed, future, tuple(_agents_until(log, step)))
+
+
+def _agents_until(log: EpisodeLog, step: int) -> Iterator[Agent]:
+    ego, past = log.ego[step], slice(step - HISTORY_STEPS + 1, step + 1)
+    for actor in log.actors:
+        track = actor.poses[past]
+        if not math.hypot(*(track[-1, :2] - ego[:2])) < AGENT_REACH_M:
+            continue
+        poses = np.full((HISTORY_STEPS + FUTURE_STEPS, 3), np.nan)
+        poses[:HISTORY_STEPS, :2], poses[:HISTORY_STEPS, 2] = to_ego(track[:, :2], ego), track[:, 2] - ego[2]
+        lights = lights_on(int(actor.lights[step]))
+        yield Agent(actor.actor_id, actor.kind, *actor.size, poses.astype(np.float32), lights)
 
 
 def history_at(log: EpisodeLog, step: int) -> FloatArray:

@@ -17,7 +17,7 @@ from looktwice.clients.metadrive.world.car_following import SpeedLimits, Style
 from looktwice.clients.metadrive.world.drifts import Drifter
 from looktwice.clients.metadrive.world.episode_log import EpisodeLog, Outcome, Recorder
 from looktwice.clients.metadrive.world.expert import Expert, varied
-from looktwice.clients.metadrive.world.hazards import Director
+from looktwice.clients.metadrive.world.hazards import USUAL, Director, HazardMix
 from looktwice.clients.metadrive.world.late_braking import LateBraking
 from looktwice.clients.metadrive.world.maps import make_map
 from looktwice.clients.metadrive.world.roads import Array, RoadMap
@@ -69,7 +69,9 @@ def worlds_of_episode(
         yield world
 
 
-def make_world(seed: int, duration_s: float = 48.0, lapses: LateBraking | None = None) -> EpisodeWorld:
+def make_world(
+    seed: int, duration_s: float = 48.0, lapses: LateBraking | None = None, hazards: HazardMix = USUAL
+) -> EpisodeWorld:
     """An episode before its first step, its expert's ``lapses`` given; raises `MapError`."""
     rng = np.random.default_rng([seed, 2])
     speed = float(
@@ -77,7 +79,7 @@ def make_world(seed: int, duration_s: float = 48.0, lapses: LateBraking | None =
     )
     style = varied(Style(speed / 3.6), rng)
     road_map = make_map(seed, max(320.0, 1.15 * duration_s * style.speed))
-    return EpisodeWorld(seed, road_map, style, rng, round(duration_s / STEP_S), lapses)
+    return EpisodeWorld(seed, road_map, style, rng, round(duration_s / STEP_S), lapses, hazards)
 
 
 class EpisodeWorld:
@@ -90,6 +92,7 @@ class EpisodeWorld:
         rng: decides about everything else.
         steps: of 0.1 s, at most.
         lapses: of the expert.
+        hazards: that wait along the route.
 
     Attributes:
         ego: the vehicle whose episode it is; whoever drives it may put another one in its place.
@@ -106,6 +109,7 @@ class EpisodeWorld:
         rng: np.random.Generator,
         steps: int,
         lapses: LateBraking | None = None,
+        hazards: HazardMix = USUAL,
     ) -> None:
         self._map = road_map
         self._rng = rng
@@ -119,7 +123,7 @@ class EpisodeWorld:
         self.ego = self._new_ego(style)
         self._style = style
         self._expert = Expert(road_map, style, self._limits, True, bool(rng.random() < 0.75), lapses)
-        self._director = Director(road_map, rng, self._next_id, style.speed)
+        self._director = Director(road_map, rng, self._next_id, style.speed, hazards)
         self._bodies: list[Body] = self._director.place(self.ego.progress)
         self._fill_oncoming_s()
         self._drivers: dict[int, Expert] = {}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -12,9 +13,29 @@ from looktwice.clients.metadrive.world.actors import Body, Pedestrian, StillBody
 from looktwice.clients.metadrive.world.car_following import look
 from looktwice.clients.metadrive.world.roads import Rail, RoadMap
 
-PLACED: Final = {"breakdown": 0.22, "closure": 0.26, "queue": 0.16, "pedestrian": 0.36}
-_SPACING_M: Final = (130.0, 290.0)
-_FIRST_M: Final = 90.0
+
+@dataclass(frozen=True)
+class HazardMix:
+    """What waits along a route, and how often.
+
+    Attributes:
+        shares: of each kind; they add up to 1.
+        spacing_m: least and most metres from one to the next.
+        first_m: to the first one, on average.
+    """
+
+    shares: Mapping[str, float]
+    spacing_m: tuple[float, float]
+    first_m: float
+
+
+USUAL: Final = HazardMix(
+    {"breakdown": 0.22, "closure": 0.26, "queue": 0.16, "pedestrian": 0.36}, (130.0, 290.0), 90.0
+)
+MANY: Final = HazardMix(
+    {"breakdown": 0.38, "closure": 0.14, "queue": 0.14, "pedestrian": 0.34}, (55.0, 120.0), 60.0
+)
+"""Above all what models misread: cars that have broken down, and people."""
 _LAST_M: Final = 90.0
 _CUT_IN_INDICATES_S: Final = 1.0
 _FAIR_BRAKE: Final = 2.2
@@ -27,9 +48,14 @@ class Director:
     """Places hazards along the route and sets off what leaders and neighbours do."""
 
     def __init__(
-        self, road_map: RoadMap, rng: np.random.Generator, new_id: Callable[[], int], limit: float
+        self,
+        road_map: RoadMap,
+        rng: np.random.Generator,
+        new_id: Callable[[], int],
+        limit: float,
+        hazards: HazardMix = USUAL,
     ) -> None:
-        self._map = road_map
+        self._map, self._hazards = road_map, hazards
         self._rng = rng
         self._new_id = new_id
         self._speed = limit
@@ -41,8 +67,8 @@ class Director:
     def place(self, start: float) -> list[Body]:
         """Everything that waits along the route from progress ``start``."""
         bodies: list[Body] = []
-        names = list(PLACED)
-        at = start + _FIRST_M * float(self._rng.uniform(0.6, 1.4))
+        names, shares = list(self._hazards.shares), list(self._hazards.shares.values())
+        at = start + self._hazards.first_m * float(self._rng.uniform(0.6, 1.4))
         while at < self._map.length - _LAST_M:
             index = self._map.route_index(at)
             begin = self._map.road_starts[index]
@@ -51,7 +77,7 @@ class Director:
             if road.turn is not None or not room:
                 at += 12.0
                 continue
-            kind = str(self._rng.choice(names, p=list(PLACED.values())))
+            kind = str(self._rng.choice(names, p=shares))
             if kind == "breakdown":
                 bodies += self._breakdown(at)
             elif kind == "closure":
@@ -60,7 +86,7 @@ class Director:
                 bodies += self._queue(at)
             else:
                 bodies += self._pedestrians(at)
-            at += float(self._rng.uniform(*_SPACING_M))
+            at += float(self._rng.uniform(*self._hazards.spacing_m))
         return bodies
 
     def _rails_at(self, progress: float) -> list[int]:

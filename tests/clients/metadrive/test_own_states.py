@@ -17,10 +17,14 @@ from looktwice.clients.metadrive.closed_loop.pilots import Careless, ConstantVel
 from looktwice.clients.metadrive.generation.blocks import GenerateConfig, GenerationError, generate
 from looktwice.clients.metadrive.generation.own_states import own_states
 from looktwice.clients.metadrive.outcomes.replayed_worlds import ReplayError, setting_of
+from looktwice.model.driving.facts import hazard_ahead
+from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.metrics import collides, leaves_road
 from looktwice.model.driving.scene import Scene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.tracks import Track
+from looktwice.model.network.checkpoint import load
+from looktwice.model.network.small_planner import SmallPlanner
 from looktwice.service.cli.commands import app
 from looktwice.service.cli.scenes import served_pilot
 from looktwice.service.operations.settings import Settings
@@ -67,6 +71,58 @@ def test_own_states_are_what_the_pilot_met_and_what_the_expert_would_do() -> Non
         assert labelled.lane_map is not None
     steps = [int(labelled.scene.scene_id.split("-")[1]) for labelled in states]
     assert all((step - TAKE_OVER) % 10 == 5 for step in steps)
+
+
+class Halting(Remembering):
+    """Would stop at once, wherever it is."""
+
+    def plan(self, scene: Scene) -> Planned:
+        super().plan(scene)
+        return Planned(np.zeros((64, 4), np.float32), np.zeros((0, 64, 4), np.float32))
+
+
+def test_a_teacher_says_in_every_state_what_it_would_do() -> None:
+    pilot, teacher = Remembering(), Halting()
+    states, drove = own_states(SEED, pilot, config=CONFIG, every=2, teacher=teacher)
+    assert len(states) == drove.plans // 2 == len(teacher.shown)
+    for labelled in states:
+        shown = pilot.shown[labelled.scene.scene_id]
+        np.testing.assert_array_equal(labelled.scene.history, shown.history)
+        np.testing.assert_array_equal(labelled.scene.route, shown.route)
+        assert not labelled.future.any()
+        kept = [_place(each) for each in labelled.given(route=True, tracks=True).tracks or ()]
+        told = [pytest.approx(_place(each), abs=1e-3) for each in shown.tracks or ()]
+        assert kept
+        assert kept == told[: len(kept)]
+        # Nobody knows yet what the others will do.
+        assert all(np.isnan(agent.future).all() for agent in labelled.agents)
+        assert not expert_plan(labelled).lane
+
+
+def test_among_hazards_only_their_moments_become_scenes() -> None:
+    seed, config = 6, DriveConfig(duration_s=20.0)
+    usual, pilot = Remembering(), Remembering()
+    own_states(seed, usual, config=config, every=1, teacher=Halting())
+    states, drove = own_states(seed, pilot, config=config, every=1, teacher=Halting(), hazards=True)
+    assert 0 < len(states) < drove.plans
+    ahead = {name for name, scene in pilot.shown.items() if hazard_ahead(scene)}
+    assert {labelled.scene.scene_id for labelled in states} == ahead
+    assert len(ahead) > sum(map(hazard_ahead, usual.shown.values()))
+    with pytest.raises(GenerationError, match="a model has to drive"):
+        GenerateConfig(dense=False, hazards=True)
+
+
+def test_a_planner_that_is_not_told_the_tracks_is_no_teacher(
+    untrained_checkpoint: Path, tmp_path: Path
+) -> None:
+    planner = SmallPlanner("blind", load(untrained_checkpoint).codec)
+    planner.save(tmp_path / "blind", {})
+    command = ["scenes", "generate", str(tmp_path / "new"), "--first-seed", "4", "--episodes", "1"]
+    blind = str(tmp_path / "blind")
+    told = CliRunner().invoke(app, [*command, "--no-dense", "--small", blind, "--teacher", blind])
+    assert told.exit_code != 0
+    assert "--teacher has to plan from tracks" in told.output
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_served_model_s_own_drives_become_scenes(tmp_path: Path) -> None:
