@@ -25,7 +25,7 @@ from looktwice.model.driving.scene import CAMERAS, CLIP_FRAMES, LabelledScene
 from looktwice.model.driving.scene_store import read_scenes, scene_files
 from looktwice.model.driving.thoughts import Thoughts, read_thoughts
 from looktwice.model.driving.tracks import tracks_of
-from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.driving.trajectory import POSE_MIRROR, FloatArray
 from looktwice.model.driving.whole_files import written_whole
 from looktwice.model.families.family import LessonPart
 from looktwice.model.network.inputs import InputBuilder
@@ -105,6 +105,14 @@ class Examples:
         """What one of `next_cameras` saw half a second later, encoded."""
         first, last = self.next_spans[index, CAMERAS.index(camera)]
         return self.pictures[first:last].tobytes()
+
+    def motion(self, index: int, *, mirror: bool, route: bool) -> tuple[FloatArray, FloatArray, bool]:
+        """History [16, 4], route [20, 2], and whether it counts: where it is asked for, and known."""
+        known = route and bool(np.isfinite(self.route[index]).all())
+        history, way = self.history[index], np.nan_to_num(self.route[index])
+        if mirror:
+            history, way = history * POSE_MIRROR, way * POSE_MIRROR[:2]
+        return history, way, known
 
     def thought(self, index: int) -> Thoughts | None:
         """The expert's thoughts; None where they are not known."""

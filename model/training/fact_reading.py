@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from looktwice.model.driving.facts import mirrored
-from looktwice.model.driving.trajectory import POSE_MIRROR
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.grounding import fact_loss, fact_weights
@@ -61,14 +60,10 @@ class FactDataset(Dataset[FactSample]):
 
     def look(self, index: int, *, mirror: bool, route: bool) -> FactSample:
         """One example as it is asked for."""
-        examples = self._examples
-        has_route = route and bool(np.isfinite(examples.route[index]).all())
-        history, way = examples.history[index], np.nan_to_num(examples.route[index])
-        facts = examples.facts[index]
-        if mirror:
-            history, way, facts = history * POSE_MIRROR, way * POSE_MIRROR[:2], mirrored(facts)
+        history, way, known = self._examples.motion(index, mirror=mirror, route=route)
+        facts = self._examples.facts[index]
         tokens = self._vision.tokens(index, mirror).astype(np.float32)
-        return FactSample(tokens, history, way, np.array(has_route), facts)
+        return FactSample(tokens, history, way, np.array(known), mirrored(facts) if mirror else facts)
 
 
 def collate_facts(samples: list[FactSample]) -> dict[str, Tensor]:

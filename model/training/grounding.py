@@ -110,7 +110,7 @@ class GroundingDataset(Dataset[GroundingSample]):
     def look(self, look: GroundingItem, light: np.random.Generator | None = None) -> GroundingSample:
         """One example as it is asked for, in a light by chance or, without one, as it was."""
         examples, index = self._examples, look.index
-        has_route = look.route and bool(np.isfinite(examples.route[index]).all())
+        history, way, has_route = examples.motion(index, mirror=look.mirror, route=look.route)
         frames = example_frames(examples, index, look.mirror, self._inputs)
         if light is not None:
             frames = in_other_light(frames, light)
@@ -120,8 +120,8 @@ class GroundingDataset(Dataset[GroundingSample]):
             examples.dense_range_log[index].astype(np.float32),
             examples.dense_motion[index].astype(np.float32),
             examples.facts[index],
-            examples.history[index],
-            np.nan_to_num(examples.route[index]),
+            history,
+            way,
             np.array(has_route),
             examples.future[index],
         )
@@ -138,7 +138,7 @@ def in_other_light(frames: npt.NDArray[np.uint8], random: np.random.Generator) -
 
 
 def _mirror(sample: GroundingSample) -> GroundingSample:
-    """What is known, for pictures that are mirrored already."""
+    """What is known, for pictures and a motion that are mirrored already."""
     motion = sample.motion[..., ::-1].copy()
     motion[:, 1] *= -1
     return sample._replace(
@@ -146,8 +146,6 @@ def _mirror(sample: GroundingSample) -> GroundingSample:
         range_log=np.ascontiguousarray(sample.range_log[..., ::-1]),
         motion=motion,
         facts=mirrored(sample.facts),
-        history=sample.history * POSE_MIRROR,
-        route=sample.route * POSE_MIRROR[:2],
         futures=sample.futures * POSE_MIRROR,
     )
 

@@ -79,14 +79,13 @@ class IntentDataset(Dataset[IntentSample]):
     def look(self, index: int, *, mirror: bool, route: bool) -> IntentSample:
         """One example as it is asked for."""
         examples = self._examples
-        has_route = route and bool(np.isfinite(examples.route[index]).all())
-        history, future = examples.history[index], examples.future[index]
-        way, facts = np.nan_to_num(examples.route[index]), examples.facts[index]
+        history, way, has_route = examples.motion(index, mirror=mirror, route=route)
+        future, facts = examples.future[index], examples.facts[index]
         tracks, bins = examples.tracks[index].copy(), examples.plan_bins[index]
         if not has_route:
             tracks = without_route(tracks)
         if mirror:
-            history, future, way = history * POSE_MIRROR, future * POSE_MIRROR, way * POSE_MIRROR[:2]
+            future = future * POSE_MIRROR
             tracks[:, MIRRORED] *= -1
             bins, facts = self._mirrored_bins[index], mirrored(facts)
         read = self._nothing if self._read is None else self._read[index, int(mirror), int(has_route)]
