@@ -93,23 +93,28 @@ class IntentDataset(Dataset[IntentSample]):
 
 
 @torch.inference_mode()
-def read_facts(vla: LookTwiceVla, examples: Examples, vision: VisionCache, seed: int = 0) -> FloatArray:
+def read_facts(
+    vla: LookTwiceVla, examples: Examples, vision: VisionCache, seed: int = 0, misread_share: float = 1.0
+) -> FloatArray:
     """What is read from pictures of examples, float32 [N, plain and mirrored, without and with route, facts].
 
-    Examples without pictures are `misread` as those with pictures are. Without mirror images in ``vision``
-    only the examples themselves are read, [N, 1, 2, facts].
+    Examples without pictures are `misread` as those with pictures are, or keep what is true, and NaN where a
+    fact does not apply. Without mirror images in ``vision`` only the examples themselves are read:
+    [N, 1, 2, facts].
 
     Args:
         vla: whose resampler reads.
         examples: to read.
         vision: what its tower sees in them.
         seed: of the errors in examples without pictures.
+        misread_share: of them that are misread.
     """
     assert vla.resampler is not None
     sides = 1 + vision.mirrored
     read = np.empty((len(examples), sides, 2, len(FACTS)), np.float32)
     pictured, random = examples.pictured, np.random.default_rng(seed)
     with_pictures, device = np.flatnonzero(pictured), vla.device
+    misreading = ~pictured & (random.random(len(examples)) < misread_share)
     for side in range(sides):
         truth = mirrored(examples.facts) if side else examples.facts
         flip = POSE_MIRROR if side else np.ones(4, np.float32)
@@ -122,9 +127,10 @@ def read_facts(vla: LookTwiceVla, examples: Examples, vision: VisionCache, seed:
                 inputs = (seen.astype(np.float32), history[places], route[places], known)
                 gathered = vla.resampler.gather(*(torch.from_numpy(each).to(device) for each in inputs))
                 read[places, side, has_route] = likely(vla.resampler.facts(gathered)).cpu().numpy()
-        if not pictured.all():
+        read[~pictured, side] = truth[~pictured, None]
+        if misreading.any():
             there = read[with_pictures, side]
-            read[~pictured, side] = misread(truth[~pictured], truth[with_pictures], there, random, device)
+            read[misreading, side] = misread(truth[misreading], truth[with_pictures], there, random, device)
     return read
 
 

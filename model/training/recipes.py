@@ -93,6 +93,8 @@ class Recipe:
         steps, batch_size: how long; of ``outcome``, scenes are counted, each with all its draws.
         learning_rate, warmup_steps: cosine decay to zero behind a linear warm-up.
         vision_rate: the tower's learning rate, relative to the rest; 0 leaves the tower as it is.
+        misread_share: share of the examples without pictures that are misread as pictures would be; the facts
+            of all others are taken as they are, so that what is read later is trusted.
         tracks_share, mirror_share, blur_share: shares of the examples with tracks, mirrored, and with no
             history but the present speed; see `Item`.
         picture_share: share of the examples with pictures half a second ahead that are taught one of them.
@@ -121,6 +123,7 @@ class Recipe:
     route_share: float = 0.5
     weights: SectionWeights = field(default_factory=lambda: PAPER_WEIGHTS)
     vision_rate: float = 1.0
+    misread_share: float = 1.0
     tracks_share: float = 0.0
     mirror_share: float = 0.0
     blur_share: float = 0.0

@@ -390,7 +390,11 @@ def _prepare(
     if recipe.goal == "read":
         source: Source = "scene" if recipe.pictures else "tracks"
         reading = IntentLearner(loaded.model, loaded.codec, source)
-        read = None if vision is None else read_facts(loaded.model, examples, vision, recipe.seed)
+        read = (
+            None
+            if vision is None
+            else read_facts(loaded.model, examples, vision, recipe.seed, recipe.misread_share)
+        )
         return reading, IntentDataset(examples, read, recipe.route_share, recipe.seed), None, collate_intents
     has_planners = loaded.model.resampler is not None and loaded.model.track_reader is not None
     own_plans = None

@@ -61,6 +61,15 @@ def train(
     vision_rate: Annotated[
         float | None, typer.Option(help="The vision tower's, relative; 0 leaves it as it is.", min=0)
     ] = None,
+    misread_share: Annotated[
+        float | None,
+        typer.Option(
+            help="read-scene: share of the scenes without pictures that are misread as pictures would be, "
+            "instead of all; 0: what is read is trusted.",
+            min=0,
+            max=1,
+        ),
+    ] = None,
     refine_below: Annotated[
         float | None,
         typer.Option(
@@ -154,6 +163,7 @@ def train(
             batch_size=batch_size or chosen.batch_size,
             learning_rate=learning_rate or chosen.learning_rate,
             vision_rate=chosen.vision_rate if vision_rate is None else vision_rate,
+            misread_share=chosen.misread_share if misread_share is None else misread_share,
             seed=seed,
         )
         if recipe == VISUAL_CODES.name and source is not None:

@@ -72,6 +72,31 @@ def test_scenes_without_pictures_are_misread_like_those_with(loaded: Loaded, tmp
     np.testing.assert_array_equal(read, again)
 
 
+def test_readings_may_be_trusted(loaded: Loaded, tmp_path: Path) -> None:
+    blind = []
+    for labelled in SCENES:
+        clips = tuple(replace(clip, images=(NO_PICTURE,) * 4) for clip in labelled.scene.clips)
+        blind.append(replace(labelled, scene=replace(labelled.scene, clips=clips)))
+    examples = Examples.from_scenes([*SCENES, *blind], (FRONT_WIDE, FRONT_TELE))
+    vision = open_vision(loaded, examples, tmp_path, mirrored=True)
+    misread, half, true = (
+        read_facts(loaded.model, examples, vision, misread_share=share) for share in (1.0, 0.5, 0.0)
+    )
+    np.testing.assert_array_equal(true[: len(SCENES)], misread[: len(SCENES)])
+    for place in range(len(SCENES), len(examples)):
+        for route in range(2):
+            np.testing.assert_array_equal(true[place, 0, route], examples.facts[place])
+            np.testing.assert_array_equal(true[place, 1, route], mirrored(examples.facts[place]))
+    kept = [np.array_equal(one, other, equal_nan=True) for one, other in zip(half, true, strict=True)]
+    assert 0 < sum(kept[len(SCENES) :]) < len(blind)
+    # A fact that does not apply says nothing; it must not reach the network as NaN.
+    learner = IntentLearner(loaded.model, loaded.codec, "scene").eval()
+    data = IntentDataset(examples, true, route_share=1.0)
+    batch = collate_intents([data.look(place, mirror=False, route=True) for place in range(len(data))])
+    with torch.inference_mode():
+        assert torch.isfinite(learner(**batch)["loss"])
+
+
 def test_tracks_tell_nothing_of_a_route_that_is_not_given(data: IntentDataset) -> None:
     given, kept_back = (data.look(1, mirror=False, route=route) for route in (True, False))
     assert given.has_route
