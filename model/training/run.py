@@ -170,7 +170,8 @@ def run(
     Raises:
         FeedbackFileError: ``failures`` is missing, damaged, or of another version.
         ValueError: the recipe wants reflections and there are none, or the other way round, or they are on
-            other scenes, or on plans made with tracks where ``source`` takes none; it takes no failures, and
+            other scenes, or on plans made with tracks where ``source`` takes none; it learns from pictures or
+            judges draws, and no scene can be learned from so; it takes no failures, and
             there are some, or they are on other scenes; it teaches pictures, and there are no codes for those
             that scenes bring; it teaches sketches, and ``source`` has none; only one of ``source`` and
             ``vision_source`` writes sketches.
@@ -384,6 +385,8 @@ def _prepare(
         )
     if recipe.goal == "facts":
         assert vision is not None, "facts are read from pictures"
+        if not examples.pictured.any():
+            raise ValueError(f"recipe {recipe.name} learns from pictures, and no scene has any")
         reader = FactLearner(loaded.model)
         seen_facts = FactDataset(examples, vision, recipe.route_share, recipe.seed)
         return reader, Subset(seen_facts, looked_at(examples)), None, collate_facts
@@ -445,7 +448,12 @@ def _prepare(
             route_share=recipe.route_share,
             tracks_share=recipe.tracks_share if loaded.settings.with_tracks else 0.0,
         )
-        places = np.flatnonzero(examples.pictured & taught).tolist()
+        # Where nobody knows the road, a draw that leaves it would count as one that holds.
+        places = np.flatnonzero(examples.pictured & taught & examples.tell("perceived")).tolist()
+        if not places:
+            raise ValueError(
+                f"recipe {recipe.name} judges draws: no scene with pictures tells the road around"
+            )
         return judging, ScenePlaces(places), None, collate_places
     has_route = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
     sampler = TaskSampler(

@@ -116,6 +116,16 @@ def test_a_run_draws_as_the_learner_reckons_and_is_logged(
     assert last["step"] == 2
 
 
+def test_draws_are_not_judged_where_nobody_knows_the_road(
+    resampling_checkpoint: Path, tmp_path: Path
+) -> None:
+    roadless = replace(training_scene(0), drivable=(), lane_map=None)
+    write_scenes(tmp_path / "a.parquet", [roadless])
+    settings = RunSettings(tmp_path / "cache", bf16=False)
+    with pytest.raises(ValueError, match="no scene with pictures tells the road around"):
+        run(NANO["cf-rl"], tmp_path / "a.parquet", resampling_checkpoint, tmp_path / "no", settings)
+
+
 def test_a_run_in_bfloat16_draws_in_single_precision(resampling_checkpoint: Path, tmp_path: Path) -> None:
     scenes = tmp_path / "scenes"
     write_scenes(scenes / "a.parquet", [training_scene(index) for index in range(3)])
