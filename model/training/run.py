@@ -451,9 +451,7 @@ def _prepare(
         # Where nobody knows the road, a draw that leaves it would count as one that holds.
         places = np.flatnonzero(examples.pictured & taught & examples.tell("perceived")).tolist()
         if not places:
-            raise ValueError(
-                f"recipe {recipe.name} judges draws: no scene with pictures tells the road around"
-            )
+            raise ValueError(f"recipe {recipe.name} judges draws, and no scene with pictures tells the road")
         return judging, ScenePlaces(places), None, collate_places
     has_route = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
     sampler = TaskSampler(

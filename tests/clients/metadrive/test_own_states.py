@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 
 from looktwice.clients.metadrive.closed_loop.drives import TAKE_OVER, DriveConfig
 from looktwice.clients.metadrive.closed_loop.pilots import Careless, ConstantVelocity, Planned
-from looktwice.clients.metadrive.generation.blocks import GenerateConfig, GenerationError, generate
+from looktwice.clients.metadrive.drawing.rig import Rig
+from looktwice.clients.metadrive.generation.blocks import GenerateConfig, GenerationError, generate, run_seed
 from looktwice.clients.metadrive.generation.own_states import own_states
 from looktwice.clients.metadrive.outcomes.replayed_worlds import ReplayError, setting_of
 from looktwice.model.driving.facts import hazard_ahead
@@ -146,25 +147,19 @@ def test_a_served_model_s_own_drives_become_scenes(tmp_path: Path) -> None:
         setting_of(tmp_path)
 
 
-def test_a_pilot_without_eyes_has_pictures_where_they_are_wanted(tmp_path: Path) -> None:
-    config = GenerateConfig(
-        stride_s=2.0, duration_s=8.0, block=1, dense=False, width_px=112, driver="constant velocity"
-    )
-    for pictures in (True, False):
-        folder = tmp_path / str(pictures)
-        asked = replace(config, pictures=pictures)
-        assert generate(folder, range(4, 5), workers=1, config=asked, pilot=ConstantVelocity).scenes > 0
-        assert {labelled.scene.has_pictures for labelled in read_scenes(folder)} == {pictures}
-
-
-def test_the_expert_s_scenes_are_the_same_without_pictures(tmp_path: Path) -> None:
-    config = GenerateConfig(
-        stride_s=1.0, duration_s=16.0, block=1, dense=False, width_px=112, drifts=True, lapses=True
-    )
+def test_a_pilot_without_eyes_has_pictures_where_they_are_wanted(rig: Rig) -> None:
+    config = GenerateConfig(stride_s=2.0, duration_s=8.0, dense=False, driver="constant velocity")
     for pictures in (True, False):
         asked = replace(config, pictures=pictures)
-        generate(tmp_path / str(pictures), range(7, 8), workers=1, config=asked)
-    seen, blind = (list(read_scenes(tmp_path / str(pictures))) for pictures in (True, False))
+        scenes, outcome = run_seed(4, rig if pictures else None, asked, ConstantVelocity())
+        assert outcome.scenes == len(scenes) > 0
+        assert {labelled.scene.has_pictures for labelled in scenes} == {pictures}
+
+
+def test_the_expert_s_scenes_are_the_same_without_pictures(rig: Rig) -> None:
+    config = GenerateConfig(stride_s=1.0, duration_s=16.0, dense=False, drifts=True, lapses=True)
+    seen, _ = run_seed(7, rig, config)
+    blind, _ = run_seed(7, None, replace(config, pictures=False))
     assert len(seen) == len(blind) > 0
     for one, other in zip(seen, blind, strict=True):
         assert one.scene.has_pictures

@@ -79,8 +79,8 @@ def test_the_stage_moves_what_reads_and_nothing_else(resampling_checkpoint: Path
     moved = {name for name, value in after.items() if name in before and not value.equal(before[name])}
     assert {name.split(".")[1] for name in moved} >= {"layers", "facts", "queries"}
     assert all(name.startswith("resampler.") and ".intent." not in name for name in moved)
+    write_scenes(tmp_path / "blind" / "a.parquet", [blind])
     with pytest.raises(ValueError, match="read-facts learns from pictures, and no scene has any"):
-        write_scenes(tmp_path / "blind" / "a.parquet", [blind])
         run(recipe, tmp_path / "blind", resampling_checkpoint, tmp_path / "no", settings)
     assert not (tmp_path / "no").exists()
     rows = [json.loads(line) for line in (tmp_path / "done" / "log.jsonl").read_text().splitlines()]

@@ -122,7 +122,7 @@ def test_draws_are_not_judged_where_nobody_knows_the_road(
     roadless = replace(training_scene(0), drivable=(), lane_map=None)
     write_scenes(tmp_path / "a.parquet", [roadless])
     settings = RunSettings(tmp_path / "cache", bf16=False)
-    with pytest.raises(ValueError, match="no scene with pictures tells the road around"):
+    with pytest.raises(ValueError, match="no scene with pictures tells the road"):
         run(NANO["cf-rl"], tmp_path / "a.parquet", resampling_checkpoint, tmp_path / "no", settings)
 
 
