@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from looktwice.model.training.response_targets import Target
 
 Batch = dict[str, Tensor]
+Sample = Any
+"""A named tuple of arrays: one example."""
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
+_EVALUATED: Final = 64
 WIDTH_STEP: Final = 16
 """Batches are padded to multiples of this: few shapes, so kernels made for a shape are made few times and
 kept in little memory (on CPUs every new shape costs megabytes)."""
@@ -79,3 +83,24 @@ def collate(samples: list[ResponseSample]) -> Batch:
     if samples[0].patches is not None:
         batch["patches"] = torch.from_numpy(np.concatenate([sample.patches for sample in samples]))
     return batch
+
+
+def stacked(samples: Sequence[Sample]) -> Batch:
+    """Samples of one kind as a batch, by the names of their fields."""
+    columns = dict(zip(samples[0]._fields, zip(*samples, strict=True), strict=True))
+    return {name: torch.from_numpy(np.stack(values)) for name, values in columns.items()}
+
+
+def mean_outputs(
+    learner: nn.Module, samples: Callable[[int], Sample], places: Sequence[int]
+) -> dict[str, float]:
+    """What a learner's outputs are on average over the samples of places; it is evaluated meanwhile."""
+    was_training, sums = learner.training, dict[str, float]()
+    learner.eval()
+    with torch.inference_mode():
+        for start in range(0, len(places), _EVALUATED):
+            some = places[start : start + _EVALUATED]
+            for name, value in learner(**stacked([samples(place) for place in some])).items():
+                sums[name] = sums.get(name, 0.0) + len(some) * float(value)
+    learner.train(was_training)
+    return {name: total / len(places) for name, total in sums.items()}

@@ -41,7 +41,7 @@ from looktwice.model.network.visual_codes import (
     psnr,
 )
 from looktwice.model.training.recipes import Recipe
-from looktwice.model.training.run import inherit_log
+from looktwice.model.training.trainer import inherit_log
 from looktwice.model.training.visual_codes import SHEET_FILE, held_out, learn, painting_losses, spread
 from looktwice.model.training.written_pictures import written_pictures
 

@@ -9,21 +9,20 @@ The small planner of pictures has to learn behind it anew (recipe ``read-scene``
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from looktwice.model.driving.facts import mirrored
 from looktwice.model.network.vla import LookTwiceVla
+from looktwice.model.training.batches import mean_outputs
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.grounding import fact_loss, fact_weights
 from looktwice.model.training.vision_cache import VisionCache
-
-_BATCH: Final = 64
 
 
 class FactSample(NamedTuple):
@@ -66,12 +65,6 @@ class FactDataset(Dataset[FactSample]):
         return FactSample(tokens, history, way, np.array(known), mirrored(facts) if mirror else facts)
 
 
-def collate_facts(samples: list[FactSample]) -> dict[str, Tensor]:
-    """Stack samples."""
-    columns = dict(zip(FactSample._fields, zip(*samples, strict=True), strict=True))
-    return {name: torch.from_numpy(np.stack(values)) for name, values in columns.items()}
-
-
 class FactLearner(nn.Module):
     """The resampler without its small planner; outputs the loss of what it reads.
 
@@ -96,7 +89,7 @@ class FactLearner(nn.Module):
     def forward(
         self, tokens: Tensor, history: Tensor, route: Tensor, has_route: Tensor, facts: Tensor
     ) -> dict[str, Tensor]:
-        """The loss of a batch from `collate_facts`."""
+        """The loss of a batch of `FactSample`."""
         read = self.reader.facts(self.reader.gather(tokens, history, route, has_route))
         return {"loss": fact_loss(read, facts, self.fact_weights)}
 
@@ -107,16 +100,8 @@ def reading_errors(learner: FactLearner, examples: Examples, vision: VisionCache
     The learner is put into evaluation mode meanwhile.
     """
     data, places = FactDataset(examples, vision, route_share=1.0), np.flatnonzero(examples.pictured).tolist()
-    was_training = learner.training
-    learner.eval()
     figures: dict[str, float] = {}
-    with torch.inference_mode():
-        for suffix, route in (("", False), ("+route", True)):
-            total = 0.0
-            for start in range(0, len(places), _BATCH):
-                some = places[start : start + _BATCH]
-                batch = collate_facts([data.look(place, mirror=False, route=route) for place in some])
-                total += len(some) * float(learner(**batch)["loss"])
-            figures[f"fact_loss/read{suffix}"] = total / max(1, len(places))
-    learner.train(was_training)
+    for suffix, route in (("", False), ("+route", True)):
+        means = mean_outputs(learner, partial(data.look, mirror=False, route=route), places)
+        figures |= {f"fact_{name}/read{suffix}": mean for name, mean in means.items()}
     return figures

@@ -8,6 +8,7 @@ the trajectory is kept as the sketch; all other heads are thrown away. Tower and
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from looktwice.model.network.intent import IntentTrunk, present_speeds
 from looktwice.model.network.track_features import MIRRORED, without_route
 from looktwice.model.network.trajectory_head import TrajectoryHead
 from looktwice.model.network.vla import LookTwiceVla
+from looktwice.model.training.batches import mean_outputs
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.grounding import fact_loss, fact_weights
 from looktwice.model.training.misread import misread
@@ -134,31 +136,16 @@ def read_facts(
     return read
 
 
-def collate_intents(samples: list[IntentSample]) -> dict[str, Tensor]:
-    """Stack samples."""
-    columns = dict(zip(IntentSample._fields, zip(*samples, strict=True), strict=True))
-    return {name: torch.from_numpy(np.stack(values)) for name, values in columns.items()}
-
-
 def read_errors(learner: IntentLearner, examples: Examples, read: FloatArray | None) -> Mapping[str, float]:
     """How well a source is read in held-out scenes: ``plan_ade_m`` and losses, with and without the route.
 
     The learner is put into evaluation mode meanwhile. Scenes without a route count in both.
     """
     data = IntentDataset(examples, read, route_share=1.0)
-    was_training = learner.training
-    learner.eval()
     figures: dict[str, float] = {}
-    with torch.inference_mode():
-        for suffix, route in (("", False), ("+route", True)):
-            sums: dict[str, float] = {}
-            for start in range(0, len(data), _BATCH):
-                places = range(start, min(start + _BATCH, len(data)))
-                batch = collate_intents([data.look(place, mirror=False, route=route) for place in places])
-                for name, value in learner(**batch).items():
-                    sums[name] = sums.get(name, 0.0) + len(places) * float(value)
-            figures |= {f"{name}/read{suffix}": total / len(data) for name, total in sums.items()}
-    learner.train(was_training)
+    for suffix, route in (("", False), ("+route", True)):
+        means = mean_outputs(learner, partial(data.look, mirror=False, route=route), range(len(data)))
+        figures |= {f"{name}/read{suffix}": mean for name, mean in means.items()}
     return figures
 
 
@@ -202,7 +189,7 @@ class IntentLearner(nn.Module):
         facts: Tensor,
         read: Tensor,
     ) -> dict[str, Tensor]:
-        """The loss of a batch from `collate_intents`, and its parts without gradients."""
+        """The loss of a batch of `IntentSample`, and its parts without gradients."""
         for layer in self.part.trunk.layers:
             if isinstance(layer, nn.Dropout):
                 layer.p = _DROPOUT if self.training else 0.0

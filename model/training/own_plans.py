@@ -20,8 +20,9 @@ from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.network.intent import IntentTrunk
 from looktwice.model.network.trajectory_head import spread_of
 from looktwice.model.network.vla import LookTwiceVla
+from looktwice.model.training.batches import stacked
 from looktwice.model.training.examples import Examples
-from looktwice.model.training.intents import IntentDataset, collate_intents, read_facts
+from looktwice.model.training.intents import IntentDataset, read_facts
 from looktwice.model.training.vision_cache import VisionCache
 
 _BATCH: Final = 256
@@ -119,7 +120,7 @@ def _states(
     states, bins, device = [], [], next(part.parameters()).device
     for start in range(0, len(data), _BATCH):
         places = range(start, min(start + _BATCH, len(data)))
-        batch = collate_intents([data.look(place, mirror=mirror, route=route) for place in places])
+        batch = stacked([data.look(place, mirror=mirror, route=route) for place in places])
         given = (batch[name].to(device) for name in (around, "history", "route", "has_route"))
         states.append(part.state(*given).float())
         bins.append(batch["plan_bins"].to(device))

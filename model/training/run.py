@@ -41,10 +41,10 @@ from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.network.vla_settings import EXPANDED_SETTINGS, NANO_SETTINGS
 from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from looktwice.model.training.attempts import PlacedAttempts, place_attempts
-from looktwice.model.training.batches import collate
+from looktwice.model.training.batches import collate, stacked
 from looktwice.model.training.dense import DENSE_SHAPE
 from looktwice.model.training.examples import Examples, load_examples
-from looktwice.model.training.fact_reading import FactDataset, FactLearner, collate_facts, reading_errors
+from looktwice.model.training.fact_reading import FactDataset, FactLearner, reading_errors
 from looktwice.model.training.grounding import (
     GroundingDataset,
     GroundingLearner,
@@ -55,7 +55,6 @@ from looktwice.model.training.intents import (
     IntentDataset,
     IntentLearner,
     Source,
-    collate_intents,
     read_errors,
     read_facts,
 )
@@ -68,7 +67,7 @@ from looktwice.model.training.recipes import Recipe
 from looktwice.model.training.reflections import PlacedReflections, place_reflections
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.sampler import TaskSampler
-from looktwice.model.training.trainer import LearnerTrainer, Validate
+from looktwice.model.training.trainer import LearnerTrainer, Validate, inherit_log
 from looktwice.model.training.vision_cache import VisionCache, open_vision
 
 
@@ -389,7 +388,7 @@ def _prepare(
             raise ValueError(f"recipe {recipe.name} learns from pictures, and no scene has any")
         reader = FactLearner(loaded.model)
         seen_facts = FactDataset(examples, vision, recipe.route_share, recipe.seed)
-        return reader, Subset(seen_facts, looked_at(examples)), None, collate_facts
+        return reader, Subset(seen_facts, looked_at(examples)), None, stacked
     if recipe.goal == "read":
         source: Source = "scene" if recipe.pictures else "tracks"
         reading = IntentLearner(loaded.model, loaded.codec, source)
@@ -398,7 +397,7 @@ def _prepare(
             if vision is None
             else read_facts(loaded.model, examples, vision, recipe.seed, recipe.misread_share)
         )
-        return reading, IntentDataset(examples, read, recipe.route_share, recipe.seed), None, collate_intents
+        return reading, IntentDataset(examples, read, recipe.route_share, recipe.seed), None, stacked
     has_planners = loaded.model.resampler is not None and loaded.model.track_reader is not None
     own_plans = None
     if recipe.own_plans and has_planners:
@@ -479,17 +478,6 @@ def _prepare(
         attempting=recipe.attempting,
     )
     return learner, responses, sampler, collate
-
-
-def inherit_log(log: Path, sources: Sequence[Path]) -> None:
-    """Begin a log that is not there yet with the rows of its sources, each row once."""
-    if log.exists():
-        return
-    rows: dict[str, None] = {}
-    for source in sources:
-        if (source / LOG_FILE).exists():
-            rows |= dict.fromkeys((source / LOG_FILE).read_text().splitlines(keepends=True))
-    log.write_text("".join(rows))
 
 
 def _about(

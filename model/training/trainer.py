@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -185,3 +185,14 @@ class _Log(TrainerCallback):
     def _write(self, row: Mapping[str, Any]) -> None:
         with self._path.open("a") as file:
             file.write(json.dumps({"stage": self._stage, **row}) + "\n")
+
+
+def inherit_log(log: Path, sources: Sequence[Path]) -> None:
+    """Begin a log that is not there yet with the rows of its sources, each row once."""
+    if log.exists():
+        return
+    rows: dict[str, None] = {}
+    for source in sources:
+        if (source / LOG_FILE).exists():
+            rows |= dict.fromkeys((source / LOG_FILE).read_text().splitlines(keepends=True))
+    log.write_text("".join(rows))

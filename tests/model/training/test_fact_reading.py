@@ -14,8 +14,9 @@ from looktwice.model.driving.facts import mirrored
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.network.checkpoint import load
+from looktwice.model.training.batches import stacked
 from looktwice.model.training.examples import Examples
-from looktwice.model.training.fact_reading import FactDataset, FactLearner, collate_facts, reading_errors
+from looktwice.model.training.fact_reading import FactDataset, FactLearner, reading_errors
 from looktwice.model.training.recipes import NANO
 from looktwice.model.training.run import RunSettings, run
 from looktwice.model.training.vision_cache import VisionCache, open_vision
@@ -54,7 +55,7 @@ def test_scenes_are_read_better_after_a_few_steps(
     torch.manual_seed(0)
     learner = FactLearner(load(resampling_checkpoint).model).train()
     data = FactDataset(examples, vision, route_share=1.0)
-    batch = collate_facts([data.look(place, mirror=False, route=True) for place in range(len(data))])
+    batch = stacked([data.look(place, mirror=False, route=True) for place in range(len(data))])
     before = reading_errors(learner, examples, vision)
     assert learner.training
     optimizer = torch.optim.AdamW([each for each in learner.parameters() if each.requires_grad], 1e-3)

@@ -15,12 +15,12 @@ from looktwice.model.network.intent import INTENT_TOKENS
 from looktwice.model.network.small_planner import WEIGHTS_FILE, SmallPlannerError, load_small, small_revision
 from looktwice.model.network.track_features import TRACK_FEATURES
 from looktwice.model.network.vla import LookTwiceVla, with_settings
+from looktwice.model.training.batches import stacked
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.intents import (
     IntentDataset,
     IntentLearner,
     Source,
-    collate_intents,
     read_errors,
     read_facts,
 )
@@ -92,7 +92,7 @@ def test_readings_may_be_trusted(loaded: Loaded, tmp_path: Path) -> None:
     # A fact that does not apply says nothing; it must not reach the network as NaN.
     learner = IntentLearner(loaded.model, loaded.codec, "scene").eval()
     data = IntentDataset(examples, true, route_share=1.0)
-    batch = collate_intents([data.look(place, mirror=False, route=True) for place in range(len(data))])
+    batch = stacked([data.look(place, mirror=False, route=True) for place in range(len(data))])
     with torch.inference_mode():
         assert torch.isfinite(learner(**batch)["loss"])
 
@@ -114,7 +114,7 @@ def test_a_few_steps_learn_to_plan_from_a_source_and_leave_the_rest_alone(
     torch.manual_seed(0)
     learner = IntentLearner(loaded.model, loaded.codec, source).train()
     optimizer = torch.optim.AdamW(learner.parameters(), 3e-3)
-    batch = collate_intents([data.look(index, mirror=False, route=True) for index in range(len(data))])
+    batch = stacked([data.look(index, mirror=False, route=True) for index in range(len(data))])
     losses = []
     for _ in range(40):
         outputs = learner(**batch)
@@ -140,7 +140,7 @@ def test_held_out_scenes_are_read_with_and_without_their_route(
     one_by_one = []
     learner.eval()
     for index in range(len(data)):
-        batch = collate_intents([data.look(index, mirror=False, route=True)])
+        batch = stacked([data.look(index, mirror=False, route=True)])
         with torch.inference_mode():
             one_by_one.append(float(learner(**batch)["plan_ade_m"]))
     assert figures["plan_ade_m/read+route"] == pytest.approx(np.mean(one_by_one), rel=1e-4)
@@ -180,7 +180,7 @@ def test_a_reader_of_tracks_with_sketches_is_a_small_planner(
     planner = load_small(resampling_checkpoint)
     assert planner.kind == "teacher"
     sample = data.look(1, mirror=False, route=True)
-    batch = collate_intents([sample])
+    batch = stacked([sample])
     with torch.inference_mode():
         trajectory = planner.plan([SCENES[1].given(route=True, tracks=True)])
         off_m = np.linalg.norm(trajectory[0, :, :2] - sample.futures[:, :2], axis=1).mean()
