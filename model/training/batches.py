@@ -91,7 +91,7 @@ def stacked(samples: Sequence[Sample]) -> Batch:
     return {name: torch.from_numpy(np.stack(values)) for name, values in columns.items()}
 
 
-def mean_outputs(
+def mean_values(
     learner: nn.Module, samples: Callable[[int], Sample], places: Sequence[int]
 ) -> dict[str, float]:
     """What a learner's outputs are on average over the samples of places; it is evaluated meanwhile."""

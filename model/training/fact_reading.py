@@ -19,7 +19,7 @@ from torch.utils.data import Dataset
 
 from looktwice.model.driving.facts import mirrored
 from looktwice.model.network.vla import LookTwiceVla
-from looktwice.model.training.batches import mean_outputs
+from looktwice.model.training.batches import mean_values
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.grounding import fact_loss, fact_weights
 from looktwice.model.training.vision_cache import VisionCache
@@ -102,6 +102,6 @@ def reading_errors(learner: FactLearner, examples: Examples, vision: VisionCache
     data, places = FactDataset(examples, vision, route_share=1.0), np.flatnonzero(examples.pictured).tolist()
     figures: dict[str, float] = {}
     for suffix, route in (("", False), ("+route", True)):
-        means = mean_outputs(learner, partial(data.look, mirror=False, route=route), places)
+        means = mean_values(learner, partial(data.look, mirror=False, route=route), places)
         figures |= {f"fact_{name}/read{suffix}": mean for name, mean in means.items()}
     return figures

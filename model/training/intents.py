@@ -27,7 +27,7 @@ from looktwice.model.network.intent import IntentTrunk, present_speeds
 from looktwice.model.network.track_features import MIRRORED, without_route
 from looktwice.model.network.trajectory_head import TrajectoryHead
 from looktwice.model.network.vla import LookTwiceVla
-from looktwice.model.training.batches import mean_outputs
+from looktwice.model.training.batches import mean_values
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.grounding import fact_loss, fact_weights
 from looktwice.model.training.misread import misread
@@ -144,7 +144,7 @@ def read_errors(learner: IntentLearner, examples: Examples, read: FloatArray | N
     data = IntentDataset(examples, read, route_share=1.0)
     figures: dict[str, float] = {}
     for suffix, route in (("", False), ("+route", True)):
-        means = mean_outputs(learner, partial(data.look, mirror=False, route=route), range(len(data)))
+        means = mean_values(learner, partial(data.look, mirror=False, route=route), range(len(data)))
         figures |= {f"{name}/read{suffix}": mean for name, mean in means.items()}
     return figures
 

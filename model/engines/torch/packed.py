@@ -41,15 +41,16 @@ class Rotation(NamedTuple):
 
 
 _ONE_SUM: Final = 256
-"""So many numbers oneDNN adds up in one order, whatever stands beside them; longer sums by how many rows
-there are (sums of 768, on AMX)."""
+"""So many numbers in bfloat16 oneDNN adds up in one order, whatever stands beside them; longer sums by how
+many rows there are (sums of 768, on AMX)."""
 
 
 class _Product:
     """``x @ weight.T + bias``, the weight laid out once as products read it, and not in every call.
 
     In bfloat16 on most CPUs that is as their matrix units do (oneDNN's own layout, as `torch.compile` does
-    when it freezes weights); else turned over, which takes half of the time where tokens are few.
+    when it freezes weights); else turned over, which takes half of the time where tokens are few. But MKL's
+    sums in float32 depend on how many rows there are (without AVX-512), and oneDNN's do not.
 
     Args:
         weight: [n, m].
@@ -60,14 +61,13 @@ class _Product:
     def __init__(self, weight: Tensor, bias: Tensor | None = None, *, repeatable: bool = False) -> None:
         self.width = weight.shape[1]
         self._bias = bias
-        self._by_onednn = (
-            weight.device.type == "cpu" and weight.dtype == torch.bfloat16 and has_bfloat16_layout()
-        )
+        has_layout = has_bfloat16_layout() if weight.dtype == torch.bfloat16 else repeatable
+        self._by_onednn = weight.device.type == "cpu" and has_layout
         self._sums = [self.width]
         if not self._by_onednn:
             self._weights = [weight.t().contiguous()]
             return
-        if repeatable and self.width > _ONE_SUM:
+        if repeatable and weight.dtype == torch.bfloat16 and self.width > _ONE_SUM:
             self._sums = [min(_ONE_SUM, self.width - at) for at in range(0, self.width, _ONE_SUM)]
         parts = [part.contiguous() for part in torch.split(weight, self._sums, dim=1)]
         self._weights = [torch.ops.mkldnn._reorder_linear_weight(part) for part in parts]
