@@ -61,8 +61,8 @@ class _Product:
     def __init__(self, weight: Tensor, bias: Tensor | None = None, *, repeatable: bool = False) -> None:
         self.width = weight.shape[1]
         self._bias = bias
-        has_layout = has_bfloat16_layout() if weight.dtype == torch.bfloat16 else repeatable
-        self._by_onednn = weight.device.type == "cpu" and has_layout
+        pays = {torch.bfloat16: has_bfloat16_layout(), torch.float32: repeatable}
+        self._by_onednn = weight.device.type == "cpu" and pays.get(weight.dtype, False)
         self._sums = [self.width]
         if not self._by_onednn:
             self._weights = [weight.t().contiguous()]
