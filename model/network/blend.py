@@ -13,15 +13,16 @@ from torch import Tensor
 
 from looktwice.model.network.card import CheckpointError
 from looktwice.model.network.checkpoint import Loaded
-from looktwice.model.network.vla import is_planner, is_vision
+from looktwice.model.network.vla import is_planner, is_tower, is_vision
 
 
 def blend(before: Loaded, after: Loaded, share: float) -> Loaded:
     """``after`` with the weights of its decoder moved back towards those of ``before``.
 
-    What sees (the vision tower, what gathers its tokens and reads facts from them) stays as it is in
-    ``after``: between two readings of pictures lies none. So do the small planners: they learn from enough
-    scenes not to know them by heart, and what lies between two of them plans worse than the second.
+    So is what reads facts from the vision tower's tokens, where both have the same tower; where they have
+    not, there is no reading between theirs, and all that sees stays as it is in ``after``. The small planners
+    stay in any case: they learn from enough scenes not to know them by heart, and what lies between two of
+    them plans worse than the second.
 
     Args:
         before, after: checkpoints of one architecture, the second trained from the first.
@@ -38,10 +39,12 @@ def blend(before: Loaded, after: Loaded, share: float) -> Loaded:
         name: value.shape for name, value in new.items()
     }:
         raise CheckpointError(f"{before.card.name} and {after.card.name} differ in more than their weights")
+    other_tower = any(not torch.equal(old[name], new[name]) for name in new if is_tower(name))
+    stays = {name for name in new if is_planner(name) or (other_tower and is_vision(name))}
     with torch.no_grad():
         after.model.load_state_dict(
             {
-                name: value if is_vision(name) or is_planner(name) else _between(old[name], value, share)
+                name: value if name in stays else _between(old[name], value, share)
                 for name, value in new.items()
             }
         )

@@ -335,8 +335,12 @@ def is_vision(name: str) -> bool:
     Args:
         name: within the network, or within a module that holds it.
     """
-    name = f".{name}"
-    return ".visual." in name or (".resampler." in name and ".intent." not in name)
+    return is_tower(name) or (".resampler." in f".{name}" and ".intent." not in name)
+
+
+def is_tower(name: str) -> bool:
+    """Whether a weight belongs to the vision tower; ``name`` as in `is_vision`."""
+    return ".visual." in f".{name}"
 
 
 def is_planner(name: str) -> bool:

@@ -16,7 +16,7 @@ def blend(
     to: Annotated[Path, typer.Option(help="Folder for the checkpoint between them.")],
     share: Annotated[float, typer.Option(min=0, max=1, help="Of the second checkpoint.")] = 0.5,
 ) -> None:
-    """Mix the decoders of two checkpoints; what sees and the small planners are those of the second."""
+    """Mix the decoders of two checkpoints, and what reads one tower; the small planners are the second's."""
     with reported_errors():
         import shutil
 

@@ -47,6 +47,16 @@ def test_the_decoder_goes_back_and_what_sees_and_the_planners_stay(before: Loade
     }
 
 
+def test_what_reads_one_tower_goes_back_too(before: Loaded, after: Loaded) -> None:
+    after.model.model.visual.load_state_dict(before.model.model.visual.state_dict())
+    old = {name: value.clone() for name, value in before.model.named_parameters()}
+    blended = blend(before, after, 0.25)
+    for name, value in blended.model.named_parameters():
+        if name.startswith(("resampler.", "track_reader.")):
+            moved = 1.0 if name.startswith(("resampler.intent.", "track_reader.")) else 0.25
+            torch.testing.assert_close(value, old[name] + moved, atol=1e-5, rtol=0)
+
+
 def test_of_checkpoints_that_differ_in_more_than_weights_there_is_no_blend(
     before: Loaded, untrained_checkpoint: Path
 ) -> None:
