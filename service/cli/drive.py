@@ -41,6 +41,10 @@ def drive(
             "reader of tracks writes sketches, that drives too."
         ),
     ] = None,
+    by_pictures: Annotated[
+        bool,
+        typer.Option(help="--small is a checkpoint, and drives by what it reads in pictures, not by tracks."),
+    ] = False,
     keep: Annotated[
         Path | None, typer.Option(help="File that keeps every drive: started again, it goes on behind them.")
     ] = None,
@@ -113,7 +117,10 @@ def drive(
         return hash_of(driver, seed, seconds, asked, route, tracks, models, width_px, *formats)
 
     with reported_errors():
-        small_pilots = {pilot.name: pilot for pilot in map(SmallPilot, small or ())}
+        small_pilots = {
+            pilot.name: pilot
+            for pilot in (SmallPilot(folder, by_pictures=by_pictures) for folder in small or ())
+        }
     wanted = [*(drivers or ([] if small else DRIVERS[:-1])), *small_pilots]
     asks = any(driver in SERVICE_DRIVERS for driver in wanted)
     if unknown := set(drivers or ()) - set(DRIVERS):

@@ -64,6 +64,10 @@ def generate(
         Path | None,
         typer.Option(help="Folder of a small planner (`train teacher`) that drives; else as --service."),
     ] = None,
+    by_pictures: Annotated[
+        bool,
+        typer.Option(help="--small is a checkpoint, and drives by what it reads in pictures, not by tracks."),
+    ] = False,
     tracks: Annotated[bool, typer.Option(help="Tell that model the tracks of the objects around.")] = False,
     careless: Annotated[
         bool,
@@ -91,10 +95,12 @@ def generate(
     with reported_errors():
         from looktwice.clients.metadrive.generation import GenerateConfig, generate
 
-        if careless and small is None:
-            raise ValueError("--careless is for --small, which plans from tracks")
-        driver, pilot = _driver(service, small, tracks=tracks, pictures=pictures)
-        says, taught_by = _driver(None, teacher, tracks=True, pictures=False)
+        if careless and (small is None or by_pictures):
+            raise ValueError("--careless is for --small, where it plans from tracks")
+        if by_pictures and (small is None or not pictures):
+            raise ValueError("--by-pictures is for --small, and needs pictures")
+        driver, pilot = _driver(service, small, by_pictures=by_pictures, tracks=tracks, pictures=pictures)
+        says, taught_by = _driver(None, teacher, by_pictures=False, tracks=True, pictures=False)
         if says is not None and not says.startswith("teacher "):
             raise ValueError(
                 f"--teacher has to plan from tracks, and {teacher} holds a planner that does not"
@@ -121,7 +127,7 @@ def generate(
 
 
 def _driver(
-    service: str | None, small: Path | None, *, tracks: bool, pictures: bool
+    service: str | None, small: Path | None, *, by_pictures: bool, tracks: bool, pictures: bool
 ) -> tuple[str | None, Callable[[], Pilot] | None]:
     """Who drives in the expert's place, with revision, and what makes it in a worker; None for nobody."""
     from looktwice.clients.planner import Access, PlannerClient
@@ -130,7 +136,8 @@ def _driver(
     if service is not None and small is not None:
         raise ValueError("either --service or --small drives, not both")
     if small is not None:
-        return SmallPilot(small).described, partial(SmallPilot, small)
+        makes = partial(SmallPilot, small, by_pictures=by_pictures)
+        return makes().described, makes
     if service is None:
         return None, None
     if not pictures:

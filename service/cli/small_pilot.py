@@ -1,4 +1,4 @@
-"""A small planner in the closed loop."""
+"""Small planners in the closed loop."""
 
 from __future__ import annotations
 
@@ -9,21 +9,26 @@ import numpy as np
 
 from looktwice.clients.metadrive.closed_loop import Planned
 from looktwice.model.driving.scene import Scene
-from looktwice.model.network.small_planner import load_small, small_revision
+from looktwice.model.network.reading_planner import ReadingPlanner
+from looktwice.model.network.small_planner import SmallPlanner, load_small, small_revision
 
 
 class SmallPilot:
-    """Drives by a small planner's best guess; it looks at no picture.
+    """Drives by a small planner's best guess.
 
     Args:
-        folder: of the planner, or of a checkpoint whose reader of tracks writes sketches.
+        folder: of the planner, or of a checkpoint whose small planners sketch.
+        by_pictures: the checkpoint's planner of pictures drives; else the one of tracks, without pictures.
     """
 
-    needs_pictures = False
-
-    def __init__(self, folder: Path) -> None:
-        self._planner = load_small(folder)
-        self.name = self._planner.kind
+    def __init__(self, folder: Path, *, by_pictures: bool = False) -> None:
+        self._planner: SmallPlanner | ReadingPlanner
+        self.needs_pictures = by_pictures
+        if by_pictures:
+            self._planner, self.name = ReadingPlanner(folder), "pictures"
+        else:
+            self._planner = load_small(folder)
+            self.name = self._planner.kind
         self.revision = small_revision(folder)
 
     @property
