@@ -76,6 +76,10 @@ _SIGNED: Final[npt.NDArray[np.bool_]] = np.array(
 )
 
 
+NEEDS_OWN_SPEED: Final[npt.NDArray[np.bool_]] = np.array(
+    [name.endswith(("_speed", "standing", "braking")) for name in FACTS]
+)
+"""Which facts pictures tell only to who knows how fast the car itself is: the others do not depend on it."""
 TELLS_OF_OBJECT: Final[npt.NDArray[np.bool_]] = np.array(
     [not name.endswith("present") and not name.startswith("road_") for name in FACTS]
 )

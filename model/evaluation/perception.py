@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from looktwice.model.driving.columns import Columns, aligned, cells, titles
 from looktwice.model.driving.facts import (
@@ -23,7 +22,7 @@ from looktwice.model.driving.facts import (
 )
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.network.checkpoint import Loaded
-from looktwice.model.network.fact_reader import likely
+from looktwice.model.network.reading_planner import read_pictures
 
 _BATCH: Final = 16
 _NEAR_M: Final = 60.0
@@ -83,7 +82,7 @@ def read_facts(
 
 def _reading(loaded: Loaded, batch: list[LabelledScene]) -> FactReadings:
     return FactReadings(
-        read=_read(loaded, batch),
+        read=read_pictures(loaded, [labelled.scene for labelled in batch]).numpy(),
         true=np.stack([scene_facts(labelled) for labelled in batch]),
         history=np.stack([labelled.scene.history for labelled in batch]),
         route=np.stack([np.asarray(labelled.scene.route) for labelled in batch]),
@@ -95,25 +94,6 @@ def _reading(loaded: Loaded, batch: list[LabelledScene]) -> FactReadings:
 def _batches(scenes: Iterator[LabelledScene]) -> Iterator[list[LabelledScene]]:
     while batch := list(islice(scenes, _BATCH)):
         yield batch
-
-
-@torch.inference_mode()
-def _read(loaded: Loaded, batch: list[LabelledScene]) -> Array:
-    model, builder = loaded.model, loaded.inputs
-    assert model.resampler is not None
-    patches = np.concatenate(
-        [builder.patches(pictures) for each in batch for pictures in builder.slices(each.scene)]
-    )
-    clips = len(batch) * len(loaded.settings.cameras)
-    tokens = model.vision(torch.from_numpy(patches), torch.tensor([loaded.settings.grid] * clips))
-    gathered = model.resampler.gather(
-        tokens.view(len(batch), loaded.settings.vision_tokens, -1),
-        torch.from_numpy(np.stack([each.scene.history for each in batch])),
-        torch.from_numpy(np.stack([np.asarray(each.scene.route) for each in batch])),
-        torch.ones(len(batch), dtype=torch.bool),
-    )
-    values: Array = likely(model.resampler.facts(gathered)).numpy()
-    return values
 
 
 def perception_rows(reading: FactReadings) -> list[dict[str, Any]]:

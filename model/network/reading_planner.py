@@ -16,10 +16,10 @@ from torch import Tensor
 
 from looktwice.model.driving.scene import Scene, SceneError
 from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray
-from looktwice.model.network.checkpoint import load
+from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.network.fact_reader import likely
 from looktwice.model.network.intent import IntentTrunk, present_speeds
-from looktwice.model.network.precision import fast_dtype
+from looktwice.model.network.precision import bfloat16_is_fast
 from looktwice.model.network.small_planner import SmallPlannerError
 from looktwice.model.network.trajectory_head import TrajectoryHead
 
@@ -29,6 +29,9 @@ class ReadingPlanner:
 
     Args:
         folder: of the checkpoint.
+
+    Attributes:
+        width_px: of the pictures that it takes.
 
     Raises:
         SmallPlannerError: the checkpoint reads nothing in pictures, or sketches nothing from it.
@@ -43,9 +46,8 @@ class ReadingPlanner:
                 f"{folder}: this checkpoint reads no facts in pictures or sketches nothing from them; "
                 "`looktwice train read-scene` makes one that does"
             )
-        self._vla, self._inputs, self._settings = loaded.model, loaded.inputs, loaded.settings
-        self._vla.train(False)
-        self._resampler = resampler
+        self._loaded, self._intent = loaded, resampler.intent
+        self.width_px = loaded.settings.image_width
         self._head = TrajectoryHead(IntentTrunk.width, loaded.codec, best=resampler.intent.sketch)
 
     @torch.inference_mode()
@@ -55,28 +57,40 @@ class ReadingPlanner:
         Raises:
             SceneError: a scene has no route, or pictures that the checkpoint does not take.
         """
-        history = torch.from_numpy(np.stack([scene.history for scene in scenes]))
-        route = torch.from_numpy(np.stack([self._route(scene) for scene in scenes]))
-        has_route = torch.ones(len(scenes), dtype=torch.bool)
-        gathered = self._resampler.gather(self._seen(scenes), history, route, has_route)
-        facts = likely(self._resampler.facts(gathered))
-        state = self._resampler.intent.state(facts, history, route, has_route).float()
+        facts = read_pictures(self._loaded, scenes)
+        history, route, has_route = _motion(scenes)
+        state = self._intent.state(facts, history, route, has_route).float()
         curves = self._head.curves(self._head(state).best, present_speeds(history))
         trajectories = np.zeros((len(scenes), FUTURE_STEPS, 4), np.float32)
         trajectories[..., [0, 1, 3]] = curves.numpy()
         return trajectories
 
-    def _seen(self, scenes: Sequence[Scene]) -> Tensor:
-        """Vision tokens float32 [n, v, hidden]."""
-        slices = [pictures for scene in scenes for pictures in self._inputs.slices(scene)]
-        patches = torch.from_numpy(np.concatenate([self._inputs.patches(each) for each in slices]))
-        grids = torch.tensor([self._settings.grid] * (len(scenes) * len(self._settings.cameras)))
-        with torch.autocast("cpu", torch.bfloat16, enabled=fast_dtype() == torch.bfloat16):
-            tokens: Tensor = self._vla.vision(patches, grids)
-        return tokens.float().view(len(scenes), self._settings.vision_tokens, -1)
 
-    def _route(self, scene: Scene) -> FloatArray:
-        route = self._inputs.route_of(scene)
-        if route is None:
+@torch.inference_mode()
+def read_pictures(loaded: Loaded, scenes: Sequence[Scene]) -> Tensor:
+    """The facts that are read in pictures of scenes with a route, [n, len(FACTS)]; see `likely`.
+
+    Raises:
+        SceneError: a scene has no route, or pictures that the checkpoint does not take.
+    """
+    model, builder, settings = loaded.model, loaded.inputs, loaded.settings
+    assert model.resampler is not None, "this checkpoint reads nothing in pictures"
+    slices = [pictures for scene in scenes for pictures in builder.slices(scene)]
+    patches = torch.from_numpy(np.concatenate([builder.patches(pictures) for pictures in slices]))
+    grids = torch.tensor([settings.grid] * (len(scenes) * len(settings.cameras)))
+    with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16_is_fast()):
+        tokens = model.vision(patches, grids).float()
+    gathered = model.resampler.gather(tokens.view(len(scenes), settings.vision_tokens, -1), *_motion(scenes))
+    return likely(model.resampler.facts(gathered))
+
+
+def _motion(scenes: Sequence[Scene]) -> tuple[Tensor, Tensor, Tensor]:
+    """History, route, and that it is known."""
+    for scene in scenes:
+        if scene.route is None:
             raise SceneError(f"scene {scene.scene_id} has no route, which small planners need")
-        return route
+    return (
+        torch.from_numpy(np.stack([scene.history for scene in scenes])),
+        torch.from_numpy(np.stack([np.asarray(scene.route) for scene in scenes])),
+        torch.ones(len(scenes), dtype=torch.bool),
+    )

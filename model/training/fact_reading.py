@@ -3,26 +3,33 @@
 Who learned from an expert's pictures alone has not seen a broken-down car close ahead, or a gap of a metre:
 experts never come so near. A planner does that misreads them. What its pictures show stands in the tower's
 tokens all the same, so the resampler learns to read it from there, over tokens that are worked out once.
-The small planner of pictures has to learn behind it anew (recipe ``read-scene``).
+
+Who knows the car's own past reads it, too. Experts are slow on an open road where somebody crosses it, so
+whoever is slow reads a walker there, stays slow, and reads it again (causal confusion,
+https://arxiv.org/abs/1905.11979). So one half of the scenes come with the past of another one. There only
+what does not depend on the own speed is taught.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from looktwice.model.driving.facts import mirrored
+from looktwice.model.driving.facts import NEEDS_OWN_SPEED, mirrored
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.training.batches import mean_values
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.grounding import fact_loss, fact_weights
 from looktwice.model.training.vision_cache import VisionCache
+
+OTHER_PAST_SHARE: Final = 0.5
+"""Of scenes with the past of another one."""
 
 
 class FactSample(NamedTuple):
@@ -36,7 +43,7 @@ class FactSample(NamedTuple):
 
 
 class FactDataset(Dataset[FactSample]):
-    """All examples, each time mirrored or not and with or without its route, by chance.
+    """All examples, each time mirrored or not, with or without its route, with its past or not, by chance.
 
     Args:
         examples: to learn from; those without pictures must not be asked for.
@@ -53,9 +60,15 @@ class FactDataset(Dataset[FactSample]):
         return len(self._examples)
 
     def __getitem__(self, index: int) -> FactSample:
-        chance = self.random.random(2)
+        chance = self.random.random(3)
         mirror = self._vision.mirrored and bool(chance[0] < 0.5)
-        return self.look(index, mirror=mirror, route=bool(chance[1] < self._route_share))
+        sample = self.look(index, mirror=mirror, route=bool(chance[1] < self._route_share))
+        if chance[2] >= OTHER_PAST_SHARE:
+            return sample
+        past = self._examples.history[self.random.integers(len(self))]
+        return sample._replace(
+            history=past, facts=np.where(NEEDS_OWN_SPEED, np.float32(np.nan), sample.facts)
+        )
 
     def look(self, index: int, *, mirror: bool, route: bool) -> FactSample:
         """One example as it is asked for."""

@@ -135,7 +135,10 @@ def drive(
             split_of_seed(seed)
         cards = planner.models() if asks else []
         models = [card.revision for card in cards]
-        width_px = max((card.image_size[0] for card in cards), default=FRONT_CAMERAS[0].width)
+        widths_px = [card.image_size[0] for card in cards] + [
+            pilot.width_px for pilot in small_pilots.values()
+        ]
+        width_px = max(widths_px, default=0) or FRONT_CAMERAS[0].width
         rig = Rig.of_width(width_px)
         imagines = wanted[-1] in SERVICE_DRIVERS and any(card.imagines and card.paints for card in cards)
         film, config = Film(imagines=imagines), DriveConfig(seconds)

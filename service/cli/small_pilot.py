@@ -19,6 +19,9 @@ class SmallPilot:
     Args:
         folder: of the planner, or of a checkpoint whose small planners sketch.
         by_pictures: the checkpoint's planner of pictures drives; else the one of tracks, without pictures.
+
+    Attributes:
+        width_px: of the pictures that it takes; 0 for none.
     """
 
     def __init__(self, folder: Path, *, by_pictures: bool = False) -> None:
@@ -26,8 +29,9 @@ class SmallPilot:
         self.needs_pictures = by_pictures
         if by_pictures:
             self._planner, self.name = ReadingPlanner(folder), "pictures"
+            self.width_px = self._planner.width_px
         else:
-            self._planner = load_small(folder)
+            self._planner, self.width_px = load_small(folder), 0
             self.name = self._planner.kind
         self.revision = small_revision(folder)
 

@@ -18,6 +18,7 @@ from looktwice.clients.metadrive.drawing.rig import Rig
 from looktwice.clients.metadrive.generation.blocks import GenerateConfig, GenerationError, generate, run_seed
 from looktwice.clients.metadrive.generation.own_states import own_states
 from looktwice.clients.metadrive.outcomes.replayed_worlds import ReplayError, setting_of
+from looktwice.model.bundled import CHECKPOINT
 from looktwice.model.driving.facts import hazard_ahead
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.metrics import collides, leaves_road
@@ -198,6 +199,26 @@ def test_carelessness_is_refused_where_nobody_plans_from_tracks(tmp_path: Path) 
     assert told.exit_code != 0
     assert "--careless is for --small" in told.output
     assert not (tmp_path / "new").exists()
+
+
+def test_a_small_planner_of_pictures_meets_states_of_its_own(tmp_path: Path) -> None:
+    command = ["scenes", "generate", str(tmp_path / "new"), "--first-seed", "4", "--episodes", "1"]
+    command += ["--workers", "1", "--no-dense", "--stride", "4", "--width", "336"]
+    drives = ["--small", str(CHECKPOINT), "--by-pictures"]
+    told = CliRunner().invoke(app, [*command, *drives, "--teacher", str(CHECKPOINT)])
+    assert told.exit_code == 0, told.output
+    scenes = list(read_scenes(tmp_path / "new"))
+    assert scenes
+    assert all(labelled.scene.has_pictures for labelled in scenes)
+    for refused, message in (
+        (["--by-pictures"], "--by-pictures is for --small"),
+        ([*drives, "--no-pictures"], "--by-pictures is for --small, and needs pictures"),
+        ([*drives, "--careless"], "--careless is for --small, where it plans from tracks"),
+    ):
+        told = CliRunner().invoke(app, [*command, *refused])
+        assert told.exit_code != 0
+        assert message in told.output
+    assert "pictures " in (tmp_path / "new" / "manifest.json").read_text()
 
 
 def test_what_only_the_expert_s_drives_have_is_refused() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from looktwice.model.driving.facts import mirrored
+from looktwice.model.driving.facts import FACTS, mirrored
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.network.checkpoint import load
@@ -47,6 +47,24 @@ def test_a_mirrored_look_swaps_everything_it_knows(examples: Examples, vision: V
     assert not np.array_equal(swapped.tokens, plain.tokens)
     assert plain.has_route
     assert not data.look(1, mirror=False, route=False).has_route
+
+
+def test_half_of_the_scenes_have_another_past_and_do_not_ask_for_speeds(
+    examples: Examples, vision: VisionCache
+) -> None:
+    examples = replace(examples, facts=examples.facts.copy())
+    data = FactDataset(examples, vision, route_share=1.0)
+    own = [data.look(1, mirror=mirror, route=True).history for mirror in (False, True)]
+    speed, walker = FACTS.index("own_0_speed"), FACTS.index("walker_0_present")
+    examples.facts[1, [speed, walker]] = 0.5, 1.0
+    others = 0
+    for sample in (data[1] for _ in range(200)):
+        another = not any(np.array_equal(sample.history, each) for each in own)
+        others += another
+        assert sample.facts[walker] == 1.0
+        assert not another or np.isnan(sample.facts[speed])
+    # A scene may be given its own past as another one's.
+    assert 40 < others < 120
 
 
 def test_scenes_are_read_better_after_a_few_steps(
