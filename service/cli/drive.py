@@ -52,6 +52,8 @@ def drive(
     as_json: Json = False,
 ) -> None:
     """Drive closed loop, planning anew every half second; expert and constant velocity are the limits."""
+    if by_pictures and not small:
+        raise typer.BadParameter("it is for --small", param_hint="--by-pictures")
     if gif is not None and gif.suffix.lower() != ".gif":
         raise typer.BadParameter(f"{gif} does not end in .gif", param_hint="--gif")
     from rich.console import Console
