@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
@@ -96,13 +96,13 @@ class SmallPlanner(nn.Module):
         return guesses
 
     @torch.inference_mode()
-    def plan(self, scenes: Sequence[Scene]) -> FloatArray:
-        """The best guess for each scene, float32 [n, 64, 4].
+    def plan(self, scenes: Sequence[Scene], facts: Tensor | None = None) -> FloatArray:
+        """The best guess for each scene, float32 [n, 64, 4]; ``facts`` as in `SmallInputs`.
 
         Raises:
             SceneError: a scene has no route, or none of the tracks that the teacher needs.
         """
-        inputs = small_inputs(scenes, self.kind)
+        inputs = replace(small_inputs(scenes, self.kind), facts=facts)
         curves = self.head.curves(self(inputs).best, inputs.speeds_ms)
         trajectories = np.zeros((len(scenes), FUTURE_STEPS, 4), np.float32)
         trajectories[..., [0, 1, 3]] = curves.numpy()
@@ -119,16 +119,25 @@ class SmallPlanner(nn.Module):
 
 def small_inputs(scenes: Sequence[Scene], kind: SmallKind) -> SmallInputs:
     """What a small planner sees of scenes; raises `SceneError` for what a scene lacks."""
+    history, route = motion_of(scenes)
+    for scene in scenes:
+        if kind == "teacher" and scene.tracks is None:
+            raise SceneError(f"scene {scene.scene_id} has no tracks, which the teacher needs")
+    return SmallInputs(
+        history,
+        route,
+        torch.from_numpy(np.stack([track_features(scene.tracks or (), scene.route) for scene in scenes])),
+    )
+
+
+def motion_of(scenes: Sequence[Scene]) -> tuple[Tensor, Tensor]:
+    """History [n, 16, 4] and route [n, 20, 2] of scenes; raises `SceneError` for one without a route."""
     for scene in scenes:
         if scene.route is None:
             raise SceneError(f"scene {scene.scene_id} has no route, which small planners need")
-        if kind == "teacher" and scene.tracks is None:
-            raise SceneError(f"scene {scene.scene_id} has no tracks, which the teacher needs")
-    routes = np.stack([np.asarray(scene.route) for scene in scenes])
-    return SmallInputs(
+    return (
         torch.from_numpy(np.stack([scene.history for scene in scenes])),
-        torch.from_numpy(routes),
-        torch.from_numpy(np.stack([track_features(scene.tracks or (), scene.route) for scene in scenes])),
+        torch.from_numpy(np.stack([np.asarray(scene.route) for scene in scenes])),
     )
 
 
