@@ -69,8 +69,9 @@ class ResponseDataset(Dataset[ResponseSample]):
             not, the expert's own responses teach nothing of the branch.
         attempts: to be asked for by items, which are refined in the format ``attempting``.
         own_plans: behind which trajectories are learned too, where nothing is reflected.
-        sketched: plans and trajectories are those of the sketch in the prompt. Behind the expert's plan, of
-            which then nothing is taught, the trajectory is the expert's.
+        sketched: plans and trajectories are those of the sketch in the prompt, and so are trajectories behind
+            plans of the model's own that hold. Behind the expert's plan, of which then nothing is taught, and
+            behind second looks, the trajectory is the expert's.
         visual_codes: of the checkpoint, where items are to teach pictures.
         seed: of the codes that are drawn.
 
@@ -160,8 +161,11 @@ class ResponseDataset(Dataset[ResponseSample]):
             found = [mirrored(each) for each in found]
         reflections: list[Counterfactual | None] = [*found] or [None]
         plans, vectors = [plan] * len(reflections), [expert] * len(reflections)
+        sketch = self._sketch(item)
+        if sketch is not None:
+            # What held was copied from the sketch; behind a second look there is nothing to copy.
+            vectors = [sketch if each and not each.thinking else expert for each in reflections]
         if not found and self._own_plans is not None:
-            sketch = self._sketch(item)
             if item.task == self.reflecting:
                 # Nobody knows whether it deserves a second look: behind it the trajectory alone is taught.
                 behind, led_to = plan, expert

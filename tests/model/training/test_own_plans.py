@@ -10,8 +10,9 @@ import pytest
 from looktwice.model.driving.labeller import label_plan
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
-from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.driving.trajectory import POSE_MIRROR, FloatArray
 from looktwice.model.families.cf_vla.targets import NANO_WEIGHTS, PAPER_WEIGHTS
+from looktwice.model.families.family import Counterfactual
 from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.network.vla_settings import NANO_SETTINGS
 from looktwice.model.training.examples import Examples
@@ -22,6 +23,10 @@ from looktwice.model.training.sampler import Item
 from looktwice.model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
 
+LOOK = (
+    "A slower vehicle is in my lane some 20 metres ahead. "
+    "Going on like this would bring me too close, so I should brake and stop."
+)
 EXAMPLES = Examples.from_scenes((training_scene(index) for index in range(8)), (FRONT_WIDE, FRONT_TELE))
 
 
@@ -153,3 +158,28 @@ def test_behind_an_own_plan_nothing_but_the_trajectory_is_taught(loaded: Loaded,
     assert taught(own).startswith("\n<|traj_future_start|>")
     [at_once] = behind[Item(1, "traj_only", True, tracks=True)].responses
     assert len(at_once.ids) < len(own.ids)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_a_plan_that_holds_leads_to_its_sketch_and_a_second_look_to_the_expert(
+    loaded: Loaded, own_plans: OwnPlans, mirror: bool
+) -> None:
+    keeps, waits = (parse_plan(f"- longitudinal\n  - 0.0s-6.4s: {word}\n") for word in ("Keep Speed", "Wait"))
+    data = ResponseDataset(
+        EXAMPLES,
+        loaded.codec,
+        loaded.inputs,
+        loaded.vocabulary,
+        NANO_WEIGHTS,
+        pictures=True,
+        own_plans=own_plans,
+        sketched=True,
+        reflections=[Counterfactual(keeps, ""), Counterfactual(keeps, LOOK, waits)],
+    )
+    sample = data[Item(1, "cf_vla", True, (0, 1), tracks=True, mirror=mirror)]
+    sketch = own_plans.sketch(1, mirror=mirror, route=True, tracks=True)
+    seen = POSE_MIRROR if mirror else np.ones_like(POSE_MIRROR)
+    [expert] = loaded.codec.vectors(EXAMPLES.history[1:2] * seen, EXAMPLES.future[1:2] * seen)
+    for errors_m, wanted in zip(sample.code_errors_m[:, 0], (sketch, expert), strict=True):
+        apart_m = np.linalg.norm(loaded.codec.books[0] - wanted, axis=1) / 8  # of 64 poses
+        np.testing.assert_allclose(errors_m, apart_m, atol=1e-3)
