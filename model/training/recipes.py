@@ -298,6 +298,15 @@ NANO: Final[Mapping[str, Recipe]] = (
 ELF-VLA, those of VLA-World, and outcome training."""
 
 
+def lasting(recipe: Recipe, steps: int) -> Recipe:
+    """A recipe of so many steps; a shorter one warms up for less of them, in proportion."""
+    return replace(
+        recipe,
+        steps=steps,
+        warmup_steps=min(recipe.warmup_steps, recipe.warmup_steps * steps // recipe.steps),
+    )
+
+
 def refining_with(recipe: Recipe, **changes: Any) -> Recipe:
     """A recipe with other `RefineSettings`, such as a ``threshold`` of 0, below which nothing is refined.
 

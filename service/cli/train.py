@@ -55,7 +55,9 @@ def train(
     validation_scenes: Annotated[int, typer.Option(help="How many of them.", min=1)] = 96,
     cache: Annotated[Path, typer.Option(help="Folder for scenes brought into arrays.")] = Path("data/cache"),
     paper: Annotated[bool, typer.Option(help="The paper's recipe, for a pretrained backbone.")] = False,
-    steps: Annotated[int | None, typer.Option(help="Instead of the recipe's.", min=1)] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Instead of the recipe's; fewer warm up for less.", min=1)
+    ] = None,
     batch_size: Annotated[int | None, typer.Option(help="Instead of the recipe's.", min=1)] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Instead of the recipe's.")] = None,
     vision_rate: Annotated[
@@ -119,7 +121,7 @@ def train(
     from looktwice.model.network.precision import bfloat16_is_fast
     from looktwice.model.network.small_planner import DRIVING_KINDS
     from looktwice.model.training.composer import train_composer
-    from looktwice.model.training.recipes import COMPOSER, NANO, PAPER, VISUAL_CODES, refining_with
+    from looktwice.model.training.recipes import COMPOSER, NANO, PAPER, VISUAL_CODES, lasting, refining_with
     from looktwice.model.training.run import RunSettings, create, run
     from looktwice.model.training.small import SmallSettings
     from looktwice.model.training.visual_codes import train_visual_codes
@@ -158,8 +160,7 @@ def train(
             raise ValueError(f"unknown recipe {recipe!r}; known are {known}")
         chosen = recipes[recipe]
         chosen = replace(
-            chosen,
-            steps=steps or chosen.steps,
+            chosen if steps is None else lasting(chosen, steps),
             batch_size=batch_size or chosen.batch_size,
             learning_rate=learning_rate or chosen.learning_rate,
             vision_rate=chosen.vision_rate if vision_rate is None else vision_rate,
