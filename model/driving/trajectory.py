@@ -196,6 +196,23 @@ def speeds(trajectory: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     return np.where(along < 0, -magnitude, magnitude)
 
 
+def retimed(path: FloatArray, pace: FloatArray) -> FloatArray:
+    """The way of the trajectory ``path`` [64, 4], driven as far at each time as ``pace`` [64, 4].
+
+    Beyond the end of the way, and backwards, it goes straight on.
+    """
+    poses = np.concatenate([np.zeros((1, 4)), path])
+    poses[:, 3] = np.unwrap(poses[:, 3])
+    # A part that is driven back and forth counts once.
+    along_m = np.maximum.accumulate(np.concatenate([[0.0], np.cumsum(speeds(path)) * STEP_S]))
+    end = poses[-1]
+    ahead = MAX_POSITION_M * np.array([np.cos(end[3]), np.sin(end[3]), 0.0, 0.0])
+    way = np.concatenate([[[-MAX_POSITION_M, 0.0, 0.0, 0.0]], poses, [end + ahead]])
+    way_m = np.concatenate([[-MAX_POSITION_M], along_m, [along_m[-1] + MAX_POSITION_M]])
+    wanted_m = np.cumsum(speeds(pace)) * STEP_S
+    return np.stack([np.interp(wanted_m, way_m, column) for column in way.T], axis=1).astype(np.float32)
+
+
 def constant_velocity(history: FloatArray) -> FloatArray:
     """The trajectory [64, 4] of an ego that keeps speed and heading: a kinematic baseline."""
     time_s = STEP_S * np.arange(1, FUTURE_STEPS + 1)

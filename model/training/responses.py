@@ -9,8 +9,10 @@ from typing import Final, cast
 import numpy as np
 from torch.utils.data import Dataset
 
+from looktwice.model.driving.direction import group_of
 from looktwice.model.driving.labeller import label_plan
 from looktwice.model.driving.next_view import expected_view
+from looktwice.model.driving.phrases import facts_of
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import mirrored_camera
 from looktwice.model.driving.trajectory import (
@@ -19,6 +21,7 @@ from looktwice.model.driving.trajectory import (
     POSE_MIRROR,
     STEP_S,
     present_speed,
+    retimed,
 )
 from looktwice.model.families.family import (
     Counterfactual,
@@ -70,8 +73,8 @@ class ResponseDataset(Dataset[ResponseSample]):
         attempts: to be asked for by items, which are refined in the format ``attempting``.
         own_plans: behind which trajectories are learned too, where nothing is reflected.
         sketched: plans and trajectories are those of the sketch in the prompt, and so are trajectories behind
-            plans of the model's own that hold. Behind the expert's plan, of which then nothing is taught, and
-            behind second looks, the trajectory is the expert's.
+            plans of the model's own that hold. Behind second looks they are the sketch's but for what is to
+            be changed, and behind the expert's plan, of which then nothing is taught, the expert's.
         visual_codes: of the checkpoint, where items are to teach pictures.
         seed: of the codes that are drawn.
 
@@ -162,9 +165,9 @@ class ResponseDataset(Dataset[ResponseSample]):
         reflections: list[Counterfactual | None] = [*found] or [None]
         plans, vectors = [plan] * len(reflections), [expert] * len(reflections)
         sketch = self._sketch(item)
-        if sketch is not None:
-            # What held was copied from the sketch; behind a second look there is nothing to copy.
-            vectors = [sketch if each and not each.thinking else expert for each in reflections]
+        if sketch is not None and found:
+            plans = [each.revised_plan or plan for each in found]
+            vectors = [self._looked_at(each, sketch, expert, history, future) for each in found]
         if not found and self._own_plans is not None:
             if item.task == self.reflecting:
                 # Nobody knows whether it deserves a second look: behind it the trajectory alone is taught.
@@ -183,7 +186,7 @@ class ResponseDataset(Dataset[ResponseSample]):
         # What the prompt sketches is copied code by code: its tokens are those of the nearest ones.
         copied = self._inputs.settings.sketch_tokens
         soft = [
-            self._soft.draw(vector, self.random, nearest=0 if vector is expert else copied)
+            self._soft.draw(vector, self.random, nearest=copied if vector is sketch else 0)
             for vector in vectors
         ]
         camera = picture.camera if picture is not None and item.camera_requested else None
@@ -217,6 +220,26 @@ class ResponseDataset(Dataset[ResponseSample]):
         if not self._sketched or self._own_plans is None or item.blur:
             return None
         return self._own_plans.sketch(item.index, mirror=item.mirror, route=item.route, tracks=item.tracks)
+
+    def _looked_at(
+        self, reflection: Counterfactual, sketch: Array, expert: Array, history: Array, future: Array
+    ) -> Array:
+        """Where a plan that the sketch carries out leads behind a reflection: a trajectory [d].
+
+        It is the sketch's where nothing is to be changed. A reflection in phrases may ask for another pace
+        alone, or another way alone; then that is the expert's, and the other one stays the sketch's.
+        """
+        facts = facts_of(reflection.thinking)
+        if not reflection.thinking or (facts is not None and not facts.changes):
+            return sketch
+        changed = set() if facts is None else {group_of(change) for change in facts.changes}
+        pace = "longitudinal" in changed
+        if facts is None or (pace and len(changed) > 1):
+            return expert
+        driven = self._codec.trajectories(history[None], sketch[None])[0]
+        mended = retimed(driven, future) if pace else retimed(future, driven)
+        vector: Array = self._codec.vectors(history[None], mended[None])[0]
+        return vector
 
     def _driven(self, sketch: Array, history: Array, plan: Plan) -> Plan:
         """The plan that a sketch carries out; lanes, which it does not tell, are the expert's."""

@@ -18,6 +18,7 @@ from looktwice.model.driving.trajectory import (
     constant_velocity,
     present_acceleration,
     present_speed,
+    retimed,
     speeds,
     to_ego_frame,
     wrap_angle,
@@ -49,6 +50,22 @@ def test_speeds_are_signed_by_the_gear() -> None:
     assert both.shape == (2, 64)
     np.testing.assert_allclose(both[0], 8.0, atol=1e-2)
     np.testing.assert_allclose(both[1], -3.0, atol=1e-2)
+
+
+def test_a_way_is_driven_at_another_pace() -> None:
+    fast, _ = drive(10.0, 0.2)
+    slow, _ = drive(5.0, 0.1)  # around the same circle
+    straight, _ = drive(5.0)
+    np.testing.assert_allclose(retimed(fast, fast), fast, atol=1e-3)
+    np.testing.assert_allclose(retimed(fast, straight), slow, atol=2e-2)
+    ahead = retimed(slow, fast)
+    np.testing.assert_allclose(ahead[:32], fast[:32], atol=2e-2)
+    np.testing.assert_allclose(speeds(ahead)[32:], 10.0, atol=1e-2)
+    np.testing.assert_allclose(ahead[32:, 3], slow[-1, 3], atol=1e-3, err_msg="straight on from its end")
+    stands, backs = np.zeros_like(fast), drive(-3.0)[0]
+    np.testing.assert_allclose(retimed(stands, straight), straight, atol=1e-3)
+    np.testing.assert_allclose(retimed(fast, stands), stands, atol=1e-3)
+    np.testing.assert_allclose(retimed(fast, backs), backs, atol=1e-3)
 
 
 def test_ego_frame_has_x_forward_and_y_left() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -8,9 +9,10 @@ import numpy as np
 import pytest
 
 from looktwice.model.driving.labeller import label_plan
+from looktwice.model.driving.phrases import NOTHING
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
-from looktwice.model.driving.trajectory import POSE_MIRROR, FloatArray
+from looktwice.model.driving.trajectory import POSE_MIRROR, FloatArray, retimed
 from looktwice.model.families.cf_vla.targets import NANO_WEIGHTS, PAPER_WEIGHTS
 from looktwice.model.families.family import Counterfactual
 from looktwice.model.network.checkpoint import Loaded, load
@@ -23,9 +25,13 @@ from looktwice.model.training.sampler import Item
 from looktwice.model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
 
-LOOK = (
+BRAKES = (
     "A slower vehicle is in my lane some 20 metres ahead. "
     "Going on like this would bring me too close, so I should brake and stop."
+)
+MOVES = (
+    "There is room in the left lane. "
+    "Going on like this would get me stuck, so I should move to the left lane."
 )
 EXAMPLES = Examples.from_scenes((training_scene(index) for index in range(8)), (FRONT_WIDE, FRONT_TELE))
 
@@ -161,10 +167,13 @@ def test_behind_an_own_plan_nothing_but_the_trajectory_is_taught(loaded: Loaded,
 
 
 @pytest.mark.parametrize("mirror", [False, True])
-def test_a_plan_that_holds_leads_to_its_sketch_and_a_second_look_to_the_expert(
+def test_a_second_look_changes_of_the_sketch_what_it_says(
     loaded: Loaded, own_plans: OwnPlans, mirror: bool
 ) -> None:
-    keeps, waits = (parse_plan(f"- longitudinal\n  - 0.0s-6.4s: {word}\n") for word in ("Keep Speed", "Wait"))
+    first, moves, waits, both = (
+        parse_plan(f"- longitudinal\n  - 0.0s-6.4s: {pace}\n- lane\n  - 0.0s-6.4s: {lane}\n")
+        for pace, lane in itertools.product(("Keep Speed", "Wait"), ("Keep Lane", "Left Lane Change"))
+    )
     data = ResponseDataset(
         EXAMPLES,
         loaded.codec,
@@ -174,12 +183,23 @@ def test_a_plan_that_holds_leads_to_its_sketch_and_a_second_look_to_the_expert(
         pictures=True,
         own_plans=own_plans,
         sketched=True,
-        reflections=[Counterfactual(keeps, ""), Counterfactual(keeps, LOOK, waits)],
+        reflections=[
+            Counterfactual(first, ""),
+            Counterfactual(first, NOTHING, first),
+            Counterfactual(first, BRAKES, waits),
+            Counterfactual(first, MOVES, moves),
+            Counterfactual(first, f"{BRAKES} {MOVES}", both),
+        ],
     )
-    sample = data[Item(1, "cf_vla", True, (0, 1), tracks=True, mirror=mirror)]
-    sketch = own_plans.sketch(1, mirror=mirror, route=True, tracks=True)
+    sample = data[Item(1, "cf_vla", True, (0, 1, 2, 3, 4), tracks=True, mirror=mirror)]
     seen = POSE_MIRROR if mirror else np.ones_like(POSE_MIRROR)
-    [expert] = loaded.codec.vectors(EXAMPLES.history[1:2] * seen, EXAMPLES.future[1:2] * seen)
-    for errors_m, wanted in zip(sample.code_errors_m[:, 0], (sketch, expert), strict=True):
+    history, expert = EXAMPLES.history[1] * seen, EXAMPLES.future[1] * seen
+    vector = own_plans.sketch(1, mirror=mirror, route=True, tracks=True)
+    [sketch] = loaded.codec.trajectories(history[None], vector[None])
+    assert np.abs(sketch - expert).max() > 1, "they can be told apart"
+    ways = (sketch, sketch, retimed(sketch, expert), retimed(expert, sketch), expert)
+    for way, errors_m, target in zip(ways, sample.code_errors_m[:, 0], sample.responses, strict=True):
+        [wanted] = loaded.codec.vectors(history[None], way[None])
         apart_m = np.linalg.norm(loaded.codec.books[0] - wanted, axis=1) / 8  # of 64 poses
-        np.testing.assert_allclose(errors_m, apart_m, atol=1e-3)
+        np.testing.assert_allclose(errors_m, apart_m, atol=0.02)
+        assert target.weights[-2] > 0, "where it leads is taught"
