@@ -33,7 +33,7 @@ plan: $(VENV)/.serve
 # A file's tests stay together: they share servers and checkpoints. Files are dealt out by their paths: those that
 # take long come first, and many short ones last, so that no core waits for the last file.
 test: $(VENV)/.dev $(BIN)/promtool system-packages lint
-	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 25
 
 test-fast: $(VENV)/.dev
 	$(BIN)/python -m pytest -q $(FAST_TESTS) $(addprefix --ignore=,$(NOT_FAST))
