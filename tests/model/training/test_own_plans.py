@@ -4,6 +4,7 @@ import itertools
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,6 +48,12 @@ def own_plans(loaded: Loaded, tmp_path_factory: pytest.TempPathFactory) -> OwnPl
     return OwnPlans(loaded.model, EXAMPLES, vision)
 
 
+def dataset(loaded: Loaded, **how: Any) -> ResponseDataset:
+    """All examples, with pictures."""
+    parts = (EXAMPLES, loaded.codec, loaded.inputs, loaded.vocabulary)
+    return ResponseDataset(*parts, **{"weights": NANO_WEIGHTS, "pictures": True, **how})
+
+
 @pytest.mark.parametrize("tracks", [False, True])
 @pytest.mark.parametrize("mirror", [False, True])
 def test_own_plans_are_near_what_was_learned(own_plans: OwnPlans, tracks: bool, mirror: bool) -> None:
@@ -86,19 +93,7 @@ def test_sketched_trajectories_are_those_that_the_prompt_tells(
 ) -> None:
     """Behind the expert's plan, of which nothing is taught, the trajectory stays the expert's."""
     item = Item(1, "cf_vla", True, tracks=tracks)
-    data = {
-        sketched: ResponseDataset(
-            EXAMPLES,
-            loaded.codec,
-            loaded.inputs,
-            loaded.vocabulary,
-            NANO_WEIGHTS,
-            pictures=True,
-            own_plans=own_plans,
-            sketched=sketched,
-        )
-        for sketched in (False, True)
-    }
+    data = {sketched: dataset(loaded, own_plans=own_plans, sketched=sketched) for sketched in (False, True)}
 
     def errors_m(sketched: bool, asked: Item) -> FloatArray:
         """How far the first codes leave the trajectory of each response, [responses, codes]."""
@@ -142,15 +137,7 @@ def test_sketched_trajectories_are_those_that_the_prompt_tells(
 
 def test_behind_an_own_plan_nothing_but_the_trajectory_is_taught(loaded: Loaded, own_plans: OwnPlans) -> None:
     def data(plans: OwnPlans | None) -> ResponseDataset:
-        return ResponseDataset(
-            EXAMPLES,
-            loaded.codec,
-            loaded.inputs,
-            loaded.vocabulary,
-            PAPER_WEIGHTS,
-            pictures=True,
-            own_plans=plans,
-        )
+        return dataset(loaded, weights=PAPER_WEIGHTS, own_plans=plans)
 
     def taught(response: Target) -> str:
         ids = [id for id, weight in zip(response.ids, response.weights, strict=True) if weight > 0]
@@ -174,13 +161,8 @@ def test_a_second_look_changes_of_the_sketch_what_it_says(
         parse_plan(f"- longitudinal\n  - 0.0s-6.4s: {pace}\n- lane\n  - 0.0s-6.4s: {lane}\n")
         for pace, lane in itertools.product(("Keep Speed", "Wait"), ("Keep Lane", "Left Lane Change"))
     )
-    data = ResponseDataset(
-        EXAMPLES,
-        loaded.codec,
-        loaded.inputs,
-        loaded.vocabulary,
-        NANO_WEIGHTS,
-        pictures=True,
+    data = dataset(
+        loaded,
         own_plans=own_plans,
         sketched=True,
         reflections=[
