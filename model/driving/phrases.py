@@ -15,7 +15,7 @@ from typing import Final, Literal
 
 from looktwice.model.driving.agents import AgentKind
 from looktwice.model.driving.direction import Change, group_of, track_changes
-from looktwice.model.driving.plan import GROUPS, Plan
+from looktwice.model.driving.plan import GROUPS, Group, Plan
 
 Side = Literal["left", "right"]
 ReflectionLanguage = Literal["free_text", "phrases"]
@@ -263,6 +263,11 @@ class Facts:
         return Facts(tuple(each.mirrored() for each in self.statements))
 
     @property
+    def groups(self) -> frozenset[Group]:
+        """The tracks that something is stated of."""
+        return frozenset(group_of(change) for change in self.changes)
+
+    @property
     def changes(self) -> tuple[Change, ...]:
         """The changes that are asked for, at most one of each track."""
         return tuple(each.change for each in self.statements)
@@ -330,8 +335,7 @@ def agrees(facts: Facts, before: Plan, after: Plan) -> bool:
 
 def corrected(before: Plan, better: Plan, facts: Facts) -> Plan:
     """The plan that a reflection leads to: tracks that something is stated of are those of ``better``."""
-    stated = {group_of(change) for change in facts.changes}
-    return Plan(**{group: (better if group in stated else before).track(group) for group in GROUPS})
+    return Plan(**{group: (better if group in facts.groups else before).track(group) for group in GROUPS})
 
 
 def head_of(cue: Cue) -> Head:

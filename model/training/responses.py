@@ -9,7 +9,6 @@ from typing import Final, cast
 import numpy as np
 from torch.utils.data import Dataset
 
-from looktwice.model.driving.direction import group_of
 from looktwice.model.driving.labeller import label_plan
 from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.phrases import facts_of
@@ -229,12 +228,15 @@ class ResponseDataset(Dataset[ResponseSample]):
         It is the sketch's where nothing is to be changed. A reflection in phrases may ask for another pace
         alone, or another way alone; then that is the expert's, and the other one stays the sketch's.
         """
-        facts = facts_of(reflection.thinking)
-        if not reflection.thinking or (facts is not None and not facts.changes):
+        if not reflection.thinking:
             return sketch
-        changed = set() if facts is None else {group_of(change) for change in facts.changes}
-        pace = "longitudinal" in changed
-        if facts is None or (pace and len(changed) > 1):
+        facts = facts_of(reflection.thinking)
+        if facts is None:
+            return expert
+        if not facts.groups:
+            return sketch
+        pace = "longitudinal" in facts.groups
+        if pace and len(facts.groups) > 1:
             return expert
         driven = self._codec.trajectories(history[None], sketch[None])[0]
         mended = retimed(driven, future) if pace else retimed(future, driven)
