@@ -12,6 +12,7 @@ from looktwice.clients.labelling.build_outcomes import followed_plans, plans_tha
 from looktwice.clients.labelling.ledger import Entry, Ledger, LedgerError, StageRun
 from looktwice.clients.labelling.teachers.prompt import camera_line
 from looktwice.model.driving.images import media_type
+from looktwice.model.driving.mends import Mend, mend_within
 from looktwice.model.driving.phrases import corrected, facts_of
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.reflection_store import LabelledReflection
@@ -31,7 +32,7 @@ DATASET: Final = "looktwice"
 def reflections(ledger: Ledger, label: StageRun, *, by_outcome: bool = False) -> Iterator[LabelledReflection]:
     """What a teacher wrote, with its provenance, scene by scene.
 
-    A reflection in phrases leads to the expert's plan in the tracks that it speaks of; the others stay as the
+    A reflection in phrases leads to the better plan in the tracks that it speaks of; the others stay as the
     model planned them.
 
     Args:
@@ -43,11 +44,15 @@ def reflections(ledger: Ledger, label: StageRun, *, by_outcome: bool = False) ->
     for entry in ledger.entries(label):
         predicted, expert = (parse_plan(entry.record[f"{name}_plan"]) for name in ("predicted", "expert"))
         facts = facts_of(entry.record["reflection"])
+        mend: Mend | None = entry.record["mend"] or "the expert's"
+        if mend is not None and facts is not None:
+            mend = mend_within(mend, facts.groups)
         yield LabelledReflection(
             scene_id=entry.scene_id,
             predicted_plan=predicted,
             reflection=entry.record["reflection"],
             expert_plan=expert if facts is None else corrected(predicted, expert, facts),
+            mend=mend or "",
             judged=not by_outcome or entry.record["failure"] is not None,
             key=entry.key,
             **_planned_by(rollout),
@@ -93,6 +98,7 @@ def _to_act_on(rollout: StageRun, entry: Entry, plans: Iterable[str]) -> Iterato
             predicted_plan=parse_plan(plan),
             reflection="",
             expert_plan=expert,
+            mend="",
             judged=True,
             key=entry.key,
             **_planned_by(rollout),

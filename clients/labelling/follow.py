@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import groupby, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from looktwice.clients.labelling.ledger import Entry, Ledger, StageRun
+from looktwice.clients.labelling.ledger import Ledger, StageRun
 from looktwice.clients.labelling.pipeline import StageLimits, StageStopped, Tally
 from looktwice.clients.labelling.rollout import key_of, unpacked
 from looktwice.clients.metadrive.outcomes import (
@@ -25,19 +25,46 @@ from looktwice.clients.metadrive.outcomes import (
     follow_episodes,
     setting_of,
 )
+from looktwice.model.driving.direction import wanted_changes
 from looktwice.model.driving.hashing import hash_of
+from looktwice.model.driving.labeller import expert_plan
+from looktwice.model.driving.mends import MENDS, Mend, mended, mended_plan
+from looktwice.model.driving.plan import Plan, parse_plan
+from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.trajectory import FloatArray
 
 
+class _Mended(NamedTuple):
+    """A plan's trajectory with a mend, and the plan that it carries out."""
+
+    mend: Mend
+    trajectory: FloatArray
+    plan: Plan
+
+
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """A scene's place in the ledger, its moment, and the trajectories that are followed from it."""
+    """A scene's place in the ledger, its moment, and what is followed from it.
+
+    Attributes:
+        key, rollout: in the ledger, of the outcomes and of the rollout.
+        moment: of the scene.
+        trajectories: float32 [64, 4], of the free draws.
+        mends: for each of them, in the order in which they are tried.
+    """
 
     key: str
     rollout: str
     moment: Moment
     trajectories: tuple[FloatArray, ...]
+    mends: tuple[tuple[_Mended, ...], ...]
+
+    @property
+    def task(self) -> FollowTask:
+        """What is asked of the simulator."""
+        others = [[each.trajectory for each in mends] for mends in self.mends]
+        return FollowTask(self.moment, self.trajectories, others)
 
 
 def follow_all(
@@ -71,7 +98,7 @@ def follow_all(
     def episodes() -> Iterator[list[FollowTask]]:
         for episode in _episodes(_works(ledger, run, rollout, scenes, setting, tally), limits.at_most):
             works.update((work.moment.scene_id, work) for work in episode)
-            yield [(work.moment, work.trajectories) for work in episode]
+            yield [work.task for work in episode]
 
     try:
         for scene_id, found in follow_episodes(episodes(), setting, workers):
@@ -96,6 +123,10 @@ def _enter(ledger: Ledger, run: StageRun, work: _Work, found: MomentOutcomes | s
         "rollout": work.rollout,
         "expert": found.expert.to_json(),
         "plans": [plan.to_json() for plan in found.plans],
+        "mends": [
+            None if place is None else {"mend": mends[place].mend, "plan": str(mends[place].plan)}
+            for mends, place in zip(work.mends, found.better, strict=True)
+        ],
     }
     ledger.finish(run, work.key, work.moment.scene_id, record)
     tally.done += 1
@@ -122,8 +153,19 @@ def _works(
             tally.earlier += 1
             continue
         begun.add(key)
-        yield _Work(key, entry.key, Moment.of(labelled), _trajectories(entry))
+        trajectories = tuple(unpacked(draw["trajectory"]) for draw in entry.record["free"])
+        mends = tuple(
+            tuple(_mends(labelled, parse_plan(draw["plan"]), trajectory))
+            for draw, trajectory in zip(entry.record["free"], trajectories, strict=True)
+        )
+        yield _Work(key, entry.key, Moment.of(labelled), trajectories, mends)
 
 
-def _trajectories(entry: Entry) -> tuple[FloatArray, ...]:
-    return tuple(unpacked(draw["trajectory"]) for draw in entry.record["free"])
+def _mends(labelled: LabelledScene, plan: Plan, trajectory: FloatArray) -> Iterator[_Mended]:
+    """The mends that a plan's words can tell, the smallest first."""
+    history, expert = labelled.scene.history, expert_plan(labelled)
+    for mend in MENDS:
+        changed = mended(mend, trajectory, labelled.future, history)
+        better = mended_plan(mend, plan, changed, expert, history)
+        if wanted_changes(plan, better):
+            yield _Mended(mend, changed, better)

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from looktwice.clients.labelling.build_outcomes import Followed, failure_of, followed_entries
+from looktwice.clients.labelling.build_outcomes import FailingPlan, Followed, failure_of, followed_entries
 from looktwice.clients.labelling.checks import FailedCheck
 from looktwice.clients.labelling.ledger import Entry, Ledger, Record, StageRun
 from looktwice.clients.labelling.pipeline import CannotBeDone, Job, StageStopped
@@ -25,7 +25,8 @@ from looktwice.clients.labelling.teachers.teacher import (
     ask,
 )
 from looktwice.model.driving.hashing import annotations_hash, hash_of
-from looktwice.model.driving.outcome import Outcome, in_words
+from looktwice.model.driving.mends import Mend
+from looktwice.model.driving.outcome import in_words
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import read_scenes
@@ -37,11 +38,19 @@ else."""
 
 
 class LabelTask(NamedTuple):
-    """A question, the rollout that it comes from, and what stands for the annotations that it was made of."""
+    """A question, and where it comes from.
+
+    Attributes:
+        entry: the rollout.
+        question: what a teacher is asked.
+        annotations: what stands for those that it was made of.
+        mend: that leads to the better plan; None where it is the expert's, and nobody followed it.
+    """
 
     entry: Entry
     question: Question
     annotations: str
+    mend: Mend | None
 
 
 def config_of(rollout: StageRun, teacher: Teacher, seed: int) -> Record:
@@ -68,7 +77,7 @@ def questions(
     """What a teacher is to be asked: each kept scene with some of the plans that were kept of it.
 
     Which plans is left to chance, once and for all for a scene and a seed. Where plans were followed, a
-    question says what its plan failed at.
+    question says what its plan failed at, and the better plan is the mended one.
     """
     followed = followed_entries(ledger, rollout)
     for labelled in read_scenes(scenes, dense=False, unlabelled=lambda _: None, group=group):
@@ -79,8 +88,9 @@ def questions(
         annotations = annotations_hash(labelled)
         for text in predicted_plans(entry, draws, plans_per_scene, seed):
             fate = followed.get(entry.key)
-            failure = None if fate is None else failure_of(text, entry, Followed.of(fate.record))
-            yield LabelTask(entry, _question(labelled, entry, text, seed, failure), annotations)
+            failing = None if fate is None else failure_of(text, entry, Followed.of(fate.record))
+            mend = None if failing is None else failing.better.mend
+            yield LabelTask(entry, _question(labelled, entry, text, seed, failing), annotations, mend)
 
 
 def predicted_plans(entry: Entry, draws: Sequence[int], count: int, seed: int) -> list[str]:
@@ -96,9 +106,9 @@ def jobs(run: StageRun, asked: Iterator[LabelTask]) -> Iterator[Job[LabelTask]]:
     for each in asked:
         question = each.question
         parts: list[str] = [run.id, each.entry.key, str(question.predicted), each.annotations]
-        # Another hint, another question; without one it is as it always was.
+        # Another hint or another better plan, another question; without them it is as it always was.
         if question.outcome is not None:
-            parts.append(in_words(question.outcome))
+            parts += [in_words(question.outcome), str(question.expert)]
         key = hash_of(*parts)
         yield Job(key, each.entry.scene_id, each)
 
@@ -137,6 +147,7 @@ def record(asked: LabelTask, reflection: CheckedReflection) -> Record:
         "rollout": asked.entry.key,
         "predicted_plan": str(asked.question.predicted),
         "failure": None if asked.question.outcome is None else in_words(asked.question.outcome),
+        "mend": asked.mend,
         "expert_plan": str(asked.question.expert),
         "reflection": reflection.text,
         "attempts": reflection.attempts,
@@ -154,7 +165,10 @@ def _told(failed: Sequence[FailedCheck]) -> list[str]:
 
 
 def _question(
-    labelled: LabelledScene, entry: Entry, predicted: str, seed: int, failure: Outcome | None
+    labelled: LabelledScene, entry: Entry, predicted: str, seed: int, failing: FailingPlan | None
 ) -> Question:
-    expert = parse_plan(entry.record["expert_plan"])
-    return Question(labelled.scene, parse_plan(predicted), expert, Surroundings.of(labelled), seed, failure)
+    better, outcome = entry.record["expert_plan"], None
+    if failing is not None:
+        better, outcome = failing.better.plan, failing.outcome
+    told = parse_plan(predicted), parse_plan(better)
+    return Question(labelled.scene, *told, Surroundings.of(labelled), seed, outcome)

@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import pyarrow as pa
 
+from looktwice.model.driving.mends import MENDS, Mend
 from looktwice.model.driving.parquet_rows import read_rows, write_rows
 from looktwice.model.driving.plan import Plan, PlanError, parse_plan
 
-REFLECTION_VERSION: Final = "3"
+REFLECTION_VERSION: Final = "4"
 _VERSION_KEY: Final = b"looktwice.reflection_version"
 _ROW_GROUP: Final = 4096
 
@@ -33,8 +34,10 @@ class LabelledReflection:
         scene_id: of a scene in the scene store.
         predicted_plan: what the model planned.
         reflection: a teacher's paragraph; empty where the plan is right and is to be acted on.
-        expert_plan: what it leads to: the expert's plan, of which a reflection in phrases takes over the
-            tracks that it speaks of.
+        expert_plan: what it leads to: the mended plan, or the expert's, of which a reflection in phrases
+            takes over the tracks that it speaks of.
+        mend: that leads from the plan's trajectory to the better one, one of `MENDS`; empty where nothing is
+            to be changed.
         judged: whether it is known that the plan deserves a second look, or none; see `Counterfactual`.
         route, tracks: whether the model was told the route, and the tracks of what is around.
         key: of the label in the ledger it comes from.
@@ -48,6 +51,7 @@ class LabelledReflection:
     predicted_plan: Plan
     reflection: str
     expert_plan: Plan
+    mend: Mend | Literal[""]
     judged: bool
     route: bool
     tracks: bool
@@ -95,4 +99,6 @@ def _to_row(reflection: LabelledReflection) -> dict[str, Any]:
 
 def _from_row(row: dict[str, Any]) -> LabelledReflection:
     plans = {name: parse_plan(row[name]) for name in ("predicted_plan", "expert_plan")}
+    if row["mend"] and row["mend"] not in MENDS:
+        raise TypeError(f"{row['mend']!r} is no mend; those are {', '.join(MENDS)}")
     return LabelledReflection(**(row | plans))

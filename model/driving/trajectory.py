@@ -199,6 +199,14 @@ def speeds(trajectory: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
 def retimed(path: FloatArray, pace: FloatArray) -> FloatArray:
     """The way of the trajectory ``path`` [64, 4], driven as far at each time as ``pace`` [64, 4].
 
+    See `paced`.
+    """
+    return paced(path, speeds(pace))
+
+
+def paced(path: FloatArray, speeds_ms: npt.NDArray[np.float64]) -> FloatArray:
+    """The way of the trajectory ``path`` [64, 4], driven with speeds [64], each over a step.
+
     Beyond the end of the way, and backwards, it goes straight on.
     """
     poses = np.concatenate([np.zeros((1, 4)), path])
@@ -209,7 +217,7 @@ def retimed(path: FloatArray, pace: FloatArray) -> FloatArray:
     ahead = MAX_POSITION_M * np.array([np.cos(end[3]), np.sin(end[3]), 0.0, 0.0])
     way = np.concatenate([[[-MAX_POSITION_M, 0.0, 0.0, 0.0]], poses, [end + ahead]])
     way_m = np.concatenate([[-MAX_POSITION_M], along_m, [along_m[-1] + MAX_POSITION_M]])
-    wanted_m = np.cumsum(speeds(pace)) * STEP_S
+    wanted_m = np.cumsum(speeds_ms) * STEP_S
     return np.stack([np.interp(wanted_m, way_m, column) for column in way.T], axis=1).astype(np.float32)
 
 

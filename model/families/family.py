@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
+from looktwice.model.driving.mends import Mend
 from looktwice.model.driving.next_view import Motion
 from looktwice.model.driving.perceived import Perceived
 from looktwice.model.driving.phrases import ReflectionLanguage
@@ -236,13 +237,15 @@ class Counterfactual:
     """A counterfactual example's own parts: a plan of the model's own, and why it is to be corrected.
 
     ``thinking`` is empty where it is not: such a plan is acted on. ``revised_plan`` is what the reasoning
-    leads to, where that is not the expert's plan in all tracks. ``judged`` says whether it is known that the
-    plan deserves a second look, or none; otherwise nothing is taught of the branch.
+    leads to, where that is not the expert's plan in all tracks, and ``mend`` leads there from the plan's
+    trajectory. ``judged`` says whether it is known that the plan deserves a second look, or none; otherwise
+    nothing is taught of the branch.
     """
 
     first_plan: Plan
     thinking: str
     revised_plan: Plan | None = None
+    mend: Mend | None = None
     judged: bool = True
 
 

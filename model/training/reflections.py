@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from looktwice.model.driving.phrases import facts_of, read_facts
+from looktwice.model.driving.phrases import read_facts
 from looktwice.model.driving.reflection_store import LabelledReflection
 from looktwice.model.families.family import Counterfactual
 from looktwice.model.training.examples import Examples
@@ -87,8 +87,11 @@ def place_reflections(examples: Examples, found: Iterable[LabelledReflection]) -
     labelled, reflections = list(found), []
     places = places_of(examples, (each.scene_id for each in labelled), "a reflection")
     for each in labelled:
-        thinking = plain(each.reflection)
-        revised = None if facts_of(thinking) is None else each.expert_plan
-        reflections.append(Counterfactual(each.predicted_plan, thinking, revised, each.judged))
+        revised = each.expert_plan if each.reflection else None
+        reflections.append(
+            Counterfactual(
+                each.predicted_plan, plain(each.reflection), revised, each.mend or None, each.judged
+            )
+        )
     told = np.array([(each.route, each.tracks) for each in labelled], np.bool_).reshape(-1, 2)
     return PlacedReflections(places, told, reflections)

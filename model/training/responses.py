@@ -10,8 +10,8 @@ import numpy as np
 from torch.utils.data import Dataset
 
 from looktwice.model.driving.labeller import label_plan
+from looktwice.model.driving.mends import mended
 from looktwice.model.driving.next_view import expected_view
-from looktwice.model.driving.phrases import facts_of
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import mirrored_camera
 from looktwice.model.driving.trajectory import (
@@ -20,7 +20,6 @@ from looktwice.model.driving.trajectory import (
     POSE_MIRROR,
     STEP_S,
     present_speed,
-    retimed,
 )
 from looktwice.model.families.family import (
     Counterfactual,
@@ -72,8 +71,8 @@ class ResponseDataset(Dataset[ResponseSample]):
         attempts: to be asked for by items, which are refined in the format ``attempting``.
         own_plans: behind which trajectories are learned too, where nothing is reflected.
         sketched: plans and trajectories are those of the sketch in the prompt, and so are trajectories behind
-            plans of the model's own that hold. Behind second looks they are the sketch's but for what is to
-            be changed, and behind the expert's plan, of which then nothing is taught, the expert's.
+            plans of the model's own that hold. Behind second looks they are the sketch's with its mend,
+            and behind the expert's plan, of which then nothing is taught, the expert's.
         visual_codes: of the checkpoint, where items are to teach pictures.
         seed: of the codes that are drawn.
 
@@ -166,7 +165,7 @@ class ResponseDataset(Dataset[ResponseSample]):
         sketch = self._sketch(item)
         if sketch is not None and found:
             plans = [each.revised_plan or plan for each in found]
-            vectors = [self._looked_at(each, sketch, expert, history, future) for each in found]
+            vectors = [self._looked_at(each, sketch, history, future) for each in found]
         if not found and self._own_plans is not None:
             if item.task == self.reflecting:
                 # Nobody knows whether it deserves a second look: behind it the trajectory alone is taught.
@@ -220,27 +219,13 @@ class ResponseDataset(Dataset[ResponseSample]):
             return None
         return self._own_plans.sketch(item.index, mirror=item.mirror, route=item.route, tracks=item.tracks)
 
-    def _looked_at(
-        self, reflection: Counterfactual, sketch: Array, expert: Array, history: Array, future: Array
-    ) -> Array:
-        """Where a plan that the sketch carries out leads behind a reflection: a trajectory [d].
-
-        It is the sketch's where nothing is to be changed. A reflection in phrases may ask for another pace
-        alone, or another way alone; then that is the expert's, and the other one stays the sketch's.
-        """
-        if not reflection.thinking:
+    def _looked_at(self, reflection: Counterfactual, sketch: Array, history: Array, future: Array) -> Array:
+        """Where a plan that the sketch carries out leads behind a reflection: a trajectory [d]."""
+        if reflection.mend is None:
             return sketch
-        facts = facts_of(reflection.thinking)
-        if facts is None:
-            return expert
-        if not facts.groups:
-            return sketch
-        pace = "longitudinal" in facts.groups
-        if pace and len(facts.groups) > 1:
-            return expert
         driven = self._codec.trajectories(history[None], sketch[None])[0]
-        mended = retimed(driven, future) if pace else retimed(future, driven)
-        vector: Array = self._codec.vectors(history[None], mended[None])[0]
+        better = mended(reflection.mend, driven, future, history)
+        vector: Array = self._codec.vectors(history[None], better[None])[0]
         return vector
 
     def _driven(self, sketch: Array, history: Array, plan: Plan) -> Plan:

@@ -123,7 +123,7 @@ def outcomes(
     run: RunId = None,
     as_json: Json = False,
 ) -> None:
-    """Follow the model's own plans in the simulator: which hold, which fail, and at what."""
+    """Follow the model's own plans in the simulator: which hold, which fail and at what, what mends them."""
     from collections import Counter
 
     from looktwice.clients.labelling.build_outcomes import Followed, config_of
@@ -149,6 +149,7 @@ def outcomes(
             plans=len(plans),
             plans_hold=sum(plan.holds for plan in plans),
             fails=dict(Counter(name for plan in plans for name in plan.fails)),
+            mends=dict(Counter(mend.mend for each in found for mend in each.mends if mend is not None)),
         )
         return begun, tally
 

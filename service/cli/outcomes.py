@@ -127,7 +127,7 @@ def _asked(labelled: LabelledScene, never: Sequence[Draw], adaptive: Sequence[Dr
     """The trajectories of all first plans, then those of the second looks."""
     trajectories: list[FloatArray] = [draw.trajectory for draw in never]
     trajectories += [draw.trajectory for draw in adaptive if draw.looked_twice]
-    return Moment.of(labelled), trajectories
+    return FollowTask(Moment.of(labelled), trajectories)
 
 
 def _draws(
@@ -144,8 +144,8 @@ def _draws(
 
 
 def _episodes(asked: Sequence[FollowTask]) -> Iterator[list[FollowTask]]:
-    by_seed = sorted(asked, key=lambda each: each[0].seed)
-    for _, episode in groupby(by_seed, lambda each: each[0].seed):
+    by_seed = sorted(asked, key=lambda each: each.moment.seed)
+    for _, episode in groupby(by_seed, lambda each: each.moment.seed):
         yield list(episode)
 
 

@@ -2,13 +2,14 @@
 
 from looktwice.clients.metadrive.outcomes.replayed_worlds import (
     EpisodeSetting,
+    FollowTask,
     Moment,
     ReplayError,
     setting_of,
 )
 from looktwice.clients.metadrive.outcomes.store import outcome_key, outcome_store
 from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes
-from looktwice.clients.metadrive.outcomes.workers import FollowTask, WorkerDied, follow_episodes
+from looktwice.clients.metadrive.outcomes.workers import WorkerDied, follow_episodes
 from looktwice.clients.metadrive.result_store import ResultStore
 from looktwice.clients.metadrive.world.fork import Forked, fork_along, fork_expert
 

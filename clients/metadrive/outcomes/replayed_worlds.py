@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import shapely
@@ -78,6 +78,20 @@ class Moment:
         return cls(
             labelled.scene.scene_id, labelled.seed, int(named[2]), labelled.scene.history, labelled.future
         )
+
+
+class FollowTask(NamedTuple):
+    """What is to be followed from one moment.
+
+    Attributes:
+        moment: from which.
+        trajectories: float32 [64, 4], of plans.
+        others: for each of them what is tried instead where it fails; see `outcomes_at`.
+    """
+
+    moment: Moment
+    trajectories: Sequence[FloatArray]
+    others: Sequence[Sequence[FloatArray]] = ()
 
 
 def setting_of(scenes: Path) -> EpisodeSetting:
@@ -149,19 +163,19 @@ def replayed(
 def outcomes_of_episode(
     seed: int,
     setting: EpisodeSetting,
-    asked: Sequence[tuple[Moment, Sequence[FloatArray]]],
+    asked: Sequence[FollowTask],
 ) -> Iterator[tuple[str, MomentOutcomes | ReplayError]]:
     """What comes of plans at some moments of one episode, which is driven once.
 
     Args:
         seed, setting: of the episode.
-        asked: moments, each with the trajectories [64, 4] of its plans.
+        asked: moments, each with what is to be followed from it.
 
     Yields:
         Scene ids with how their plans fared, or why that cannot be said.
     """
-    plans: Mapping[str, Sequence[FloatArray]] = {moment.scene_id: some for moment, some in asked}
-    for moment, world in replayed(seed, setting, [moment for moment, _ in asked]):
+    tasks = {task.moment.scene_id: task for task in asked}
+    for moment, world in replayed(seed, setting, [task.moment for task in asked]):
         if isinstance(world, ReplayError):
             yield moment.scene_id, world
             continue
@@ -169,7 +183,8 @@ def outcomes_of_episode(
         if not _near(driven.trajectory, moment.future):
             yield moment.scene_id, _differs(moment)
             continue
-        yield moment.scene_id, outcomes_at(world, plans[moment.scene_id], driven)
+        task = tasks[moment.scene_id]
+        yield moment.scene_id, outcomes_at(world, task.trajectories, task.others, driven)
 
 
 def _is_same(world: EpisodeWorld, moment: Moment) -> bool:

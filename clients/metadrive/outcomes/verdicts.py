@@ -42,20 +42,28 @@ class MomentOutcomes:
     Attributes:
         expert: of the expert's own way on, followed by the same car as the plans are.
         plans: of each plan, in their order.
+        better: for each plan the place of the first of its other trajectories that holds; None where the plan
+            holds itself, or none of them does, or the expert's own way fails too.
     """
 
     expert: Outcome
     plans: tuple[Outcome, ...]
+    better: tuple[int | None, ...]
 
 
 def outcomes_at(
-    world: EpisodeWorld, trajectories: Sequence[FloatArray], driven: Forked | None = None
+    world: EpisodeWorld,
+    trajectories: Sequence[FloatArray],
+    others: Sequence[Sequence[FloatArray]] = (),
+    driven: Forked | None = None,
 ) -> MomentOutcomes:
     """Follow each of some trajectories [64, 4] of the ego frame of now, each in a fork of its own.
 
     Args:
         world: at the moment; nothing happens in it.
         trajectories: of the plans.
+        others: for each of them trajectories [64, 4] that are followed instead where it fails, one after the
+            other until one holds; () where nothing else is to be tried.
         driven: the expert's fork from this moment, where it is there already.
 
     Raises:
@@ -63,11 +71,17 @@ def outcomes_at(
     """
     driven = fork_expert(world) if driven is None else driven
     expert = judged(fork_along(world, driven.trajectory), driven.driven_m)
-    strict = expert.uncomfortable is None
-    plans = (fork_along(world, trajectory) for trajectory in trajectories)
-    return MomentOutcomes(
-        expert, tuple(judged(plan, driven.driven_m, needs_comfort=strict) for plan in plans)
-    )
+    strict, expert_m = expert.uncomfortable is None, driven.driven_m
+
+    def followed(trajectory: FloatArray) -> Outcome:
+        return judged(fork_along(world, trajectory), expert_m, needs_comfort=strict)
+
+    plans = tuple(followed(trajectory) for trajectory in trajectories)
+    better: list[int | None] = [None] * len(plans)
+    for place, instead in enumerate(others):
+        if expert.holds and not plans[place].holds:
+            better[place] = next((n for n, each in enumerate(instead) if followed(each).holds), None)
+    return MomentOutcomes(expert, plans, tuple(better))
 
 
 def judged(followed: Forked, expert_m: float, *, needs_comfort: bool = False) -> Outcome:

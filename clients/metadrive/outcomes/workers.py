@@ -12,15 +12,11 @@ from typing import Final
 
 from looktwice.clients.metadrive.outcomes.replayed_worlds import (
     EpisodeSetting,
-    Moment,
+    FollowTask,
     ReplayError,
     outcomes_of_episode,
 )
 from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes
-from looktwice.model.driving.trajectory import FloatArray
-
-FollowTask = tuple[Moment, Sequence[FloatArray]]
-"""A moment, and the trajectories [64, 4] that are to be followed from it."""
 
 _EPISODES_A_PROCESS: Final = 20
 """Then it is replaced, so that its memory stays bounded."""
@@ -76,7 +72,7 @@ def _follow_episode(
     """One episode in a process of its own; what cannot be followed is told as text."""
     return [
         (scene_id, str(found) if isinstance(found, ReplayError) else found)
-        for scene_id, found in outcomes_of_episode(asked[0][0].seed, setting, asked)
+        for scene_id, found in outcomes_of_episode(asked[0].moment.seed, setting, asked)
     ]
 
 

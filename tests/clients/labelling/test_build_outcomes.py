@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,9 @@ import pytest
 
 from looktwice.clients.labelling.build_outcomes import (
     Followed,
+    VerifiedMend,
     config_of,
+    failure_of,
     followed_plans,
     plans_that_fail,
     plans_that_hold,
@@ -34,26 +37,37 @@ def entry(*plans: object) -> Entry:
 
 
 HOLDS, FAILS = outcome(), outcome("behind")
+MEND = VerifiedMend("ease off", str(SLOW_DOWN))
 
 
 @pytest.mark.parametrize(
-    ("expert", "plans", "outcomes", "fail", "hold"),
+    ("expert", "plans", "outcomes", "mends", "fail", "hold"),
     [
-        (HOLDS, (KEEP_ON, GO_FASTER), (FAILS, HOLDS), (0,), (1,)),
-        (HOLDS, (KEEP_ON, KEEP_ON), (FAILS, FAILS), (0,), ()),
-        (HOLDS, (KEEP_ON, KEEP_ON), (HOLDS, FAILS), (), ()),
-        (HOLDS, (GO_FASTER, KEEP_ON, KEEP_ON), (FAILS, HOLDS, HOLDS), (0,), (1,)),
-        (HOLDS, (SLOW_DOWN, KEEP_ON), (FAILS, FAILS), (1,), ()),
-        (FAILS, (KEEP_ON, GO_FASTER), (FAILS, HOLDS), (), (1,)),
+        (HOLDS, (KEEP_ON, GO_FASTER), (FAILS, HOLDS), (MEND, None), (0,), (1,)),
+        (HOLDS, (KEEP_ON, KEEP_ON), (FAILS, FAILS), (MEND, MEND), (0,), ()),
+        (HOLDS, (KEEP_ON, KEEP_ON), (FAILS, FAILS), (None, MEND), (1,), ()),
+        (HOLDS, (KEEP_ON, KEEP_ON), (HOLDS, FAILS), (None, MEND), (), ()),
+        (HOLDS, (GO_FASTER, KEEP_ON, KEEP_ON), (FAILS, HOLDS, HOLDS), (MEND, None, None), (0,), (1,)),
+        (HOLDS, (SLOW_DOWN, KEEP_ON), (FAILS, FAILS), (None, MEND), (1,), ()),
+        (FAILS, (KEEP_ON, GO_FASTER), (FAILS, HOLDS), (None, None), (), (1,)),
     ],
-    ids=["one each", "twice wrong", "now and then", "twice right", "the expert's words", "nobody can"],
+    ids=["one each", "twice wrong", "mended once", "now and then", "twice right", "no words", "nobody can"],
 )
 def test_which_plans_fail_and_which_hold(
-    expert: Outcome, plans: Any, outcomes: Any, fail: tuple[int, ...], hold: tuple[int, ...]
+    expert: Outcome, plans: Any, outcomes: Any, mends: Any, fail: tuple[int, ...], hold: tuple[int, ...]
 ) -> None:
-    found, followed = entry(*plans), Followed(expert, outcomes)
+    found, followed = entry(*plans), Followed(expert, outcomes, mends)
     assert plans_that_fail(found, followed) == fail
     assert plans_that_hold(found, followed) == hold
+
+
+def test_a_plan_that_fails_is_told_with_its_mend() -> None:
+    found = entry(KEEP_ON, KEEP_ON, GO_FASTER)
+    followed = Followed(HOLDS, (FAILS, outcome("collision"), HOLDS), (None, MEND, None))
+    failing = failure_of(str(KEEP_ON), found, followed)
+    assert failing is not None
+    assert (failing.outcome.fails, failing.better) == (("collision",), MEND)
+    assert failure_of(str(GO_FASTER), found, followed) is None
 
 
 def test_the_filter_keeps_failing_plans_and_the_export_adds_those_that_hold(tmp_path: Path) -> None:
@@ -71,6 +85,7 @@ def test_the_filter_keeps_failing_plans_and_the_export_adds_those_that_hold(tmp_
                 "rollout": one.key,
                 "expert": HOLDS.to_json(),
                 "plans": [plan.to_json() for plan in plans],
+                "mends": [None if plan.holds else asdict(MEND) for plan in plans],
             }
             ledger.finish(run, f"o-{one.key}", one.scene_id, record)
         followed = followed_plans(ledger, rollout)
@@ -92,6 +107,6 @@ def test_another_rule_s_outcomes_are_not_taken_for_these(tmp_path: Path) -> None
     with Ledger(tmp_path) as ledger:
         (one,) = ledger.entries(rollout)
         older = ledger.run("outcomes", {**config_of(rollout), "rules": 0})
-        ledger.finish(older, "o", one.scene_id, {"rollout": one.key, "expert": {}, "plans": []})
+        ledger.finish(older, "o", one.scene_id, {"rollout": one.key, "expert": {}, "plans": [], "mends": []})
         with pytest.raises(LedgerError, match="looktwice build outcomes"):
             followed_plans(ledger, rollout)

@@ -26,6 +26,7 @@ from looktwice.clients.labelling.teachers.teacher import (
     TeacherError,
 )
 from looktwice.model.driving.outcome import Outcome
+from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.reflection_store import ReflectionFileError, read_reflections, write_reflections
 from looktwice.model.driving.scene_store import read_scenes, write_scenes
 from tests.clients.labelling.builds import (
@@ -113,22 +114,30 @@ def test_a_question_tells_what_its_plan_failed_at(ledger: Ledger, file: Path) ->
     followed = ledger.run("outcomes", build_outcomes.config_of(rollout))
     holds = Outcome((), None, None, None, None, None, None, 60.0, 60.0)
     late = replace(holds, fails=("behind",), driven_m=42.0)
+    eased = parse_plan("- longitudinal\n  - 0.0s-3.0s: Decelerate\n  - 3.0s-6.4s: Keep Speed\n")
+    mended = str(replace(KEEP_ON, longitudinal=eased.longitudinal))
     for entry, first in zip(ledger.entries(rollout), (late, late, holds), strict=False):
+        mend = None if first.holds else {"mend": "ease off", "plan": mended}
         record = {
             "rollout": entry.key,
             "expert": holds.to_json(),
             "plans": [first.to_json(), holds.to_json()],
+            "mends": [mend, None],
         }
         ledger.finish(followed, f"o-{entry.key}", entry.scene_id, record)
     again = Attentive()
     _, tally = labelled(ledger, file, again)
     assert (tally.done, tally.earlier) == (2, SCENES - 2), "another hint is another question"
     assert {question.outcome for question in again.questions} == {late}
+    assert {str(question.expert) for question in again.questions} == {mended}, "the mended plan is better"
     told = [entry.record["failure"] for entry in ledger.entries(run)]
     assert sorted(told, key=str) == [None] * SCENES + ["falls behind by 18 m"] * 2
     assert {each.judged for each in reflections(ledger, run)} == {True}
     judged = [each.judged for each in reflections(ledger, run, by_outcome=True)]
     assert sorted(judged) == [False] * SCENES + [True] * 2, "only of a plan that failed it is known"
+    led = {each.mend: each.expert_plan for each in reflections(ledger, run)}
+    assert set(led) == {"ease off", "the expert's"}
+    assert str(led["ease off"]) == mended
     parts = user_message(again.questions[0], (), "free_text")
     assert any(isinstance(part, Text) and "your plan falls behind by 18 m" in part.text for part in parts)
     parts = user_message(teacher.questions[0], (), "free_text")

@@ -13,6 +13,7 @@ import pytest
 from looktwice.clients.metadrive.generation.blocks import GENERATOR_VERSION, GenerateConfig
 from looktwice.clients.metadrive.outcomes.replayed_worlds import (
     EpisodeSetting,
+    FollowTask,
     Moment,
     ReplayError,
     outcomes_of_episode,
@@ -44,9 +45,9 @@ def straight(speed_ms: float, sideways_ms: float = 0.0) -> FloatArray:
 
 
 def test_the_expert_s_own_plans_hold_at_every_stored_scene(filmed: Filmed) -> None:
-    asked = [(moment, [moment.future]) for moment in moments(filmed)]
+    asked = [FollowTask(moment, [moment.future]) for moment in moments(filmed)]
     found = dict(outcomes_of_episode(SEED, SETTING, asked))
-    assert list(found) == [moment.scene_id for moment, _ in asked]
+    assert list(found) == [task.moment.scene_id for task in asked]
     for outcomes in found.values():
         assert not isinstance(outcomes, ReplayError)
         assert outcomes.expert.holds
@@ -73,6 +74,19 @@ def test_an_outcome_does_not_depend_on_the_other_plans() -> None:
     together = outcomes_at(world, plans).plans
     alone = tuple(outcomes_at(world, [plan]).plans[0] for plan in plans)
     assert together == alone
+
+
+def test_where_a_plan_fails_the_first_other_trajectory_that_holds_is_found() -> None:
+    world = driven(60)
+    own = fork_expert(world).trajectory
+    stands, aside = straight(0.0), straight(8.0, sideways_ms=4.0)
+    found = outcomes_at(
+        world,
+        [stands, own, stands, stands],
+        [[aside, own, own], [own], [aside], []],
+    )
+    assert found.better == (1, None, None, None)
+    assert outcomes_at(world, [stands]).better == (None,), "nothing else was asked for"
 
 
 def forked(**changed: Any) -> Forked:
@@ -135,14 +149,15 @@ def test_what_is_not_the_stored_scene_s_world_is_refused_by_name(filmed: Filmed)
     elsewhere = replace(first, future=first.future * np.float32(1.1))
     late = replace(first, step=5000)
     for wrong, why in ((moved, "otherwise"), (elsewhere, "otherwise"), (late, "ended before")):
-        ((name, refused),) = outcomes_of_episode(SEED, SETTING, [(wrong, [])])
+        ((name, refused),) = outcomes_of_episode(SEED, SETTING, [FollowTask(wrong, [])])
         assert name == first.scene_id
         assert isinstance(refused, ReplayError)
         assert why in str(refused)
         assert first.scene_id in str(refused)
     other = replace(SETTING, drifts=True)
     last = moments(filmed)[-1]
-    ((_, refused),) = outcomes_of_episode(SEED + 1, other, [(last, [constant_velocity(last.history)])])
+    task = FollowTask(last, [constant_velocity(last.history)])
+    ((_, refused),) = outcomes_of_episode(SEED + 1, other, [task])
     assert isinstance(refused, ReplayError)
 
 

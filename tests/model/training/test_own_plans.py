@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from looktwice.model.driving.labeller import label_plan
+from looktwice.model.driving.mends import mended
 from looktwice.model.driving.phrases import NOTHING
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
@@ -154,9 +155,7 @@ def test_behind_an_own_plan_nothing_but_the_trajectory_is_taught(loaded: Loaded,
 
 
 @pytest.mark.parametrize("mirror", [False, True])
-def test_a_second_look_changes_of_the_sketch_what_it_says(
-    loaded: Loaded, own_plans: OwnPlans, mirror: bool
-) -> None:
+def test_behind_a_second_look_the_sketch_is_mended(loaded: Loaded, own_plans: OwnPlans, mirror: bool) -> None:
     first, moves, waits, both = (
         parse_plan(f"- longitudinal\n  - 0.0s-6.4s: {pace}\n- lane\n  - 0.0s-6.4s: {lane}\n")
         for pace, lane in itertools.product(("Keep Speed", "Wait"), ("Keep Lane", "Left Lane Change"))
@@ -168,9 +167,9 @@ def test_a_second_look_changes_of_the_sketch_what_it_says(
         reflections=[
             Counterfactual(first, ""),
             Counterfactual(first, NOTHING, first),
-            Counterfactual(first, BRAKES, waits),
-            Counterfactual(first, MOVES, moves),
-            Counterfactual(first, f"{BRAKES} {MOVES}", both),
+            Counterfactual(first, BRAKES, waits, "brake hard"),
+            Counterfactual(first, MOVES, moves, "the expert's way"),
+            Counterfactual(first, f"{BRAKES} {MOVES}", both, "the expert's"),
         ],
     )
     sample = data[Item(1, "cf_vla", True, (0, 1, 2, 3, 4), tracks=True, mirror=mirror)]
@@ -179,7 +178,7 @@ def test_a_second_look_changes_of_the_sketch_what_it_says(
     vector = own_plans.sketch(1, mirror=mirror, route=True, tracks=True)
     [sketch] = loaded.codec.trajectories(history[None], vector[None])
     assert np.abs(sketch - expert).max() > 1, "they can be told apart"
-    ways = (sketch, sketch, retimed(sketch, expert), retimed(expert, sketch), expert)
+    ways = (sketch, sketch, mended("brake hard", sketch, expert, history), retimed(expert, sketch), expert)
     for way, errors_m, target in zip(ways, sample.code_errors_m[:, 0], sample.responses, strict=True):
         [wanted] = loaded.codec.vectors(history[None], way[None])
         apart_m = np.linalg.norm(loaded.codec.books[0] - wanted, axis=1) / 8  # of 64 poses

@@ -17,7 +17,21 @@ EXAMPLES = Examples.from_scenes((training_scene(k) for k in range(3)), (FRONT_WI
 
 def reflection(scene_id: str, text: str) -> LabelledReflection:
     return LabelledReflection(
-        scene_id, PLAN, text, PLAN, False, True, False, "key", "nano", "1", "rules", "1", 1, "2026-01-01"
+        scene_id,
+        PLAN,
+        text,
+        PLAN,
+        "brake",
+        False,
+        True,
+        False,
+        "key",
+        "nano",
+        "1",
+        "rules",
+        "1",
+        1,
+        "2026-01-01",
     )
 
 
@@ -29,6 +43,7 @@ def test_reflections_find_their_examples_in_plain_punctuation() -> None:
     assert found.examples.tolist() == [2]
     assert found.reflections[0].thinking == 'The car\'s brake lights... I "wait".'
     assert not found.reflections[0].judged
+    assert found.reflections[0].mend == "brake"
     assert found.told.tolist() == [[True, False]]
 
 
@@ -39,7 +54,7 @@ def test_a_mirrored_reflection_says_the_other_side() -> None:
         "Going on like this would get me stuck, so I should move to the {} lane."
     )
     left, right = (
-        Counterfactual(PLAN, text.format(side, side), plan, judged=False)
+        Counterfactual(PLAN, text.format(side, side), plan, "the expert's way", judged=False)
         for side, plan in zip(("left", "right"), plans, strict=True)
     )
     assert mirrored(left) == right

@@ -290,5 +290,5 @@ def reflection(
     """A reflection on a scene, by nobody in particular."""
     wrong, right = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n"), expert_plan(labelled)
     return LabelledReflection(
-        labelled.scene.scene_id, wrong, text, right, True, True, False, *("x",) * 5, 1, "now"
+        labelled.scene.scene_id, wrong, text, right, "the expert's", True, True, False, *("x",) * 5, 1, "now"
     )

@@ -54,6 +54,7 @@ def test_from_outcomes_to_examples(rolled: Path, generated: Path, tmp_path: Path
     assert done["plans"] == DRAWS * count
     assert done["expert_holds"] == count
     assert 0 < done["plans_hold"] < done["plans"]
+    assert 0 < sum(done["mends"].values()) <= done["plans"] - done["plans_hold"]
     kept = told("filter", build, "--outcomes", "--json")
     assert kept["scenes"] == count
     assert 0 < kept["plans"] <= done["plans"] - done["plans_hold"]
@@ -65,6 +66,8 @@ def test_from_outcomes_to_examples(rolled: Path, generated: Path, tmp_path: Path
     held = [each for each in written if not each.reflection]
     assert len(written) - len(held) == labels["done"]
     assert 0 < len(held) <= done["plans_hold"]
+    assert {bool(each.mend) for each in held} == {False}
+    assert all(each.mend for each in written if each.reflection)
     corrected = {(each.scene_id, str(each.predicted_plan)) for each in written if each.reflection}
     assert corrected.isdisjoint({(each.scene_id, str(each.predicted_plan)) for each in held})
 
