@@ -17,6 +17,7 @@ from looktwice.clients.labelling.ledger import Ledger, StageRun
 from looktwice.clients.labelling.pipeline import StageLimits, StageStopped, Tally
 from looktwice.clients.labelling.rollout import key_of, unpacked
 from looktwice.clients.metadrive.outcomes import (
+    DescribedPilot,
     EpisodeSetting,
     FollowTask,
     Moment,
@@ -75,6 +76,7 @@ def follow_all(
     workers: int,
     limits: StageLimits = StageLimits(),
     on_progress: Callable[[Tally], None] = lambda _: None,
+    makes: Callable[[], DescribedPilot] | None = None,
 ) -> Tally:
     """Follow the free draws of every rolled-out scene, and enter what comes of them.
 
@@ -86,9 +88,10 @@ def follow_all(
         workers: processes.
         limits: ``at_most`` and ``max_error_rate`` count here.
         on_progress: told after every scene.
+        makes: the model that drove when the scenes were made, where it was not the expert.
 
     Raises:
-        ReplayError: these scenes' worlds cannot be made again.
+        ReplayError: these scenes' worlds cannot be made again, or another model drove.
         StageStopped: too many errors, or a process died; what is entered stays.
     """
     setting = setting_of(scenes)
@@ -101,7 +104,7 @@ def follow_all(
             yield [work.task for work in episode]
 
     try:
-        for scene_id, found in follow_episodes(episodes(), setting, workers):
+        for scene_id, found in follow_episodes(episodes(), setting, workers, makes):
             faults += _enter(ledger, run, works.pop(scene_id), found, tally)
             on_progress(tally)
             count = tally.done + tally.dead

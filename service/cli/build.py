@@ -116,6 +116,11 @@ def outcomes(
         Path, typer.Argument(help="Generated scenes, with their manifest: a file or a folder.")
     ],
     workers: Annotated[int, typer.Option(help="Processes that follow plans.", min=1)] = 2,
+    small: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the small planner that drove when these scenes were generated, if any."),
+    ] = None,
+    by_pictures: Annotated[bool, typer.Option(help="It drove by what it read in pictures.")] = False,
     max_error_rate: MaxErrorRate = 0.1,
     retry_dead: RetryDead = False,
     limit: Limit = None,
@@ -129,7 +134,9 @@ def outcomes(
     from looktwice.clients.labelling.build_outcomes import Followed, config_of
     from looktwice.clients.labelling.follow import follow_all
     from looktwice.clients.labelling.pipeline import StageLimits
+    from looktwice.service.cli.small_pilot import SmallPilot
 
+    makes = None if small is None else partial(SmallPilot, small, by_pictures=by_pictures)
     limits = StageLimits(max_error_rate=max_error_rate, at_most=dry_run or limit)
     counts: dict[str, Any] = {}
 
@@ -140,7 +147,7 @@ def outcomes(
             ledger.forget_dead(begun)
         total = None if limits.at_most else min(ledger.count(rollout), scenes_in(scenes))
         with progress_bar(begun, total, quiet=as_json) as show:
-            tally = follow_all(ledger, begun, rollout, scenes, workers, limits, show)
+            tally = follow_all(ledger, begun, rollout, scenes, workers, limits, show, makes)
         found = [Followed.of(entry.record) for entry in ledger.entries(begun)]
         plans = [plan for each in found for plan in each.plans]
         counts.update(

@@ -249,8 +249,7 @@ def write_block(
     teacher: Callable[[], Pilot] | None = None,
 ) -> None:
     """Generate one block in this process and put its file in place."""
-    cameras = FRONT_CAMERAS + (SURROUND_CAMERAS if config.surround else ())
-    rig = Rig(tuple(camera.resized(config.width_px) for camera in cameras)) if config.pictures else None
+    rig = rig_of(config)
     scenes: list[LabelledScene] = []
     outcomes: list[EpisodeOutcome] = []
     driver, taught_by = (None if make is None else make() for make in (pilot, teacher))
@@ -262,6 +261,12 @@ def write_block(
         rig.close()
     described = json.dumps([asdict(outcome) for outcome in outcomes])
     write_scenes(block_file(out_dir, seeds), scenes, {_EPISODES_KEY: described})
+
+
+def rig_of(config: GenerateConfig) -> Rig | None:
+    """The cameras that look; None where nothing is seen."""
+    cameras = FRONT_CAMERAS + (SURROUND_CAMERAS if config.surround else ())
+    return Rig(tuple(camera.resized(config.width_px) for camera in cameras)) if config.pictures else None
 
 
 class _EpisodeScenes(NamedTuple):
@@ -310,11 +315,16 @@ def _of_pilot(
     seed: int, pilot: Pilot, rig: Rig | None, config: GenerateConfig, teacher: Pilot | None
 ) -> _EpisodeScenes:
     every = max(1, round(config.stride_s / DriveConfig().replan_s))
-    driver = Careless(pilot, seed) if config.careless else pilot
     scenes, drove = own_states(
-        seed, driver, rig, DriveConfig(config.duration_s), every, teacher, hazards=config.hazards
+        *(seed, pilot_of(config, pilot, seed), rig, DriveConfig(config.duration_s), every, teacher),
+        hazards=config.hazards,
     )
     return _EpisodeScenes(scenes, drove.ended, "", drove.plans // every)
+
+
+def pilot_of(config: GenerateConfig, pilot: Pilot, seed: int) -> Pilot:
+    """Who drives an episode: a pilot as it is, or careless."""
+    return Careless(pilot, seed) if config.careless else pilot
 
 
 def write_manifest(out_dir: Path, config: GenerateConfig) -> dict[str, Any]:

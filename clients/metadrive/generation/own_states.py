@@ -10,6 +10,7 @@ may be the teacher in the expert's place (https://arxiv.org/abs/1912.12294); the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -55,11 +56,22 @@ def own_states(
         MapError: no map fits the seed.
         PlannerError: the pilot's service does not answer.
     """
-    if hazards:
-        config = replace(config, hazards=MANY)
     states = _States(every, teacher, hazards)
-    drove = drive(seed, pilot, rig, config, on_plan=states.meet, look=rig is not None)
-    return states.labelled, drove
+    return states.labelled, drive_among(seed, pilot, rig, config, states.meet, hazards=hazards)
+
+
+def drive_among(
+    seed: int,
+    pilot: Pilot,
+    rig: Rig | None,
+    config: DriveConfig,
+    meet: Callable[[EpisodeWorld, Scene], None],
+    *,
+    hazards: bool,
+) -> Drive:
+    """Let a pilot drive an episode, among many hazards or the usual ones, and ``meet`` each of its plans."""
+    among = replace(config, hazards=MANY) if hazards else config
+    return drive(seed, pilot, rig, among, on_plan=meet, look=rig is not None)
 
 
 @dataclass

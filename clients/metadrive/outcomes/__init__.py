@@ -1,6 +1,7 @@
 """What comes of plans, in the worlds of generated scenes. A door: others import from here."""
 
 from looktwice.clients.metadrive.outcomes.replayed_worlds import (
+    DescribedPilot,
     EpisodeSetting,
     FollowTask,
     Moment,
@@ -14,6 +15,7 @@ from looktwice.clients.metadrive.result_store import ResultStore
 from looktwice.clients.metadrive.world.fork import Forked, fork_along, fork_expert
 
 __all__ = [
+    "DescribedPilot",
     "EpisodeSetting",
     "FollowTask",
     "Forked",

@@ -8,22 +8,31 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 import shapely
 
 from looktwice.clients.metadrive import simulator
-from looktwice.clients.metadrive.generation.blocks import GENERATOR_VERSION, GenerateConfig
+from looktwice.clients.metadrive.closed_loop import DriveConfig, Pilot
+from looktwice.clients.metadrive.drawing.rig import Rig
+from looktwice.clients.metadrive.generation.blocks import (
+    GENERATOR_VERSION,
+    GenerateConfig,
+    pilot_of,
+    rig_of,
+)
+from looktwice.clients.metadrive.generation.own_states import drive_among
 from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes, outcomes_at
 from looktwice.clients.metadrive.scenes.windows import history_at
 from looktwice.clients.metadrive.world.episode import EpisodeWorld, worlds_of_episode
 from looktwice.clients.metadrive.world.fork import fork_expert
 from looktwice.clients.metadrive.world.maps import MapError
-from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene import LabelledScene, Scene
 from looktwice.model.driving.scene_store import MANIFEST
 from looktwice.model.driving.trajectory import FloatArray
 
@@ -36,13 +45,60 @@ class ReplayError(ValueError):
     """Scenes whose worlds cannot be made again; the text says why."""
 
 
+class DescribedPilot(Pilot, Protocol):
+    """A pilot that tells its name and revision, as manifests do."""
+
+    @property
+    def described(self) -> str:
+        """Both."""
+        ...
+
+
 @dataclass(frozen=True)
 class EpisodeSetting:
-    """What decides an episode besides its seed; see `run_episode` of the world."""
+    """What decides an episode besides its seed; see `GenerateConfig`.
+
+    ``driver`` is the name and revision of the model that drove in the expert's place, None for the expert.
+    """
 
     duration_s: float
     drifts: bool
     lapses: bool
+    driver: str | None = None
+    careless: bool = False
+    hazards: bool = False
+    width_px: int = 0
+
+    @property
+    def config(self) -> GenerateConfig:
+        """Of the generator, as far as it decides an episode."""
+        return GenerateConfig(**asdict(self), pictures=self.width_px > 0, dense=False)
+
+
+class EpisodeDriver:
+    """Who drives in the expert's place when worlds are made again.
+
+    Args:
+        setting: of the episodes.
+        makes: the model; None where the expert drives.
+
+    Raises:
+        ReplayError: another model drove.
+    """
+
+    def __init__(self, setting: EpisodeSetting, makes: Callable[[], DescribedPilot] | None) -> None:
+        self.setting, self.pilot = setting, None if makes is None else makes()
+        drives = None if self.pilot is None else self.pilot.described
+        if drives != setting.driver:
+            raise ReplayError(
+                f"{setting.driver or 'the expert'} drove these episodes, not {drives or 'the expert'}: "
+                "name the folder of whoever drove (--small, --by-pictures)"
+            )
+
+    @cached_property
+    def rig(self) -> Rig | None:
+        """The cameras that it looks through."""
+        return None if self.pilot is None else rig_of(self.setting.config)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,14 +180,18 @@ def setting_of(scenes: Path) -> EpisodeSetting:
             f"{manifest.parent} was made with settings unknown here: {', '.join(sorted(unknown))}"
         )
     whole = asdict(GenerateConfig()) | config
-    if whole["driver"] is not None:
+    if whole["teacher"] is not None:
         raise ReplayError(
-            f"{manifest.parent} holds what {whole['driver']} met when it drove: "
-            "its worlds cannot be made again"
+            f"{manifest.parent} holds what {whole['teacher']} says in the expert's place: nothing can be "
+            "judged by that"
         )
     if whole["speeds"]:
         raise ReplayError(f"{manifest.parent} holds scenes at other speeds than were driven")
-    return EpisodeSetting(whole["duration_s"], whole["drifts"], whole["lapses"])
+    common = whole["duration_s"], whole["drifts"], whole["lapses"]
+    if whole["driver"] is None:
+        return EpisodeSetting(*common)
+    width_px = whole["width_px"] if whole["pictures"] else 0
+    return EpisodeSetting(*common, whole["driver"], whole["careless"], whole["hazards"], width_px)
 
 
 def replayed(
@@ -161,30 +221,59 @@ def replayed(
 
 
 def outcomes_of_episode(
-    seed: int,
-    setting: EpisodeSetting,
-    asked: Sequence[FollowTask],
+    seed: int, setting: EpisodeSetting, asked: Sequence[FollowTask], driver: EpisodeDriver | None = None
 ) -> Iterator[tuple[str, MomentOutcomes | ReplayError]]:
     """What comes of plans at some moments of one episode, which is driven once.
 
     Args:
         seed, setting: of the episode.
         asked: moments, each with what is to be followed from it.
+        driver: whoever drove in the expert's place.
 
     Yields:
         Scene ids with how their plans fared, or why that cannot be said.
     """
+    if driver is not None and driver.pilot is not None:
+        yield from _on_the_way(seed, asked, driver, driver.pilot)
+        return
     tasks = {task.moment.scene_id: task for task in asked}
     for moment, world in replayed(seed, setting, [task.moment for task in asked]):
-        if isinstance(world, ReplayError):
-            yield moment.scene_id, world
-            continue
-        driven = fork_expert(world)
-        if not _near(driven.trajectory, moment.future):
-            yield moment.scene_id, _differs(moment)
-            continue
         task = tasks[moment.scene_id]
-        yield moment.scene_id, outcomes_at(world, task.trajectories, task.others, driven)
+        yield moment.scene_id, world if isinstance(world, ReplayError) else _outcomes(world, task)
+
+
+def _on_the_way(
+    seed: int, asked: Sequence[FollowTask], driver: EpisodeDriver, pilot: Pilot
+) -> Iterator[tuple[str, MomentOutcomes | ReplayError]]:
+    """The same where a pilot drives: plans are followed while it does."""
+    waiting = {task.moment.step: task for task in asked}
+    found: list[tuple[str, MomentOutcomes | ReplayError]] = []
+    config = driver.setting.config
+
+    def meet(world: EpisodeWorld, _: Scene) -> None:
+        if (task := waiting.pop(world.now, None)) is not None:
+            found.append((task.moment.scene_id, _met(world, task)))
+
+    drives = DriveConfig(config.duration_s)
+    try:
+        drive_among(seed, pilot_of(config, pilot, seed), driver.rig, drives, meet, hazards=config.hazards)
+        ended = "its episode ended before, when made again"
+    except (MapError, shapely.errors.GEOSException) as error:
+        ended = f"no map is made of seed {seed}: {error}"
+    yield from found
+    for task in waiting.values():
+        yield task.moment.scene_id, ReplayError(f"scene {task.moment.scene_id}: {ended}")
+
+
+def _met(world: EpisodeWorld, task: FollowTask) -> MomentOutcomes | ReplayError:
+    return _outcomes(world, task) if _is_same(world, task.moment) else _differs(task.moment)
+
+
+def _outcomes(world: EpisodeWorld, task: FollowTask) -> MomentOutcomes | ReplayError:
+    driven = fork_expert(world)
+    if not _near(driven.trajectory, task.moment.future):
+        return _differs(task.moment)
+    return outcomes_at(world, task.trajectories, task.others, driven)
 
 
 def _is_same(world: EpisodeWorld, moment: Moment) -> bool:

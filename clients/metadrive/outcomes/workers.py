@@ -5,12 +5,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import Final
 
 from looktwice.clients.metadrive.outcomes.replayed_worlds import (
+    DescribedPilot,
+    EpisodeDriver,
     EpisodeSetting,
     FollowTask,
     ReplayError,
@@ -27,7 +29,10 @@ class WorkerDied(RuntimeError):
 
 
 def follow_episodes(
-    episodes: Iterator[Sequence[FollowTask]], setting: EpisodeSetting, workers: int
+    episodes: Iterator[Sequence[FollowTask]],
+    setting: EpisodeSetting,
+    workers: int,
+    makes: Callable[[], DescribedPilot] | None = None,
 ) -> Iterator[tuple[str, MomentOutcomes | str]]:
     """Follow plans in so many processes; they end with this one, however it ends.
 
@@ -35,18 +40,22 @@ def follow_episodes(
         episodes: each what is asked of one episode; taken as they are needed.
         setting: of all of them.
         workers: processes.
+        makes: whoever drove in the expert's place; called in every process.
 
     Yields:
         Scene ids as their episodes are done, with how their plans fared or why that cannot be said.
 
     Raises:
+        ReplayError: another one drove.
         WorkerDied: see there.
     """
+    EpisodeDriver(setting, makes)  # before any process begins
     begun: set[Future[list[tuple[str, MomentOutcomes | str]]]] = set()
     with ProcessPoolExecutor(
         workers,
         multiprocessing.get_context("spawn"),
-        initializer=_end_with_parent,
+        initializer=_begin,
+        initargs=(setting, makes),
         max_tasks_per_child=_EPISODES_A_PROCESS,
     ) as pool:
         try:
@@ -72,8 +81,17 @@ def _follow_episode(
     """One episode in a process of its own; what cannot be followed is told as text."""
     return [
         (scene_id, str(found) if isinstance(found, ReplayError) else found)
-        for scene_id, found in outcomes_of_episode(asked[0].moment.seed, setting, asked)
+        for scene_id, found in outcomes_of_episode(asked[0].moment.seed, setting, asked, _drivers[0])
     ]
+
+
+_drivers: Final[list[EpisodeDriver]] = []
+"""The one of this process."""
+
+
+def _begin(setting: EpisodeSetting, makes: Callable[[], DescribedPilot] | None) -> None:
+    _end_with_parent()
+    _drivers.append(EpisodeDriver(setting, makes))
 
 
 def _end_with_parent() -> None:

@@ -15,9 +15,22 @@ from typer.testing import CliRunner
 from looktwice.clients.metadrive.closed_loop.drives import TAKE_OVER, DriveConfig
 from looktwice.clients.metadrive.closed_loop.pilots import Careless, ConstantVelocity, Planned
 from looktwice.clients.metadrive.drawing.rig import Rig
-from looktwice.clients.metadrive.generation.blocks import GenerateConfig, GenerationError, generate, run_seed
+from looktwice.clients.metadrive.generation.blocks import (
+    GenerateConfig,
+    GenerationError,
+    generate,
+    run_seed,
+    write_manifest,
+)
 from looktwice.clients.metadrive.generation.own_states import own_states
-from looktwice.clients.metadrive.outcomes.replayed_worlds import ReplayError, setting_of
+from looktwice.clients.metadrive.outcomes.replayed_worlds import (
+    EpisodeDriver,
+    FollowTask,
+    Moment,
+    ReplayError,
+    outcomes_of_episode,
+    setting_of,
+)
 from looktwice.model.bundled import CHECKPOINT
 from looktwice.model.driving.facts import hazard_ahead
 from looktwice.model.driving.labeller import expert_plan
@@ -145,7 +158,46 @@ def test_a_served_model_s_own_drives_become_scenes(tmp_path: Path) -> None:
     for labelled in scenes:
         for clip in labelled.scene.clips:
             assert {Image.open(io.BytesIO(image)).size for image in clip.images} == {(112, 56)}
-    with pytest.raises(ReplayError, match="what scripted 1 met"):
+    with pytest.raises(ReplayError, match="scripted 1 drove these episodes, not the expert"):
+        EpisodeDriver(setting_of(tmp_path), None)
+
+
+class Steady(ConstantVelocity):
+    """Says what manifests call it."""
+
+    described = "constant velocity 1"
+
+
+def test_plans_are_followed_in_the_worlds_that_a_pilot_met(tmp_path: Path) -> None:
+    config = GenerateConfig(
+        stride_s=2.0, duration_s=9.0, dense=False, pictures=False, driver=Steady.described
+    )
+    write_manifest(tmp_path, config)
+    states, _ = own_states(SEED, Steady(), config=DriveConfig(config.duration_s), every=4)
+    moments = [Moment.of(labelled) for labelled in states]
+    assert len(moments) >= 2
+    last = moments[-1]
+    elsewhere = replace(last, history=last.history + np.float32(0.1))
+    late = replace(last, scene_id="late", step=5000)
+    asked = [FollowTask(moment, [moment.future]) for moment in (*moments[:-1], elsewhere, late)]
+    driver = EpisodeDriver(setting_of(tmp_path), Steady)
+    *found, moved, missed = outcomes_of_episode(SEED, driver.setting, asked, driver)
+    assert [scene_id for scene_id, _ in found] == [moment.scene_id for moment in moments[:-1]]
+    for _, outcomes in found:
+        assert not isinstance(outcomes, ReplayError)
+        assert outcomes.plans == (outcomes.expert,)
+    assert moved[0] == last.scene_id
+    assert "otherwise" in str(moved[1])
+    assert missed[0] == late.scene_id
+    assert "ended before" in str(missed[1])
+
+
+def test_a_teacher_s_scenes_have_no_outcomes(tmp_path: Path) -> None:
+    config = GenerateConfig(
+        stride_s=2.0, duration_s=8.0, dense=False, pictures=False, driver="me 1", teacher="teacher 2"
+    )
+    write_manifest(tmp_path, config)
+    with pytest.raises(ReplayError, match="what teacher 2 says in the expert's place"):
         setting_of(tmp_path)
 
 
