@@ -1,7 +1,7 @@
 """What comes of plans, in the worlds of generated scenes. A door: others import from here."""
 
+from looktwice.clients.metadrive.generation.redrive import DescribedPilot
 from looktwice.clients.metadrive.outcomes.replayed_worlds import (
-    DescribedPilot,
     EpisodeSetting,
     FollowTask,
     Moment,

@@ -10,23 +10,15 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
-from functools import cached_property
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 import shapely
 
 from looktwice.clients.metadrive import simulator
-from looktwice.clients.metadrive.closed_loop import DriveConfig, Pilot
-from looktwice.clients.metadrive.drawing.rig import Rig
-from looktwice.clients.metadrive.generation.blocks import (
-    GENERATOR_VERSION,
-    GenerateConfig,
-    pilot_of,
-    rig_of,
-)
-from looktwice.clients.metadrive.generation.own_states import drive_among
+from looktwice.clients.metadrive.generation.blocks import GENERATOR_VERSION, GenerateConfig
+from looktwice.clients.metadrive.generation.redrive import DescribedPilot, Redriver
 from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes, outcomes_at
 from looktwice.clients.metadrive.scenes.windows import history_at
 from looktwice.clients.metadrive.world.episode import EpisodeWorld, worlds_of_episode
@@ -43,15 +35,6 @@ _SCENE_ID: Final = re.compile(r"(\d{6})-(\d{4})")
 
 class ReplayError(ValueError):
     """Scenes whose worlds cannot be made again; the text says why."""
-
-
-class DescribedPilot(Pilot, Protocol):
-    """A pilot that tells its name and revision, as manifests do."""
-
-    @property
-    def described(self) -> str:
-        """Both."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -75,30 +58,24 @@ class EpisodeSetting:
         return GenerateConfig(**asdict(self), pictures=self.width_px > 0, dense=False)
 
 
-class EpisodeDriver:
-    """Who drives in the expert's place when worlds are made again.
+def redriver(setting: EpisodeSetting, makes: Callable[[], DescribedPilot] | None) -> Redriver | None:
+    """Who drives in the expert's place when worlds are made again; None for the expert.
 
     Args:
         setting: of the episodes.
         makes: the model; None where the expert drives.
 
     Raises:
-        ReplayError: another model drove.
+        ReplayError: another one drove.
     """
-
-    def __init__(self, setting: EpisodeSetting, makes: Callable[[], DescribedPilot] | None) -> None:
-        self.setting, self.pilot = setting, None if makes is None else makes()
-        drives = None if self.pilot is None else self.pilot.described
-        if drives != setting.driver:
-            raise ReplayError(
-                f"{setting.driver or 'the expert'} drove these episodes, not {drives or 'the expert'}: "
-                "name the folder of whoever drove (--small, --by-pictures)"
-            )
-
-    @cached_property
-    def rig(self) -> Rig | None:
-        """The cameras that it looks through."""
-        return None if self.pilot is None else rig_of(self.setting.config)
+    pilot = None if makes is None else makes()
+    drives = None if pilot is None else pilot.described
+    if drives != setting.driver:
+        raise ReplayError(
+            f"{setting.driver or 'the expert'} drove these episodes, not {drives or 'the expert'}: "
+            "name the folder of whoever drove (--small, --by-pictures)"
+        )
+    return None if pilot is None else Redriver(setting.config, pilot)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +198,7 @@ def replayed(
 
 
 def outcomes_of_episode(
-    seed: int, setting: EpisodeSetting, asked: Sequence[FollowTask], driver: EpisodeDriver | None = None
+    seed: int, setting: EpisodeSetting, asked: Sequence[FollowTask], driver: Redriver | None = None
 ) -> Iterator[tuple[str, MomentOutcomes | ReplayError]]:
     """What comes of plans at some moments of one episode, which is driven once.
 
@@ -233,8 +210,8 @@ def outcomes_of_episode(
     Yields:
         Scene ids with how their plans fared, or why that cannot be said.
     """
-    if driver is not None and driver.pilot is not None:
-        yield from _on_the_way(seed, asked, driver, driver.pilot)
+    if driver is not None:
+        yield from _on_the_way(seed, asked, driver)
         return
     tasks = {task.moment.scene_id: task for task in asked}
     for moment, world in replayed(seed, setting, [task.moment for task in asked]):
@@ -243,21 +220,19 @@ def outcomes_of_episode(
 
 
 def _on_the_way(
-    seed: int, asked: Sequence[FollowTask], driver: EpisodeDriver, pilot: Pilot
+    seed: int, asked: Sequence[FollowTask], driver: Redriver
 ) -> Iterator[tuple[str, MomentOutcomes | ReplayError]]:
     """The same where a pilot drives: plans are followed while it does."""
     waiting = {task.moment.step: task for task in asked}
     found: list[tuple[str, MomentOutcomes | ReplayError]] = []
-    config = driver.setting.config
 
     def meet(world: EpisodeWorld, _: Scene) -> None:
         if (task := waiting.pop(world.now, None)) is not None:
             found.append((task.moment.scene_id, _met(world, task)))
 
-    drives = DriveConfig(config.duration_s)
+    ended = "its episode ended before, when made again"
     try:
-        drive_among(seed, pilot_of(config, pilot, seed), driver.rig, drives, meet, hazards=config.hazards)
-        ended = "its episode ended before, when made again"
+        driver.drive(seed, meet)
     except (MapError, shapely.errors.GEOSException) as error:
         ended = f"no map is made of seed {seed}: {error}"
     yield from found

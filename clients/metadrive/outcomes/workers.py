@@ -10,13 +10,13 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from typing import Final
 
+from looktwice.clients.metadrive.generation.redrive import DescribedPilot, Redriver
 from looktwice.clients.metadrive.outcomes.replayed_worlds import (
-    DescribedPilot,
-    EpisodeDriver,
     EpisodeSetting,
     FollowTask,
     ReplayError,
     outcomes_of_episode,
+    redriver,
 )
 from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes
 
@@ -49,7 +49,7 @@ def follow_episodes(
         ReplayError: another one drove.
         WorkerDied: see there.
     """
-    EpisodeDriver(setting, makes)  # before any process begins
+    redriver(setting, makes)  # before any process begins
     begun: set[Future[list[tuple[str, MomentOutcomes | str]]]] = set()
     with ProcessPoolExecutor(
         workers,
@@ -85,13 +85,13 @@ def _follow_episode(
     ]
 
 
-_drivers: Final[list[EpisodeDriver]] = []
+_drivers: Final[list[Redriver | None]] = []
 """The one of this process."""
 
 
 def _begin(setting: EpisodeSetting, makes: Callable[[], DescribedPilot] | None) -> None:
     _end_with_parent()
-    _drivers.append(EpisodeDriver(setting, makes))
+    _drivers.append(redriver(setting, makes))
 
 
 def _end_with_parent() -> None:

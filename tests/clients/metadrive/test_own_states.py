@@ -24,11 +24,11 @@ from looktwice.clients.metadrive.generation.blocks import (
 )
 from looktwice.clients.metadrive.generation.own_states import own_states
 from looktwice.clients.metadrive.outcomes.replayed_worlds import (
-    EpisodeDriver,
     FollowTask,
     Moment,
     ReplayError,
     outcomes_of_episode,
+    redriver,
     setting_of,
 )
 from looktwice.model.bundled import CHECKPOINT
@@ -159,7 +159,7 @@ def test_a_served_model_s_own_drives_become_scenes(tmp_path: Path) -> None:
         for clip in labelled.scene.clips:
             assert {Image.open(io.BytesIO(image)).size for image in clip.images} == {(112, 56)}
     with pytest.raises(ReplayError, match="scripted 1 drove these episodes, not the expert"):
-        EpisodeDriver(setting_of(tmp_path), None)
+        redriver(setting_of(tmp_path), None)
 
 
 class Steady(ConstantVelocity):
@@ -180,8 +180,8 @@ def test_plans_are_followed_in_the_worlds_that_a_pilot_met(tmp_path: Path) -> No
     elsewhere = replace(last, history=last.history + np.float32(0.1))
     late = replace(last, scene_id="late", step=5000)
     asked = [FollowTask(moment, [moment.future]) for moment in (*moments[:-1], elsewhere, late)]
-    driver = EpisodeDriver(setting_of(tmp_path), Steady)
-    *found, moved, missed = outcomes_of_episode(SEED, driver.setting, asked, driver)
+    setting = setting_of(tmp_path)
+    *found, moved, missed = outcomes_of_episode(SEED, setting, asked, redriver(setting, Steady))
     assert [scene_id for scene_id, _ in found] == [moment.scene_id for moment in moments[:-1]]
     for _, outcomes in found:
         assert not isinstance(outcomes, ReplayError)
