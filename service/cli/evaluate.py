@@ -211,13 +211,14 @@ def _outcomes(
     quiet: bool,
 ) -> tuple[dict[str, Any], str]:
     """What comes of first plans and of second looks, as JSON and as text."""
-    from looktwice.clients.metadrive.outcomes import Moment, setting_of
+    from looktwice.clients.metadrive.outcomes import Moment, redriver, setting_of
     from looktwice.model.evaluation.report import evaluate_variants
     from looktwice.model.families.registry import family_named
     from looktwice.service.cli.outcomes import follow_pairs, outcome_pairs
 
     # What cannot be followed is refused before anything is planned.
     setting = setting_of(folder)
+    redriver(setting, None)
     for each in scenes:
         Moment.of(each)
     format = next((each for each in engine.card.formats if family_named(each).looks_twice), None)

@@ -6,6 +6,7 @@ from looktwice.clients.metadrive.outcomes.replayed_worlds import (
     FollowTask,
     Moment,
     ReplayError,
+    redriver,
     setting_of,
 )
 from looktwice.clients.metadrive.outcomes.store import outcome_key, outcome_store
@@ -29,5 +30,6 @@ __all__ = [
     "fork_expert",
     "outcome_key",
     "outcome_store",
+    "redriver",
     "setting_of",
 ]

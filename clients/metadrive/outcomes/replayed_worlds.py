@@ -73,7 +73,7 @@ def redriver(setting: EpisodeSetting, makes: Callable[[], DescribedPilot] | None
     if drives != setting.driver:
         raise ReplayError(
             f"{setting.driver or 'the expert'} drove these episodes, not {drives or 'the expert'}: "
-            "name the folder of whoever drove (--small, --by-pictures)"
+            "whoever drove has to drive again"
         )
     return None if pilot is None else Redriver(setting.config, pilot)
 

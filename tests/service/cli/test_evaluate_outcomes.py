@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 
 from looktwice.clients.metadrive.outcomes import outcome_store
 from looktwice.model.bundled import SCENES
+from looktwice.model.driving.scene_store import MANIFEST
 from looktwice.service.cli import outcomes
 from looktwice.service.cli.commands import app
 
@@ -69,5 +71,15 @@ def test_what_second_looks_bring(generated: Path, tmp_path: Path, monkeypatch: p
     assert never["think_outcome_auc"] == route["think_outcome_auc"]
 
 
-def test_scenes_without_a_world_are_refused_before_anything_is_planned() -> None:
+def test_scenes_without_a_world_are_refused_before_anything_is_planned(
+    generated: Path, tmp_path: Path
+) -> None:
     assert "imported and bundled ones have none" in ran("--scenes", SCENES, code=2)
+    driven = tmp_path / "driven"
+    shutil.copytree(generated, driven)
+    manifest = json.loads((driven / MANIFEST).read_text())
+    manifest["config"]["driver"] = "pictures 1"
+    (driven / MANIFEST).write_text(json.dumps(manifest))
+    assert "pictures 1 drove these episodes, not the expert" in " ".join(
+        ran("--scenes", driven, code=2).split()
+    )
