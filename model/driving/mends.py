@@ -105,11 +105,9 @@ def groups_of(mend: Mend) -> frozenset[Group]:
 def mend_within(mend: Mend, groups: frozenset[Group]) -> Mend | None:
     """What is left of a mend if only some tracks may change; None where nothing is."""
     left = groups_of(mend) & groups
-    if mend != "the expert's":
-        return mend if left else None
-    pace, way = left & groups_of("the expert's pace"), left & groups_of("the expert's way")
-    if pace and way:
-        return mend
-    if pace:
-        return "the expert's pace"
-    return "the expert's way" if way else None
+    if mend == "the expert's" and left:
+        if "longitudinal" not in left:
+            return "the expert's way"
+        if left == {"longitudinal"}:
+            return "the expert's pace"
+    return mend if left else None
