@@ -14,12 +14,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.facts import facts_of
+from looktwice.model.driving.scene import Scene, SceneError
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.network.checkpoint import Loaded, load
 from looktwice.model.network.fact_reader import likely, weighed
 from looktwice.model.network.precision import bfloat16_is_fast
 from looktwice.model.network.small_planner import SmallPlanner, SmallPlannerError, motion_of
+
+
+def true_facts(scene: Scene) -> FloatArray:
+    """float32 [len(FACTS)] of a scene with a route and tracks; raises `SceneError` for another one."""
+    if scene.route is None or scene.tracks is None:
+        raise SceneError(f"scene {scene.scene_id} lacks its route or its tracks, which tell the facts")
+    return facts_of(scene.tracks, scene.route)
 
 
 class ReadingPlanner:
@@ -56,6 +64,14 @@ class ReadingPlanner:
             SceneError: a scene has no route, or pictures that the checkpoint does not take.
         """
         return self._planner.plan(scenes, weighed(read_pictures(self._loaded, scenes)))
+
+    def plan_by_facts(self, scenes: Sequence[Scene]) -> FloatArray:
+        """The same, told the true facts in the place of those that are read.
+
+        Raises:
+            SceneError: a scene has no route, or no tracks to tell the facts by.
+        """
+        return self._planner.plan(scenes, weighed(torch.from_numpy(np.stack([*map(true_facts, scenes)]))))
 
 
 @torch.inference_mode()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from looktwice.service.cli.options import Json, reported_errors
+from looktwice.service.cli.options import Json, SmallBy, reported_errors
 from looktwice.service.cli.stages import do_jobs, progress_bar, report_run, run_stage, scenes_in
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def outcomes(
         Path | None,
         typer.Option(help="Folder of the small planner that drove when these scenes were generated, if any."),
     ] = None,
-    by_pictures: Annotated[bool, typer.Option(help="It drove by what it read in pictures.")] = False,
+    by: SmallBy = "tracks",
     max_error_rate: MaxErrorRate = 0.1,
     retry_dead: RetryDead = False,
     limit: Limit = None,
@@ -136,7 +136,7 @@ def outcomes(
     from looktwice.clients.labelling.pipeline import StageLimits
     from looktwice.service.cli.small_pilot import SmallPilot
 
-    makes = None if small is None else partial(SmallPilot, small, by_pictures=by_pictures)
+    makes = None if small is None else partial(SmallPilot, small, by)
     limits = StageLimits(max_error_rate=max_error_rate, at_most=dry_run or limit)
     counts: dict[str, Any] = {}
 

@@ -10,7 +10,7 @@ from typing import Annotated, Final, cast
 
 import typer
 
-from looktwice.service.cli.options import Json, reported_errors
+from looktwice.service.cli.options import Json, SmallBy, reported_errors
 
 SERVICE_DRIVERS: Final = ("adaptive", "never", "always")
 DRIVERS: Final = ("expert", "constant-velocity", *SERVICE_DRIVERS)
@@ -41,10 +41,7 @@ def drive(
             "reader of tracks writes sketches, that drives too."
         ),
     ] = None,
-    by_pictures: Annotated[
-        bool,
-        typer.Option(help="--small is a checkpoint, and drives by what it reads in pictures, not by tracks."),
-    ] = False,
+    by: SmallBy = "tracks",
     keep: Annotated[
         Path | None, typer.Option(help="File that keeps every drive: started again, it goes on behind them.")
     ] = None,
@@ -52,8 +49,8 @@ def drive(
     as_json: Json = False,
 ) -> None:
     """Drive closed loop, planning anew every half second; expert and constant velocity are the limits."""
-    if by_pictures and not small:
-        raise typer.BadParameter("it is for --small", param_hint="--by-pictures")
+    if by != "tracks" and not small:
+        raise typer.BadParameter("it is for --small", param_hint="--by")
     if gif is not None and gif.suffix.lower() != ".gif":
         raise typer.BadParameter(f"{gif} does not end in .gif", param_hint="--gif")
     from rich.console import Console
@@ -119,10 +116,7 @@ def drive(
         return hash_of(driver, seed, seconds, asked, route, tracks, models, width_px, *formats)
 
     with reported_errors():
-        small_pilots = {
-            pilot.name: pilot
-            for pilot in (SmallPilot(folder, by_pictures=by_pictures) for folder in small or ())
-        }
+        small_pilots = {pilot.name: pilot for pilot in (SmallPilot(folder, by) for folder in small or ())}
     wanted = [*(drivers or ([] if small else DRIVERS[:-1])), *small_pilots]
     asks = any(driver in SERVICE_DRIVERS for driver in wanted)
     if unknown := set(drivers or ()) - set(DRIVERS):

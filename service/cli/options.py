@@ -6,7 +6,7 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import typer
 
@@ -62,3 +62,14 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 
 DEFAULT_CHECKPOINT = CHECKPOINT
 DEFAULT_SCENES = SCENES
+
+
+SmallInput = Literal["tracks", "pictures", "facts"]
+"""What a small planner plans from."""
+SmallBy = Annotated[
+    SmallInput,
+    typer.Option(
+        help="What --small plans from: tracks of the objects around; or it is a checkpoint, and drives by "
+        "what it reads in pictures, or by the true facts in their place."
+    ),
+]

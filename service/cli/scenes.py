@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from looktwice.service.cli.options import DEFAULT_SCENES, Json, reported_errors
+from looktwice.service.cli.options import DEFAULT_SCENES, Json, SmallBy, SmallInput, reported_errors
 
 if TYPE_CHECKING:
     from looktwice.clients.importers.recording import Recording
@@ -64,10 +64,7 @@ def generate(
         Path | None,
         typer.Option(help="Folder of a small planner (`train teacher`) that drives; else as --service."),
     ] = None,
-    by_pictures: Annotated[
-        bool,
-        typer.Option(help="--small is a checkpoint, and drives by what it reads in pictures, not by tracks."),
-    ] = False,
+    by: SmallBy = "tracks",
     tracks: Annotated[bool, typer.Option(help="Tell that model the tracks of the objects around.")] = False,
     careless: Annotated[
         bool,
@@ -95,12 +92,14 @@ def generate(
     with reported_errors():
         from looktwice.clients.metadrive.generation import GenerateConfig, generate
 
-        if careless and (small is None or by_pictures):
-            raise ValueError("--careless is for --small, where it plans from tracks")
-        if by_pictures and (small is None or not pictures):
-            raise ValueError("--by-pictures is for --small, and needs pictures")
-        driver, pilot = _driver(service, small, by_pictures=by_pictures, tracks=tracks, pictures=pictures)
-        says, taught_by = _driver(None, teacher, by_pictures=False, tracks=True, pictures=False)
+        if careless and (small is None or by == "pictures"):
+            raise ValueError("--careless is for --small, where it plans from tracks or facts")
+        if by != "tracks" and small is None:
+            raise ValueError("--by is for --small")
+        if by == "pictures" and not pictures:
+            raise ValueError("--by pictures needs pictures")
+        driver, pilot = _driver(service, small, by=by, tracks=tracks, pictures=pictures)
+        says, taught_by = _driver(None, teacher, by="tracks", tracks=True, pictures=False)
         if says is not None and not says.startswith("teacher "):
             raise ValueError(
                 f"--teacher has to plan from tracks, and {teacher} holds a planner that does not"
@@ -127,7 +126,7 @@ def generate(
 
 
 def _driver(
-    service: str | None, small: Path | None, *, by_pictures: bool, tracks: bool, pictures: bool
+    service: str | None, small: Path | None, *, by: SmallInput, tracks: bool, pictures: bool
 ) -> tuple[str | None, Callable[[], Pilot] | None]:
     """Who drives in the expert's place, with revision, and what makes it in a worker; None for nobody."""
     from looktwice.clients.planner import Access, PlannerClient
@@ -136,7 +135,7 @@ def _driver(
     if service is not None and small is not None:
         raise ValueError("either --service or --small drives, not both")
     if small is not None:
-        makes = partial(SmallPilot, small, by_pictures=by_pictures)
+        makes = partial(SmallPilot, small, by)
         return makes().described, makes
     if service is None:
         return None, None

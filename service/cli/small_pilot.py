@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from looktwice.clients.metadrive.closed_loop import Planned
 from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.network.reading_planner import ReadingPlanner
-from looktwice.model.network.small_planner import SmallPlanner, load_small, small_revision
+from looktwice.model.network.small_planner import load_small, small_revision
+from looktwice.service.cli.options import SmallInput
 
 
 class SmallPilot:
@@ -18,21 +21,24 @@ class SmallPilot:
 
     Args:
         folder: of the planner, or of a checkpoint whose small planners sketch.
-        by_pictures: the checkpoint's planner of pictures drives; else the one of tracks, without pictures.
+        by: what it plans from. By pictures and by facts the checkpoint's planner of pictures drives: by what
+            it reads in them, or by the true facts in their place; by tracks the other one.
 
     Attributes:
         width_px: of the pictures that it takes; 0 for none.
     """
 
-    def __init__(self, folder: Path, *, by_pictures: bool = False) -> None:
-        self._planner: SmallPlanner | ReadingPlanner
-        self.needs_pictures = by_pictures
-        if by_pictures:
-            self._planner, self.name = ReadingPlanner(folder), "pictures"
-            self.width_px = self._planner.width_px
+    def __init__(self, folder: Path, by: SmallInput = "tracks") -> None:
+        self._plan: Callable[[Sequence[Scene]], FloatArray]
+        self.name: str = by
+        self.needs_pictures, self.width_px = by == "pictures", 0
+        if by == "tracks":
+            planner = load_small(folder)
+            self._plan, self.name = planner.plan, planner.kind
         else:
-            self._planner, self.width_px = load_small(folder), 0
-            self.name = self._planner.kind
+            reading = ReadingPlanner(folder)
+            self._plan = reading.plan if by == "pictures" else reading.plan_by_facts
+            self.width_px = reading.width_px if by == "pictures" else 0
         self.revision = small_revision(folder)
 
     @property
@@ -43,6 +49,6 @@ class SmallPilot:
     def plan(self, scene: Scene) -> Planned:
         """See `Pilot.plan`."""
         began_s = time.perf_counter()
-        trajectory = self._planner.plan([scene])[0]
+        trajectory = self._plan([scene])[0]
         milliseconds = 1000 * (time.perf_counter() - began_s)
         return Planned(trajectory, np.zeros((0, 64, 4), np.float32), milliseconds=milliseconds)

@@ -35,9 +35,10 @@ from looktwice.model.bundled import CHECKPOINT
 from looktwice.model.driving.facts import hazard_ahead
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.metrics import collides, leaves_road
-from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.scene import Scene, SceneError
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.tracks import Track
+from looktwice.model.driving.trajectory import path_length
 from looktwice.model.network.checkpoint import load
 from looktwice.model.network.small_planner import SmallPlanner
 from looktwice.service.cli.commands import app
@@ -255,23 +256,42 @@ def test_carelessness_is_refused_where_nobody_plans_from_tracks(tmp_path: Path) 
 
 
 def test_a_small_planner_of_pictures_meets_states_of_its_own(tmp_path: Path) -> None:
-    pilot = SmallPilot(CHECKPOINT, by_pictures=True)
+    pilot = SmallPilot(CHECKPOINT, "pictures")
     assert pilot.described.startswith("pictures ")
     config = GenerateConfig(stride_s=2.0, duration_s=8.0, dense=False, driver=pilot.described)
     scenes, outcome = run_seed(4, Rig.of_width(pilot.width_px), config, pilot, SmallPilot(CHECKPOINT))
     assert outcome.scenes == len(scenes) > 0
     assert all(labelled.scene.has_pictures for labelled in scenes)
     command = ["scenes", "generate", str(tmp_path / "new"), "--first-seed", "4", "--episodes", "1"]
-    drives = ["--small", str(CHECKPOINT), "--by-pictures"]
+    drives = ["--small", str(CHECKPOINT), "--by", "pictures"]
     for refused, message in (
-        (["--by-pictures"], "--by-pictures is for --small"),
-        ([*drives, "--no-pictures"], "--by-pictures is for --small, and needs pictures"),
-        ([*drives, "--careless"], "--careless is for --small, where it plans from tracks"),
+        (["--by", "pictures"], "--by is for --small"),
+        (["--by", "facts"], "--by is for --small"),
+        ([*drives, "--no-pictures"], "--by pictures needs pictures"),
+        ([*drives, "--careless"], "--careless is for --small, where it plans from tracks or facts"),
     ):
         told = CliRunner().invoke(app, [*command, "--no-dense", *refused])
         assert told.exit_code != 0
         assert message in told.output
         assert not (tmp_path / "new").exists()
+
+
+def test_the_planner_of_pictures_drives_by_true_facts_too() -> None:
+    pilot = SmallPilot(CHECKPOINT, "facts")
+    assert pilot.described.startswith("facts ")
+    assert not pilot.needs_pictures
+    states, drove = own_states(SEED, pilot, config=CONFIG, every=4)
+    assert drove.plans > 4
+    assert drove.driven_m > 30.0
+    scene = replace(states[0].scene, tracks=states[0].given(route=True, tracks=True).tracks)
+    alone = replace(scene, tracks=())
+    lead = Track(9.0, 0.0, 0.0, 0.0, 4.5, 1.9, "vehicle")
+    blocked = replace(scene, tracks=(lead,))
+    free_m, stopped_m = (path_length(pilot.plan(each).trajectory) for each in (alone, blocked))
+    assert stopped_m < 0.7 * free_m, "it heeds what it is told"
+    for lacking in (replace(scene, tracks=None), replace(scene, route=None)):
+        with pytest.raises(SceneError, match="lacks its route or its tracks"):
+            pilot.plan(lacking)
 
 
 def test_what_only_the_expert_s_drives_have_is_refused() -> None:
