@@ -315,9 +315,9 @@ def _of_pilot(
     seed: int, pilot: Pilot, rig: Rig | None, config: GenerateConfig, teacher: Pilot | None
 ) -> _EpisodeScenes:
     every = max(1, round(config.stride_s / DriveConfig().replan_s))
+    driver = pilot_of(config, pilot, seed)
     scenes, drove = own_states(
-        *(seed, pilot_of(config, pilot, seed), rig, DriveConfig(config.duration_s), every, teacher),
-        hazards=config.hazards,
+        seed, driver, rig, DriveConfig(config.duration_s), every, teacher, hazards=config.hazards
     )
     return _EpisodeScenes(scenes, drove.ended, "", drove.plans // every)
 
