@@ -44,9 +44,8 @@ def reflections(ledger: Ledger, label: StageRun, *, by_outcome: bool = False) ->
     for entry in ledger.entries(label):
         predicted, expert = (parse_plan(entry.record[f"{name}_plan"]) for name in ("predicted", "expert"))
         facts = facts_of(entry.record["reflection"])
-        mend: Mend | None = entry.record.get("mend") or "the expert's"
-        if mend is not None and facts is not None:
-            mend = mend_within(mend, facts.groups)
+        led: Mend = entry.record.get("mend") or "the expert's"
+        mend = led if facts is None else mend_within(led, facts.groups)
         yield LabelledReflection(
             scene_id=entry.scene_id,
             predicted_plan=predicted,

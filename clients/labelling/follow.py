@@ -28,7 +28,6 @@ from looktwice.clients.metadrive.outcomes import (
 )
 from looktwice.model.driving.direction import wanted_changes
 from looktwice.model.driving.hashing import hash_of
-from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.mends import MENDS, Mend, mended, mended_plan
 from looktwice.model.driving.plan import Plan, parse_plan
 from looktwice.model.driving.scene import LabelledScene
@@ -157,16 +156,17 @@ def _works(
             continue
         begun.add(key)
         trajectories = tuple(unpacked(draw["trajectory"]) for draw in entry.record["free"])
+        expert = parse_plan(entry.record["expert_plan"])
         mends = tuple(
-            tuple(_mends(labelled, parse_plan(draw["plan"]), trajectory))
+            tuple(_mends(labelled, parse_plan(draw["plan"]), trajectory, expert))
             for draw, trajectory in zip(entry.record["free"], trajectories, strict=True)
         )
         yield _Work(key, entry.key, Moment.of(labelled), trajectories, mends)
 
 
-def _mends(labelled: LabelledScene, plan: Plan, trajectory: FloatArray) -> Iterator[_Mended]:
+def _mends(labelled: LabelledScene, plan: Plan, trajectory: FloatArray, expert: Plan) -> Iterator[_Mended]:
     """The mends that a plan's words can tell, the smallest first."""
-    history, expert = labelled.scene.history, expert_plan(labelled)
+    history = labelled.scene.history
     for mend in MENDS:
         changed = mended(mend, trajectory, labelled.future, history)
         better = mended_plan(mend, plan, changed, expert, history)

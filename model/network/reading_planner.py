@@ -71,7 +71,8 @@ class ReadingPlanner:
         Raises:
             SceneError: a scene has no route, or no tracks to tell the facts by.
         """
-        return self._planner.plan(scenes, weighed(torch.from_numpy(np.stack([*map(true_facts, scenes)]))))
+        facts = torch.from_numpy(np.stack([true_facts(scene) for scene in scenes]))
+        return self._planner.plan(scenes, weighed(facts))
 
 
 @torch.inference_mode()

@@ -35,10 +35,11 @@ class SmallPilot:
         if by == "tracks":
             planner = load_small(folder)
             self._plan, self.name = planner.plan, planner.kind
+        elif by == "facts":
+            self._plan = ReadingPlanner(folder).plan_by_facts
         else:
             reading = ReadingPlanner(folder)
-            self._plan = reading.plan if by == "pictures" else reading.plan_by_facts
-            self.width_px = reading.width_px if by == "pictures" else 0
+            self._plan, self.width_px = reading.plan, reading.width_px
         self.revision = small_revision(folder)
 
     @property
