@@ -329,6 +329,14 @@ def parameters_of(model: nn.Module) -> int:
     return cast("int", sum(parameter.numel() for parameter in model.parameters()))
 
 
+def with_own_head(model: LookTwiceVla) -> None:
+    """Give the head weights of its own where it has those of the embedding, so that they may differ."""
+    model.lm_head.weight = nn.Parameter(model.lm_head.weight.detach().clone())
+    config: Any = model.config
+    for each in (config, config.text_config):
+        each.tie_word_embeddings = False
+
+
 def is_vision(name: str) -> bool:
     """Whether a weight belongs to what sees: the tower, or the resampler but for its small planner.
 

@@ -179,6 +179,20 @@ class ResponseLearner(nn.Module):
             found.append(torch.stack(each))
         return found
 
+    def states_before(self, batch: Batch, tokens: Tensor) -> Tensor:
+        """The states [responses, hidden] that predict the first of ``tokens`` in each response of a batch."""
+        parts, input_ids = batch["parts"], batch["input_ids"]
+        layout = _ResponseLayout.of(parts)
+        given = {name: batch.get(name) for name in ("history", "route", "tracks", "seen", "patches")}
+        hidden = self._hidden(layout, input_ids, parts, **given).flatten(0, 1)
+        found = torch.isin(input_ids, tokens)
+        places = [
+            int(((row == part) & there).nonzero()[0]) + number * parts.shape[1]
+            for number, (row, there) in enumerate(zip(parts, found, strict=True))
+            for part in range(1, int(row.max()) + 1)
+        ]
+        return hidden[layout.before[places]]
+
     def _hidden(
         self,
         layout: _ResponseLayout,

@@ -19,7 +19,8 @@ def train(
         str,
         typer.Argument(
             help="create, language, ground, read-facts, traj-only, meta-act, counterfactual, multi-round, "
-            "sketched; ladder: all of it, then rollouts, labels and training round by round, and the table; "
+            "sketched; branch: when to look twice, learned alone; "
+            "ladder: all of it, then rollouts, labels and training round by round, and the table; "
             "blind, teacher: the small planners of the tables, without pictures; "
             "visual-codes: pictures as codes, for models that imagine; "
             "composer: gives these codes what was seen half a second before."
@@ -37,7 +38,8 @@ def train(
     ] = None,
     vision_from: Annotated[Path | None, typer.Option(help="Checkpoint whose vision tower is taken.")] = None,
     reflections: Annotated[
-        Path | None, typer.Option(help="A build's reflections, for counterfactual, multi-round and sketched.")
+        Path | None,
+        typer.Option(help="A build's reflections, for counterfactual, multi-round, sketched, branch."),
     ] = None,
     failures: Annotated[
         Path | None,
@@ -120,6 +122,8 @@ def train(
     from looktwice.model.network.card import LOG_FILE
     from looktwice.model.network.precision import bfloat16_is_fast
     from looktwice.model.network.small_planner import DRIVING_KINDS
+    from looktwice.model.training.branch import NAME as BRANCH
+    from looktwice.model.training.branch import train_branch
     from looktwice.model.training.composer import train_composer
     from looktwice.model.training.recipes import COMPOSER, NANO, PAPER, VISUAL_CODES, lasting, refining_with
     from looktwice.model.training.run import RunSettings, create, run
@@ -142,6 +146,13 @@ def train(
                 recipe, scenes, codec_from, target, settings, validation, rounds, round_episodes
             )
             return
+        if recipe == BRANCH:
+            if source is None or reflections is None:
+                raise ValueError(
+                    "give the checkpoint and what it learns from: --from FOLDER --reflections FILE"
+                )
+            _tell(train_branch(scenes, source, target, reflections, RunSettings(cache, workers=workers)))
+            return
         if recipe == "ladder":
             if test is None:
                 raise ValueError("give the scenes for the table: --test FOLDER")
@@ -156,7 +167,7 @@ def train(
             return
         recipes = {each.name: each for each in (VISUAL_CODES, COMPOSER)} | dict(PAPER if paper else NANO)
         if recipe not in recipes:
-            known = ", ".join(["create", "ladder", *DRIVING_KINDS, *recipes])
+            known = ", ".join(["create", BRANCH, "ladder", *DRIVING_KINDS, *recipes])
             raise ValueError(f"unknown recipe {recipe!r}; known are {known}")
         chosen = recipes[recipe]
         chosen = replace(
