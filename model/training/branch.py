@@ -40,7 +40,7 @@ SHARPNESS: Final = 4.0
 """How many times as far apart the options are written as they are likely. A branch is drawn like a word: who
 holds three of ten plans for failing would look twice by chance, as often at plans that hold. Written sharper,
 what is likelier than not is nearly always drawn, and the rest hardly ever."""
-_RIDGE: Final = 60.0
+_RIDGE: Final = 100.0
 _FOLDS: Final = 8
 _BATCH: Final = 16
 _STEPS: Final = 50
@@ -85,7 +85,7 @@ def train_branch(
     examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
     placed = place_reflections(examples, read_reflections(reflections))
     vision = open_vision(
-        loaded, examples, settings.cache, mirrored=False, bf16=settings.bf16, workers=settings.workers
+        loaded, examples, settings.cache, mirrored=True, bf16=settings.bf16, workers=settings.workers
     )
     judged = judged_states(loaded, examples, vision, placed)
     if judged.looks.all() or not judged.looks.any():
@@ -94,7 +94,11 @@ def train_branch(
         )
     figures = _held_out(judged)
     write_branch(loaded, _fitted(judged.states, judged.looks))
-    stage = {"name": NAME, "plans": len(judged.looks), "failing": int(judged.looks.sum())} | figures
+    stage = {
+        "name": NAME,
+        "reflections_count": int(judged.looks.sum()) // 2,
+        "right_plans_count": int((~judged.looks).sum()) // 2,
+    } | figures
     save(
         target,
         loaded.model,
@@ -116,6 +120,8 @@ def judged_states(
 ) -> JudgedStates:
     """The states behind the plans of reflections that are judged, as their model was told the scenes.
 
+    The second half of them is of the mirror images.
+
     Raises:
         ValueError: the checkpoint has no branch.
     """
@@ -125,7 +131,15 @@ def judged_states(
     assert responses.reflecting is not None
     places = [place for place, each in enumerate(placed.reflections) if each.judged]
     items = [
-        Item(int(placed.examples[place]), responses.reflecting, bool(route), (place,), tracks=bool(tracks))
+        Item(
+            int(placed.examples[place]),
+            responses.reflecting,
+            bool(route),
+            (place,),
+            tracks=bool(tracks),
+            mirror=mirror,
+        )
+        for mirror in (False, True)
         for place in places
         for route, tracks in [placed.told[place]]
     ]
@@ -135,8 +149,8 @@ def judged_states(
     ]
     return JudgedStates(
         torch.cat(states).double().numpy() if states else np.zeros((0, 1)),
-        np.array([bool(placed.reflections[place].thinking) for place in places], np.bool_),
-        examples.episode[placed.examples[places]],
+        np.tile(np.array([bool(placed.reflections[place].thinking) for place in places], np.bool_), 2),
+        np.tile(examples.episode[placed.examples[places]], 2),
     )
 
 
