@@ -82,18 +82,19 @@ def train_branch(
         CheckpointError: the source cannot be read.
     """
     loaded = load(source)
+    options = branch_options(loaded)
     examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
     placed = place_reflections(examples, read_reflections(reflections))
     vision = open_vision(
         loaded, examples, settings.cache, mirrored=True, bf16=settings.bf16, workers=settings.workers
     )
-    judged = judged_states(loaded, examples, vision, placed)
+    judged = judged_states(loaded, options, examples, vision, placed)
     if judged.looks.all() or not judged.looks.any():
         raise ValueError(
             f"{reflections}: all plans that are judged go the same way, so nothing tells them apart"
         )
     figures = _held_out(judged)
-    write_branch(loaded, _fitted(judged.states, judged.looks))
+    write_branch(loaded, options, _fitted(judged.states, judged.looks))
     stage = {
         "name": NAME,
         "reflections_count": int(judged.looks.sum()) // 2,
@@ -114,18 +115,33 @@ def train_branch(
     return figures
 
 
-@torch.inference_mode()
-def judged_states(
-    loaded: Loaded, examples: Examples, vision: VisionCache, placed: PlacedReflections
-) -> JudgedStates:
-    """The states behind the plans of reflections that are judged, as their model was told the scenes.
-
-    The second half of them is of the mirror images.
+def branch_options(loaded: Loaded) -> Tensor:
+    """int64 [2]: the first token of the direct option, and of the one that reflects.
 
     Raises:
         ValueError: the checkpoint has no branch.
     """
-    options, responses = _options(loaded), _responses(loaded, examples, vision, placed)
+    settings = loaded.settings
+    branches = [
+        family.branch
+        for family in families_of(settings.formats, settings.reflection).values()
+        if family.branch is not None
+    ]
+    if not branches:
+        raise ValueError(f"{loaded.card.name} has no branch: it writes {', '.join(settings.formats)}")
+    [branch] = branches
+    return torch.tensor([loaded.vocabulary.encode(text)[0] for text in (branch.direct, branch.reflecting)])
+
+
+@torch.inference_mode()
+def judged_states(
+    loaded: Loaded, options: Tensor, examples: Examples, vision: VisionCache, placed: PlacedReflections
+) -> JudgedStates:
+    """The states behind the plans of reflections that are judged, as their model was told the scenes.
+
+    The second half of them is of the mirror images. ``options`` are those of `branch_options`.
+    """
+    responses = _responses(loaded, examples, vision, placed)
     loaded.model.set_attn_implementation(MATMUL_ATTENTION)
     learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec).eval()
     assert responses.reflecting is not None
@@ -154,9 +170,9 @@ def judged_states(
     )
 
 
-def write_branch(loaded: Loaded, difference: Array) -> None:
+def write_branch(loaded: Loaded, options: Tensor, difference: Array) -> None:
     """Give the head weights of its own, whose branch options differ by ``difference`` [hidden], sharpened."""
-    direct, reflecting = _options(loaded)
+    direct, reflecting = options
     with_own_head(loaded.model)
     rows = loaded.model.lm_head.weight
     apart = torch.from_numpy(SHARPNESS * difference).to(rows.dtype)
@@ -179,20 +195,6 @@ def _responses(
         vision=vision,
         reflections=placed.reflections,
     )
-
-
-def _options(loaded: Loaded) -> Tensor:
-    """int64 [2]: the first token of the direct option, and of the one that reflects."""
-    settings = loaded.settings
-    branches = [
-        family.branch
-        for family in families_of(settings.formats, settings.reflection).values()
-        if family.branch is not None
-    ]
-    if not branches:
-        raise ValueError(f"{loaded.card.name} has no branch: it writes {', '.join(settings.formats)}")
-    [branch] = branches
-    return torch.tensor([loaded.vocabulary.encode(text)[0] for text in (branch.direct, branch.reflecting)])
 
 
 def _held_out(judged: JudgedStates) -> dict[str, float]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from looktwice.model.bundled import CHECKPOINTS
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.plan import Plan, parse_plan
 from looktwice.model.driving.reflection_store import LabelledReflection, write_reflections
@@ -29,9 +30,13 @@ SCENES = [each for each in map(training_scene, range(40)) if each.scene.route is
 
 
 def judged(labelled: LabelledScene, plan: Plan, text: str) -> LabelledReflection:
-    better, mend = (expert_plan(labelled), "the expert's") if text else (plan, "")
-    return LabelledReflection(
-        labelled.scene.scene_id, plan, text, better, mend, True, True, False, *("x",) * 5, 1, "now"
+    held = LabelledReflection(
+        labelled.scene.scene_id, plan, "", plan, "", True, True, False, *("x",) * 5, 1, "now"
+    )
+    return (
+        replace(held, reflection=text, expert_plan=expert_plan(labelled), mend="the expert's")
+        if text
+        else held
     )
 
 
@@ -97,3 +102,10 @@ def test_plans_that_all_go_one_way_are_refused(
             scenes, resampling_checkpoint, tmp_path / "to", file, RunSettings(tmp_path / "cache", bf16=False)
         )
     assert not (tmp_path / "to").exists()
+
+
+def test_a_checkpoint_without_a_branch_is_refused(scenes: Path, tmp_path: Path) -> None:
+    file, settings = tmp_path / "reflections.parquet", RunSettings(tmp_path / "cache", bf16=False)
+    write_reflections(file, [judged(SCENES[0], WAIT, TEXT)])
+    with pytest.raises(ValueError, match="has no branch: it writes elf_vla"):
+        train_branch(scenes, CHECKPOINTS["elf-nano"], tmp_path / "to", file, settings)
