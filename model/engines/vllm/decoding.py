@@ -144,19 +144,20 @@ class Decoding:
             written = [token.id for token in draws[0].tokens]
             number, self._requests = self._requests, self._requests + 1
             allowed, left = draws[0].cursor.allowed(), self._left(draws[0])
-            # What is weighed is the same for all draws, so vLLM is asked for one.
+            # What is weighed, or likeliest, is the same for all draws, so vLLM is asked for one.
             weighs = self._expected(allowed) is not None
+            shared = weighs or self._request.controls.temperature == 0
             alone = weighs or self._between_numbers(allowed) or len(left) < len(allowed.ids)
             stream = self._llm.generate(
                 self._prompt.then(written),
-                self._parameters(draws, allowed, left, weighs=weighs, alone=alone),
+                self._parameters(draws, allowed, left, weighs=weighs, alone=alone, shared=shared),
                 f"{self._request.request_id}/{number}",
             )
             following = {draw.index for draw in draws}
             async with aclosing(stream):
                 async for output in stream:
                     for part in output.outputs:
-                        for draw in draws if weighs else draws[part.index : part.index + 1]:
+                        for draw in draws if shared else draws[part.index : part.index + 1]:
                             tokens = part.token_ids[:1] if alone else part.token_ids
                             if draw.index in following and not self._walk(draw, tokens, part.logprobs, alone):
                                 following.discard(draw.index)
@@ -172,7 +173,14 @@ class Decoding:
             self.fail(EngineError.because("vLLM failed", error))
 
     def _parameters(
-        self, draws: Sequence[_Walk], allowed: Allowed, left: IntArray, *, weighs: bool, alone: bool
+        self,
+        draws: Sequence[_Walk],
+        allowed: Allowed,
+        left: IntArray,
+        *,
+        weighs: bool,
+        alone: bool,
+        shared: bool,
     ) -> Any:
         from vllm import SamplingParams
         from vllm.sampling_params import RequestOutputKind, StructuredOutputsParams
@@ -183,7 +191,7 @@ class Decoding:
             named = allowed.ids.tolist() if alone and len(allowed.ids) <= _MOST_NAMED else None
         grammar = None if alone else StructuredOutputsParams(grammar=self._grammar(first.cursor))
         return SamplingParams(
-            n=1 if weighs else len(draws),
+            n=1 if shared else len(draws),
             temperature=controls.temperature,
             top_p=controls.top_p,
             seed=seed_of(controls.seed, first.index, len(first.tokens)),

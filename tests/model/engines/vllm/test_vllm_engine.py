@@ -245,6 +245,16 @@ def test_a_given_plan_is_kept(
     assert draw.text == mine.text
 
 
+def test_greedy_draws_are_all_the_same(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
+    """vLLM itself refuses several draws at temperature 0."""
+    request = greedy("several", BUNDLED[1])
+    several = replace(request, controls=replace(request.controls, n=3))
+    draws = loop.run_until_complete(plan(vllm, several))
+    [alone] = loop.run_until_complete(plan(vllm, replace(request, request_id="alone")))
+    assert [draw.index for draw in draws] == [0, 1, 2]
+    assert {draw.text for draw in draws} == {alone.text}
+
+
 @pytest.mark.parametrize(("numbers", "different"), [("least_error", 2), ("drawn", 6)])
 def test_draws_are_valid_and_repeat_with_their_seed(
     loop: asyncio.AbstractEventLoop, vllm: VllmEngine, numbers: Decision, different: int
