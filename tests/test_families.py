@@ -30,6 +30,7 @@ OTHERWISE = {
     "model/evaluation/draw_store.py": ("plan revised_plan trajectory", "fields of a draw"),
     "model/evaluation/pictures.py": ("plan", "a caption"),
     "model/families/trajectory_codes.py": ("trajectory", "an alphabet"),
+    "model/training/branch.py": ("branch", "a recipe"),
     "service/cli": ("branch plan thinking trajectory", "commands, and what they print"),
     "service/http/problem_documents.py": ("plan trajectory", "fields of the HTTP contract"),
     "service/inspector": ("plan thinking", "elements of the page"),
