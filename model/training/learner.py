@@ -159,9 +159,7 @@ class ResponseLearner(nn.Module):
             temperature: that they were drawn at.
         """
         parts = batch["parts"]
-        layout = _ResponseLayout.of(parts)
-        given = {name: batch.get(name) for name in ("history", "route", "tracks", "seen", "patches")}
-        hidden = self._hidden(layout, batch["input_ids"], parts, **given).flatten(0, 1)
+        layout, hidden = self._read(batch)
         starts = [
             int((row == part).nonzero()[0]) + number * parts.shape[1]
             for number, row in enumerate(parts)
@@ -181,17 +179,21 @@ class ResponseLearner(nn.Module):
 
     def states_before(self, batch: Batch, tokens: Tensor) -> Tensor:
         """The states [responses, hidden] that predict the first of ``tokens`` in each response of a batch."""
-        parts, input_ids = batch["parts"], batch["input_ids"]
-        layout = _ResponseLayout.of(parts)
-        given = {name: batch.get(name) for name in ("history", "route", "tracks", "seen", "patches")}
-        hidden = self._hidden(layout, input_ids, parts, **given).flatten(0, 1)
-        found = torch.isin(input_ids, tokens)
+        parts, found = batch["parts"], torch.isin(batch["input_ids"], tokens)
+        layout, hidden = self._read(batch)
         places = [
             int(((row == part) & there).nonzero()[0]) + number * parts.shape[1]
             for number, (row, there) in enumerate(zip(parts, found, strict=True))
             for part in range(1, int(row.max()) + 1)
         ]
         return hidden[layout.before[places]]
+
+    def _read(self, batch: Batch) -> tuple[_ResponseLayout, Tensor]:
+        """How the responses of a batch from `collate` lie, and its last states [b * t, hidden]."""
+        layout = _ResponseLayout.of(batch["parts"])
+        given = {name: batch.get(name) for name in ("history", "route", "tracks", "seen", "patches")}
+        hidden = self._hidden(layout, batch["input_ids"], batch["parts"], **given)
+        return layout, hidden.flatten(0, 1)
 
     def _hidden(
         self,
