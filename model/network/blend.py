@@ -13,7 +13,7 @@ from torch import Tensor
 
 from looktwice.model.network.card import CheckpointError
 from looktwice.model.network.checkpoint import Loaded
-from looktwice.model.network.vla import is_planner, is_tower, is_vision
+from looktwice.model.network.vla import is_planner, is_tower, is_vision, with_own_head
 
 
 def blend(before: Loaded, after: Loaded, share: float) -> Loaded:
@@ -34,6 +34,9 @@ def blend(before: Loaded, after: Loaded, share: float) -> Loaded:
     """
     if not 0 <= share <= 1:
         raise ValueError(f"share is {share}, not between 0 and 1")
+    if not before.model.config.tie_word_embeddings:
+        # Between one head and another's embeddings lies a head of its own.
+        with_own_head(after.model)
     old, new = before.model.state_dict(), after.model.state_dict()
     if before.settings != after.settings or {name: value.shape for name, value in old.items()} != {
         name: value.shape for name, value in new.items()

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from looktwice.model.network.blend import blend
 from looktwice.model.network.card import CheckpointError
 from looktwice.model.network.checkpoint import Loaded, load, save
+from looktwice.model.network.vla import with_own_head
 from looktwice.service.cli.commands import app
 
 KEPT = (
@@ -55,6 +56,24 @@ def test_what_reads_one_tower_goes_back_too(before: Loaded, after: Loaded) -> No
         if name.startswith(("resampler.", "track_reader.")):
             moved = 1.0 if name.startswith(("resampler.intent.", "track_reader.")) else 0.25
             torch.testing.assert_close(value, old[name] + moved, atol=1e-5, rtol=0)
+
+
+def test_between_heads_of_their_own_and_embeddings_lies_a_head_of_its_own(
+    before: Loaded, after: Loaded, tmp_path: Path
+) -> None:
+    with_own_head(before.model)
+    with torch.no_grad():
+        before.model.lm_head.weight.add_(2.0)
+    weights = before.model.state_dict()
+    embeddings = weights["model.language_model.embed_tokens.weight"].clone()
+    head = weights["lm_head.weight"].clone()
+    blended = blend(before, after, 0.25)
+    save(tmp_path / "blended", blended.model, blended.vocabulary, blended.codec)
+    saved = load(tmp_path / "blended").model.state_dict()
+    found = saved["model.language_model.embed_tokens.weight"]
+    torch.testing.assert_close(found, embeddings + 0.25, atol=1e-5, rtol=0)
+    # The head is two more before, and nothing more but one after.
+    torch.testing.assert_close(saved["lm_head.weight"], head - 0.25, atol=1e-5, rtol=0)
 
 
 def test_of_checkpoints_that_differ_in_more_than_weights_there_is_no_blend(
