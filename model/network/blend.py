@@ -34,9 +34,6 @@ def blend(before: Loaded, after: Loaded, share: float) -> Loaded:
     """
     if not 0 <= share <= 1:
         raise ValueError(f"share is {share}, not between 0 and 1")
-    if not before.model.config.tie_word_embeddings:
-        # Between one head and another's embeddings lies a head of its own.
-        with_own_head(after.model)
     old, new = before.model.state_dict(), after.model.state_dict()
     if before.settings != after.settings or {name: value.shape for name, value in old.items()} != {
         name: value.shape for name, value in new.items()
@@ -44,6 +41,9 @@ def blend(before: Loaded, after: Loaded, share: float) -> Loaded:
         raise CheckpointError(f"{before.card.name} and {after.card.name} differ in more than their weights")
     other_tower = any(not torch.equal(old[name], new[name]) for name in new if is_tower(name))
     stays = {name for name in new if is_planner(name) or (other_tower and is_vision(name))}
+    if not before.model.config.tie_word_embeddings:
+        # Between one head and another's embeddings lies a head of its own.
+        with_own_head(after.model)
     with torch.no_grad():
         after.model.load_state_dict(
             {

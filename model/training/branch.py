@@ -9,9 +9,9 @@ mean nothing anywhere else; their embeddings stay, since the head gets weights o
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from looktwice.model.driving.reflection_store import read_reflections
+from looktwice.model.evaluation.perception import auc
 from looktwice.model.families.registry import families_of
 from looktwice.model.network.attention import MATMUL_ATTENTION
 from looktwice.model.network.card import LOG_FILE
@@ -46,20 +47,9 @@ _BATCH: Final = 16
 _STEPS: Final = 50
 
 Array = npt.NDArray[np.float64]
-
-
-class JudgedStates(NamedTuple):
-    """What branches of verified plans are drawn from.
-
-    Attributes:
-        states: float64 [n, hidden].
-        looks: bool [n], whether the plan deserves a second look.
-        episode: int64 [n], of its scene.
-    """
-
-    states: Array
-    looks: npt.NDArray[np.bool_]
-    episode: npt.NDArray[np.int64]
+"""Of states [n, hidden], or of rows."""
+Looks = npt.NDArray[np.bool_]
+"""Whether each of n plans deserves a second look."""
 
 
 def train_branch(
@@ -82,40 +72,40 @@ def train_branch(
         CheckpointError: the source cannot be read.
     """
     loaded = load(source)
-    options = branch_options(loaded)
+    options = _options(loaded)
     examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
     placed = place_reflections(examples, read_reflections(reflections))
-    vision = open_vision(
-        loaded, examples, settings.cache, mirrored=True, bf16=settings.bf16, workers=settings.workers
-    )
-    judged = judged_states(loaded, options, examples, vision, placed)
-    if judged.looks.all() or not judged.looks.any():
+    places = [place for place, each in enumerate(placed.reflections) if each.judged]
+    looks = np.array([bool(placed.reflections[place].thinking) for place in places], np.bool_)
+    if looks.all() or not looks.any():
         raise ValueError(
             f"{reflections}: all plans that are judged go the same way, so nothing tells them apart"
         )
-    figures = _held_out(judged)
-    write_branch(loaded, options, _fitted(judged.states, judged.looks))
-    stage = {
-        "name": NAME,
-        "reflections_count": int(judged.looks.sum()) // 2,
-        "right_plans_count": int((~judged.looks).sum()) // 2,
-    } | figures
+    vision = open_vision(
+        loaded, examples, settings.cache, mirrored=True, bf16=settings.bf16, workers=settings.workers
+    )
+    states = _states(loaded, options, examples, vision, placed, places)
+    both = np.tile(looks, 2)
+    figures = _held_out(states, both, np.tile(examples.episode[placed.examples[places]], 2))
+    _write(loaded, options, _fitted(states, both))
+    counts = {"reflections_count": int(looks.sum()), "right_plans_count": int((~looks).sum())}
+    stages = [*loaded.card.details.get("stages", []), {"name": NAME} | counts | figures]
     save(
         target,
         loaded.model,
         loaded.vocabulary,
         loaded.codec,
         dtype=torch.bfloat16,
-        details={**loaded.card.details, "stages": [*loaded.card.details.get("stages", []), stage]},
+        details={**loaded.card.details, "stages": stages},
         visual_codes=loaded.visual_codes,
     )
     inherit_log(target / LOG_FILE, [source])
     with (target / LOG_FILE).open("a", encoding="utf-8") as log:
-        log.write(json.dumps({"stage": NAME, "step": 1, **figures}) + "\n")
+        log.write(json.dumps({"stage": f"{len(stages)} {NAME}", "step": 1, **figures}) + "\n")
     return figures
 
 
-def branch_options(loaded: Loaded) -> Tensor:
+def _options(loaded: Loaded) -> Tensor:
     """int64 [2]: the first token of the direct option, and of the one that reflects.
 
     Raises:
@@ -134,18 +124,32 @@ def branch_options(loaded: Loaded) -> Tensor:
 
 
 @torch.inference_mode()
-def judged_states(
-    loaded: Loaded, options: Tensor, examples: Examples, vision: VisionCache, placed: PlacedReflections
-) -> JudgedStates:
-    """The states behind the plans of reflections that are judged, as their model was told the scenes.
+def _states(
+    loaded: Loaded,
+    options: Tensor,
+    examples: Examples,
+    vision: VisionCache,
+    placed: PlacedReflections,
+    places: Sequence[int],
+) -> Array:
+    """The states [2 n, hidden] behind the plans of some reflections, as their model was told the scenes.
 
-    The second half of them is of the mirror images. ``options`` are those of `branch_options`.
+    The second half of them is of the mirror images.
     """
-    responses = _responses(loaded, examples, vision, placed)
+    recipe = NANO["counterfactual"]
+    responses = ResponseDataset(
+        examples,
+        loaded.codec,
+        loaded.inputs,
+        loaded.vocabulary,
+        recipe.weights,
+        pictures=recipe.pictures,
+        vision=vision,
+        reflections=placed.reflections,
+    )
     loaded.model.set_attn_implementation(MATMUL_ATTENTION)
     learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec).eval()
     assert responses.reflecting is not None
-    places = [place for place, each in enumerate(placed.reflections) if each.judged]
     items = [
         Item(
             int(placed.examples[place]),
@@ -163,14 +167,11 @@ def judged_states(
         learner.states_before(collate([responses[item] for item in items[start : start + _BATCH]]), options)
         for start in range(0, len(items), _BATCH)
     ]
-    return JudgedStates(
-        torch.cat(states).double().numpy() if states else np.zeros((0, 1)),
-        np.tile(np.array([bool(placed.reflections[place].thinking) for place in places], np.bool_), 2),
-        np.tile(examples.episode[placed.examples[places]], 2),
-    )
+    found: Array = torch.cat(states).double().numpy()
+    return found
 
 
-def write_branch(loaded: Loaded, options: Tensor, difference: Array) -> None:
+def _write(loaded: Loaded, options: Tensor, difference: Array) -> None:
     """Give the head weights of its own, whose branch options differ by ``difference`` [hidden], sharpened."""
     direct, reflecting = options
     with_own_head(loaded.model)
@@ -181,41 +182,24 @@ def write_branch(loaded: Loaded, options: Tensor, difference: Array) -> None:
         rows[direct], rows[reflecting] = middle - apart / 2, middle + apart / 2
 
 
-def _responses(
-    loaded: Loaded, examples: Examples, vision: VisionCache, placed: PlacedReflections
-) -> ResponseDataset:
-    recipe = NANO["counterfactual"]
-    return ResponseDataset(
-        examples,
-        loaded.codec,
-        loaded.inputs,
-        loaded.vocabulary,
-        recipe.weights,
-        pictures=recipe.pictures,
-        vision=vision,
-        reflections=placed.reflections,
-    )
-
-
-def _held_out(judged: JudgedStates) -> dict[str, float]:
-    """Figures over all plans, each judged by rows that were fitted without its episode."""
-    score = np.zeros(len(judged.looks))
-    episodes = np.random.default_rng(0).permutation(np.unique(judged.episode))
+def _held_out(states: Array, looks: Looks, episode: npt.NDArray[np.int64]) -> dict[str, float]:
+    """Figures over all plans, each judged by rows that were fitted without its episode [n]."""
+    score = np.zeros(len(looks))
+    episodes = np.random.default_rng(0).permutation(np.unique(episode))
     for left_out in np.array_split(episodes, _FOLDS):
-        out = np.isin(judged.episode, left_out)
+        out = np.isin(episode, left_out)
         if out.any() and not out.all():
-            score[out] = judged.states[out] @ _fitted(judged.states[~out], judged.looks[~out])
-    failing, holding = score[judged.looks], np.sort(score[~judged.looks])
-    below = np.searchsorted(holding, failing, "left") + np.searchsorted(holding, failing, "right")
-    thinks = score > 0
+            score[out] = states[out] @ _fitted(states[~out], looks[~out])
+    thinks, area = score > 0, auc(score, looks)
+    assert area is not None, "plans go both ways"
     return {
-        "auc": float(below.mean() / 2 / len(holding)),
+        "auc": area,
         "think_rate": float(thinks.mean()),
-        "right": float(judged.looks[thinks].mean()) if thinks.any() else 0.0,
+        "right": float(looks[thinks].mean()) if thinks.any() else 0.0,
     }
 
 
-def _fitted(states: Array, looks: npt.NDArray[np.bool_]) -> Array:
+def _fitted(states: Array, looks: Looks) -> Array:
     """Log odds a state, [hidden]: ridge logistic regression by Newton's method, without a constant.
 
     States are normed and have a large mean, so one of their directions does for a constant.

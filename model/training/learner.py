@@ -158,13 +158,8 @@ class ResponseLearner(nn.Module):
             responses: their decisions, row by row.
             temperature: that they were drawn at.
         """
-        parts = batch["parts"]
         layout, hidden = self._read(batch)
-        starts = [
-            int((row == part).nonzero()[0]) + number * parts.shape[1]
-            for number, row in enumerate(parts)
-            for part in range(1, int(row.max()) + 1)
-        ]
+        starts = _first_places(batch["parts"], batch["parts"] > 0)
         found = []
         for start, decisions in zip(starts, responses, strict=True):
             logits = self.vla.lm_head(hidden[layout.before[[start + each.position for each in decisions]]])
@@ -179,13 +174,8 @@ class ResponseLearner(nn.Module):
 
     def states_before(self, batch: Batch, tokens: Tensor) -> Tensor:
         """The states [responses, hidden] that predict the first of ``tokens`` in each response of a batch."""
-        parts, found = batch["parts"], torch.isin(batch["input_ids"], tokens)
         layout, hidden = self._read(batch)
-        places = [
-            int(((row == part) & there).nonzero()[0]) + number * parts.shape[1]
-            for number, (row, there) in enumerate(zip(parts, found, strict=True))
-            for part in range(1, int(row.max()) + 1)
-        ]
+        places = _first_places(batch["parts"], torch.isin(batch["input_ids"], tokens))
         return hidden[layout.before[places]]
 
     def _read(self, batch: Batch) -> tuple[_ResponseLayout, Tensor]:
@@ -224,3 +214,12 @@ class ResponseLearner(nn.Module):
             use_cache=False,
         ).last_hidden_state
         return states
+
+
+def _first_places(parts: Tensor, counts: Tensor) -> list[int]:
+    """Of each response of a batch, the first place that counts: into [b * t], see `collate` for ``parts``."""
+    return [
+        int(((row == part) & there).nonzero()[0]) + number * parts.shape[1]
+        for number, (row, there) in enumerate(zip(parts, counts, strict=True))
+        for part in range(1, int(row.max()) + 1)
+    ]

@@ -146,12 +146,14 @@ def train(
                 recipe, scenes, codec_from, target, settings, validation, rounds, round_episodes
             )
             return
+        mixed = bfloat16_is_fast("cuda" if gpu else "cpu") if bf16 is None else bf16
+        run_settings = RunSettings(cache, bf16=mixed, compiled=compiled, use_cpu=not gpu, workers=workers)
         if recipe == BRANCH:
             if source is None or reflections is None:
                 raise ValueError(
                     "give the checkpoint and what it learns from: --from FOLDER --reflections FILE"
                 )
-            _tell(train_branch(scenes, source, target, reflections, RunSettings(cache, workers=workers)))
+            _tell(train_branch(scenes, source, target, reflections, run_settings))
             return
         if recipe == "ladder":
             if test is None:
@@ -202,13 +204,12 @@ def train(
             every = max(1, count_scenes(validation) // validation_scenes)
             held_out = list(islice(read_scenes(validation, dense=False), 0, every * validation_scenes, every))
         keep_freed_memory()
-        mixed = bfloat16_is_fast("cuda" if gpu else "cpu") if bf16 is None else bf16
         run(
             chosen,
             scenes,
             source,
             target,
-            RunSettings(cache, bf16=mixed, compiled=compiled, use_cpu=not gpu, workers=workers),
+            run_settings,
             held_out,
             vision_from,
             reflections,
