@@ -147,10 +147,11 @@ class Decoding:
             # What is weighed, or likeliest, is the same for all draws, so vLLM is asked for one.
             weighs = self._expected(allowed) is not None
             shared = weighs or self._request.controls.temperature == 0
+            asked = draws[:1] if shared else draws
             alone = weighs or self._between_numbers(allowed) or len(left) < len(allowed.ids)
             stream = self._llm.generate(
                 self._prompt.then(written),
-                self._parameters(draws, allowed, left, weighs=weighs, alone=alone, shared=shared),
+                self._parameters(asked, allowed, left, weighs=weighs, alone=alone),
                 f"{self._request.request_id}/{number}",
             )
             following = {draw.index for draw in draws}
@@ -173,14 +174,7 @@ class Decoding:
             self.fail(EngineError.because("vLLM failed", error))
 
     def _parameters(
-        self,
-        draws: Sequence[_Walk],
-        allowed: Allowed,
-        left: IntArray,
-        *,
-        weighs: bool,
-        alone: bool,
-        shared: bool,
+        self, draws: Sequence[_Walk], allowed: Allowed, left: IntArray, *, weighs: bool, alone: bool
     ) -> Any:
         from vllm import SamplingParams
         from vllm.sampling_params import RequestOutputKind, StructuredOutputsParams
@@ -191,7 +185,7 @@ class Decoding:
             named = allowed.ids.tolist() if alone and len(allowed.ids) <= _MOST_NAMED else None
         grammar = None if alone else StructuredOutputsParams(grammar=self._grammar(first.cursor))
         return SamplingParams(
-            n=1 if shared else len(draws),
+            n=len(draws),
             temperature=controls.temperature,
             top_p=controls.top_p,
             seed=seed_of(controls.seed, first.index, len(first.tokens)),
