@@ -40,8 +40,8 @@ def test_the_checkpoint_is_small_and_tells_how_it_was_made(served: Served[TorchE
     assert sum(file.stat().st_size for file in CHECKPOINT.rglob("*")) < 40_000_000
     card = served.http.get("/v1/models").json()["models"][0]
     stages = [stage["name"] for stage in card["details"]["stages"]]
-    assert stages.index("meta-act") < stages.index("counterfactual")
-    assert stages[-1] == "counterfactual"
+    assert stages.index("meta-act") < stages.index("counterfactual") < stages.index("sketched")
+    assert stages[-1] == "branch"
 
 
 def test_it_thinks_by_itself_now_and_then(planner: PlannerClient) -> None:
