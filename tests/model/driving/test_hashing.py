@@ -7,6 +7,7 @@ import numpy as np
 from looktwice.model.bundled import SCENES
 from looktwice.model.driving.hashing import annotations_hash, hash_of, judged_hash
 from looktwice.model.driving.lane_map import LaneArea, LaneMap
+from looktwice.model.driving.scene import AgentKind
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.trajectory import constant_velocity
 
@@ -23,10 +24,11 @@ def test_annotations_are_told_apart_by_whatever_a_teacher_may_read() -> None:
     first, *rest = labelled.agents
     moved = np.array(first.poses)
     moved[..., 0] += 0.5
+    other: AgentKind = "barrier" if first.kind == "cone" else "cone"
     changed = [
         labelled,
         replace(labelled, agents=tuple(rest)),
-        replace(labelled, agents=(replace(first, kind="cone"), *rest)),
+        replace(labelled, agents=(replace(first, kind=other), *rest)),
         replace(labelled, agents=(replace(first, poses=moved), *rest)),
         replace(labelled, tags=labelled.tags ^ {"turn"}),
         replace(labelled, future=constant_velocity(labelled.scene.history)),
