@@ -57,29 +57,33 @@ class RailView:
 def look(me: Vehicle, rail: Rail, bodies: list[Body]) -> RailView:
     """What ``me`` sees of ``bodies`` on ``rail``."""
     mine = rail.s_at(me.progress) if me.on_route else me.s
-    seen: list[Body] = []
-    near: list[float] = []
-    for body in bodies:
-        if body is me or (isinstance(body, Vehicle) and body.on_route != me.on_route):
-            continue
-        guess = rail.s_at(body.progress) if me.on_route else _oncoming_s(body)
-        if -70 < guess - mine < _SIGHT_M + 15:
-            seen.append(body)
-            near.append(guess)
-    xy = np.array([[b.x, b.y] for b in seen]).reshape(-1, 2)
-    s, offset = rail.project(xy, np.array(near)) if seen else (np.zeros(0), np.zeros(0))
-    index = np.clip((s / RAIL_SPACING_M).astype(int), 0, len(rail.heading) - 1)
-    angle = np.array([b.heading for b in seen]) - rail.heading[index]
-    speed = np.array([b.speed for b in seen])
-    size = np.array([b.size[:2] for b in seen]).reshape(-1, 2)
+    others = [
+        body
+        for body in bodies
+        if body is not me and not (isinstance(body, Vehicle) and body.on_route != me.on_route)
+    ]
+    if me.on_route:
+        guessed = np.interp([body.progress for body in others], rail.breaks_progress, rail.breaks_s)
+    else:
+        guessed = np.array([_oncoming_s(body) for body in others], np.float64)
+    ahead = guessed - mine
+    near = (ahead > -70) & (ahead < _SIGHT_M + 15)
+    seen = [body for body, is_near in zip(others, near.tolist(), strict=True) if is_near]
+    told = np.array([(b.x, b.y, b.heading, b.speed, *b.size[:2]) for b in seen], np.float64).reshape(-1, 6)
+    s, offset = rail.project(told[:, :2], guessed[near])
+    heading, speed, length, width = told[:, 2:].T
+    index = np.minimum(np.maximum((s / RAIL_SPACING_M).astype(int), 0), len(rail.heading) - 1)
+    angle = heading - rail.heading[index]
+    cos, sin = np.cos(angle), np.sin(angle)
+    along, across = np.abs(cos), np.abs(sin)
     return RailView(
         seen,
         s,
         offset,
-        speed * np.cos(angle),
-        speed * np.sin(angle),
-        np.abs(size[:, 0] * np.cos(angle)) + np.abs(size[:, 1] * np.sin(angle)),
-        np.abs(size[:, 1] * np.cos(angle)) + np.abs(size[:, 0] * np.sin(angle)),
+        speed * cos,
+        speed * sin,
+        length * along + width * across,
+        width * along + length * across,
         np.array(
             [isinstance(b, StillBody) or (isinstance(b, Vehicle) and b.hazard_lights) for b in seen], bool
         ),
@@ -158,7 +162,7 @@ def _following(style: Style, speed: float, gap: Array, lead_speed: Array) -> Arr
     lead_stop = np.maximum(lead_speed, 0) ** 2 / (2 * 3.5)
     needed = -(speed**2) / (2 * np.maximum(room + lead_stop, 0.3))
     harsh: Array = np.where(model < -2.0, np.maximum(model, np.minimum(1.15 * needed, -2.0)), model)
-    return np.clip(harsh, -EMERGENCY_BRAKE, style.acceleration)
+    return np.minimum(np.maximum(harsh, -EMERGENCY_BRAKE), style.acceleration)
 
 
 def _yield_distance(me: Vehicle, style: Style, view: RailView) -> float | None:

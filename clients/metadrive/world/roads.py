@@ -20,6 +20,8 @@ ROAD_MARGIN_M: Final = 0.3
 _CLOSING_M: Final = 2.5
 _SMOOTHING_M: Final = 3.0
 _SEARCH_M: Final = 18.0
+_SEARCHED: Final = np.arange(-int(_SEARCH_M / RAIL_SPACING_M), int(_SEARCH_M / RAIL_SPACING_M) + 1)
+"""Points around the one where a place on a rail is guessed."""
 _SMALL_HOLE_M2: Final = 80.0
 
 
@@ -79,6 +81,11 @@ class Rail:
     breaks_s: Array
     breaks_progress: Array
 
+    @cached_property
+    def columns(self) -> tuple[Array, Array]:
+        """x and y of the points, each in one piece: a simulated step looks them up hundreds of times."""
+        return np.ascontiguousarray(self.points[:, 0]), np.ascontiguousarray(self.points[:, 1])
+
     @property
     def length(self) -> float:
         """Metres."""
@@ -120,16 +127,16 @@ class Rail:
 
     def project(self, xy: Array, near_s: Array) -> tuple[Array, Array]:
         """Arc length [n] and offset to the left [n] of points [n, 2], searched around ``near_s`` [n]."""
-        reach = int(_SEARCH_M / RAIL_SPACING_M)
-        first = np.clip((near_s / RAIL_SPACING_M).astype(int), 0, len(self.points) - 1)
-        window = np.clip(first[:, None] + np.arange(-reach, reach + 1), 0, len(self.points) - 1)
-        delta = xy[:, None, :] - self.points[window]
-        best = np.argmin((delta**2).sum(-1), axis=1)
+        last = len(self.points) - 1
+        first = np.minimum(np.maximum((near_s / RAIL_SPACING_M).astype(int), 0), last)
+        window = np.minimum(np.maximum(first[:, None] + _SEARCHED, 0), last)
+        xs, ys = self.columns
+        apart_x, apart_y = xy[:, :1] - xs[window], xy[:, 1:] - ys[window]
+        best = np.argmin(apart_x * apart_x + apart_y * apart_y, axis=1)
         index = window[np.arange(len(xy)), best]
-        gap = xy - self.points[index]
-        cos, sin = np.cos(self.heading[index]), np.sin(self.heading[index])
-        along = gap[:, 0] * cos + gap[:, 1] * sin
-        return index * RAIL_SPACING_M + along, -gap[:, 0] * sin + gap[:, 1] * cos
+        gap_x, gap_y, heading = xy[:, 0] - xs[index], xy[:, 1] - ys[index], self.heading[index]
+        cos, sin = np.cos(heading), np.sin(heading)
+        return index * RAIL_SPACING_M + (gap_x * cos + gap_y * sin), -gap_x * sin + gap_y * cos
 
 
 def _resampled(points: Array, spacing: float) -> Array:
