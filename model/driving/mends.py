@@ -39,14 +39,16 @@ Mend = Literal[
     "the expert's",
 ]
 MENDS: Final[tuple[Mend, ...]] = get_args(Mend)
+Alternative = Mend | Literal["the route's way"]
+"""What else may be driven. A trajectory's pace in the middle of the route is no mend that words tell yet."""
 
-_SLOWER_SHARE: Final[Mapping[Mend, float]] = {"ease off": 0.25, "slow down": 0.4}
+SLOWER_SHARE: Final[Mapping[Mend, float]] = {"ease off": 0.25, "slow down": 0.4}
 """So much slower than before ..."""
-_SLOWING_S: Final = 3.2
+SLOWING_S: Final = 3.2
 """... from so many seconds on."""
-_FASTER_MS2: Final[Mapping[Mend, float]] = {"speed up": 0.7, "accelerate": 1.4}
+FASTER_MS2: Final[Mapping[Mend, float]] = {"speed up": 0.7, "accelerate": 1.4}
 """On top of what the trajectory does."""
-_BRAKE_MS2: Final[Mapping[Mend, float]] = {"brake": 2.0, "brake hard": 3.5}
+BRAKE_MS2: Final[Mapping[Mend, float]] = {"brake": 2.0, "brake hard": 3.5}
 """From now on."""
 _TIMES_S: Final = STEP_S * np.arange(1, FUTURE_STEPS + 1)
 
@@ -67,12 +69,12 @@ def mended(mend: Mend, trajectory: FloatArray, expert: FloatArray, history: Floa
     if mend == "the expert's way":
         return retimed(expert, trajectory)
     pace = speeds(trajectory)
-    if mend in _SLOWER_SHARE:
-        pace = pace * (1 - _SLOWER_SHARE[mend] * np.minimum(_TIMES_S / _SLOWING_S, 1))
-    elif mend in _FASTER_MS2:
-        pace = pace + _FASTER_MS2[mend] * _TIMES_S
+    if mend in SLOWER_SHARE:
+        pace = pace * (1 - SLOWER_SHARE[mend] * np.minimum(_TIMES_S / SLOWING_S, 1))
+    elif mend in FASTER_MS2:
+        pace = pace + FASTER_MS2[mend] * _TIMES_S
     else:
-        braked = present_speed(history) - _BRAKE_MS2[mend] * _TIMES_S
+        braked = present_speed(history) - BRAKE_MS2[mend] * _TIMES_S
         pace = np.minimum(pace, np.maximum(braked, 0))
     return paced(trajectory, pace)
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Final, Literal, cast
+from typing import Any, Final, Literal, cast, get_args
 
 OUTCOMES_VERSION: Final = 1
 """Of `looktwice.clients.metadrive.outcomes` and the car that follows; raised when plans may fare
 otherwise."""
 
 FailureName = Literal["collision", "off_road", "off_route", "comfort", "behind", "ahead"]
+Verdict = FailureName | Literal["holds"]
+VERDICTS: Final[tuple[Verdict, ...]] = ("holds", *get_args(FailureName))
+"""What comes of a trajectory in a word: it holds, or at what it fails first."""
 HitKind = Literal["standing vehicle", "moving vehicle", "oncoming vehicle", "pedestrian", "obstacle"]
 
 
@@ -41,6 +44,11 @@ class Outcome:
     def holds(self) -> bool:
         """Whether nothing went wrong."""
         return not self.fails
+
+    @property
+    def verdict(self) -> Verdict:
+        """See `VERDICTS`."""
+        return self.fails[0] if self.fails else "holds"
 
     @property
     def rank(self) -> int:

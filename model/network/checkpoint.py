@@ -301,10 +301,24 @@ def with_sketches(loaded: Loaded, stages: int, *, seed: int = 0) -> Loaded:
         stages: at most 6.
         seed: of the new weights.
     """
+    return _with_intents(loaded, replace(loaded.settings, sketch_tokens=stages), seed)
+
+
+def with_second_sketches(loaded: Loaded, *, seed: int = 0) -> Loaded:
+    """A checkpoint whose prompt also tells what else might be driven, to be trained.
+
+    Args:
+        loaded: one that writes sketches; it stays as it is.
+        seed: of the new weights.
+    """
+    return _with_intents(loaded, replace(loaded.settings, second_sketch=True), seed)
+
+
+def _with_intents(loaded: Loaded, settings: VlaSettings, seed: int) -> Loaded:
+    """A checkpoint with more tokens of an intent, as many queries of its resampler, and its own weights."""
+    more = settings.intent_tokens - loaded.settings.intent_tokens
     resampled = loaded.settings.scene_tokens
-    wider = replace(
-        loaded.settings, sketch_tokens=stages, scene_tokens=resampled + stages if resampled else 0
-    )
+    wider = replace(settings, scene_tokens=resampled + more if resampled else 0)
     config = with_settings(copy.deepcopy(loaded.model.config), wider, loaded.vocabulary)
     with torch.random.fork_rng():
         torch.manual_seed(seed)

@@ -33,6 +33,8 @@ HEADING_WEIGHT_M: Final = EGO_LENGTH_M / 3
 costs 0.1 degrees of heading on MetaDrive scenes and wins a tenth of the displacement error."""
 DIMENSIONS: Final = 20
 """Of the space that trajectories are quantised in, where there are examples enough to fit them."""
+CURVE_VALUES: Final = 3 * FUTURE_STEPS
+"""Of the curves of x, y and heading."""
 _MAX_FIT_VECTORS: Final = 80_000
 _REFINEMENTS: Final = 3
 _TIMES_S: Final = STEP_S * np.arange(1, FUTURE_STEPS + 1, dtype=np.float64)

@@ -4,7 +4,8 @@ A decoder learns from a few responses a second; a multilayer perceptron over his
 around learns from thousands, and plans in metres far better than a decoder that starts from nothing. So
 this trunk learns first (recipes ``read-tracks`` and ``read-scene``), and its state stands in the prompt as
 continuous tokens: the decoder only has to put it into words and codes. Beside it stands a sketch: the
-trajectory that the state amounts to, in the decoder's own codes.
+trajectory that the state amounts to, in the decoder's own codes. And beside that may stand what else might be
+driven (`looktwice.model.network.second_sketch`).
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ import torch
 from torch import Tensor, nn
 
 from looktwice.model.driving.tracks import MAX_TRACKS
-from looktwice.model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS, ROUTE_SPACING_M, STEP_S
-from looktwice.model.network.codec import DIMENSIONS, TrajectoryCodec
+from looktwice.model.network.codec import CURVE_VALUES, DIMENSIONS, TrajectoryCodec
+from looktwice.model.network.motion import MOTION_FEATURES, motion_features, present_speeds
+from looktwice.model.network.second_sketch import CurveSpace, Known, SecondSketcher
 from looktwice.model.network.track_features import TRACK_FEATURES
 from looktwice.model.network.trajectory_head import spread_of
 
@@ -27,32 +29,6 @@ _WIDTH: Final = 256
 _SOFTNESS: Final = 1e-3
 """Width of a sketch's mixtures, in mean squared distances from a code to the nearest other one: a few
 centimetres. In wider ones the nearest code drowns: the later a token, the less of it can be copied."""
-_POSE_SCALE: Final = (10.0, 2.0, 0.3)
-_OUTLIER: Final = 6.0
-MOTION_FEATURES: Final = 3 * (2 * HISTORY_STEPS - 1) + 2 * 2 * ROUTE_POINTS + 1
-
-
-def motion_features(history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
-    """History and route as numbers of order one, [b, MOTION_FEATURES].
-
-    Args:
-        history: [b, 16, 4].
-        route: [b, 20, 2]; rows without one are ignored.
-        has_route: bool [b].
-    """
-    poses = history[..., [0, 1, 3]].float()
-    scale = poses.new_tensor(_POSE_SCALE)
-    straight = ROUTE_SPACING_M * torch.arange(1, ROUTE_POINTS + 1, device=poses.device)
-    aside = route.float() - torch.stack([straight, torch.zeros_like(straight)], dim=1)
-    known = has_route[:, None].float()
-    parts = [(poses / scale).flatten(1), (poses.diff(dim=1) / STEP_S / scale).flatten(1)]
-    parts += [(route.float() / 40).flatten(1) * known, (aside / 4).flatten(1) * known, known]
-    return torch.cat(parts, dim=1).clamp(-_OUTLIER, _OUTLIER)
-
-
-def present_speeds(history: Tensor) -> Tensor:
-    """Metres a second [b] at the end of histories [b, 16, 4]."""
-    return -history[:, -4, 0] / (3 * STEP_S)
 
 
 class TrackPool(nn.Module):
@@ -115,11 +91,18 @@ class SketchCodes(NamedTuple):
         books: [stages, K, d], see `TrajectoryCodec`.
         widths: [stages], how far off, in squares, a code still has a share in a mixture.
         embeddings: [stages, K, hidden], the decoder's own of these codes.
+        space: that the codec works in; None where there is no second sketch.
     """
 
     books: Tensor
     widths: Tensor
     embeddings: Tensor
+    space: CurveSpace | None = None
+
+    @property
+    def spread(self) -> Tensor:
+        """What sketches are told in, [d]; see `spread_of`."""
+        return spread_of(self.books[0].float())
 
     def tokens(self, sketches: Tensor) -> Tensor:
         """Tokens [b, stages, hidden] of sketches [b, d], in spreads of the first stage's codes.
@@ -132,7 +115,7 @@ class SketchCodes(NamedTuple):
         tokens = []
         # Differences of large squares decide: mixed precision would round them away.
         with torch.autocast(sketches.device.type, enabled=False):
-            left = sketches.float() * spread_of(books[0])
+            left = sketches.float() * self.spread
             for book, width, embeddings in zip(books, widths, self.embeddings, strict=True):
                 nearness = (2 * left @ book.T - book.square().sum(dim=1)) / width
                 shares = nearness.softmax(dim=1)
@@ -147,17 +130,25 @@ class SketchBooks(nn.Module):
     Args:
         stages: how many.
         size: codes a stage.
+        curves: whether they bring the codec's space, which second sketches need.
     """
 
-    def __init__(self, stages: int, size: int) -> None:
+    def __init__(self, stages: int, size: int, *, curves: bool = False) -> None:
         super().__init__()
         # Weights and no buffers, since every engine loads weights; training has to leave them out.
         self.books = nn.Parameter(torch.zeros(stages, size, DIMENSIONS))
         self.widths = nn.Parameter(torch.ones(stages))
+        self.mean = nn.Parameter(torch.zeros(CURVE_VALUES)) if curves else None
+        self.axes = nn.Parameter(torch.zeros(DIMENSIONS, CURVE_VALUES)) if curves else None
 
     def codes(self, embeddings: Tensor) -> SketchCodes:
         """What sketches are written in; ``embeddings`` [stages * K, hidden] are a decoder's of the codes."""
-        return SketchCodes(self.books, self.widths, embeddings.view(*self.books.shape[:2], -1))
+        return SketchCodes(self.books, self.widths, embeddings.view(*self.books.shape[:2], -1), self.space)
+
+    @property
+    def space(self) -> CurveSpace | None:
+        """That the codec works in, where these bring it."""
+        return None if self.mean is None or self.axes is None else CurveSpace(self.mean, self.axes)
 
     @torch.no_grad()
     def fill(self, codec: TrajectoryCodec) -> None:
@@ -165,6 +156,9 @@ class SketchBooks(nn.Module):
         if codec.books.shape[2] != DIMENSIONS:
             raise ValueError(f"sketches need a codec of {DIMENSIONS} dimensions, not {codec.books.shape[2]}")
         self.books.copy_(torch.from_numpy(codec.books[: len(self.books)]))
+        if self.mean is not None and self.axes is not None:
+            self.mean.copy_(torch.from_numpy(codec.mean))
+            self.axes.copy_(torch.from_numpy(codec.axes))
         for width, book in zip(self.widths, self.books.float(), strict=True):
             apart = torch.cdist(book, book).fill_diagonal_(torch.inf).amin(dim=1)
             width.fill_(_SOFTNESS * apart.square().mean().clamp_min(1e-3))
@@ -177,28 +171,43 @@ class IntentReader(nn.Module):
         hidden_size: of a token.
         around: size of the vector of what is around, see `IntentTrunk`.
         sketches: whether its sketch stands there too.
+        second: and what else might be driven.
     """
 
-    def __init__(self, hidden_size: int, around: int, *, sketches: bool) -> None:
+    def __init__(self, hidden_size: int, around: int, *, sketches: bool, second: bool = False) -> None:
         super().__init__()
         self.trunk = IntentTrunk(around)
         self.tokens = nn.Linear(IntentTrunk.width, INTENT_TOKENS * hidden_size)
         self.sketch = nn.Linear(IntentTrunk.width, DIMENSIONS) if sketches else None
+        self.second = SecondSketcher(hidden_size) if second else None
 
-    def written(self, state: Tensor, codes: SketchCodes | None) -> Tensor:
-        """A state [b, 256] as tokens [b, `INTENT_TOKENS` and those of the sketch, hidden]."""
+    def written(self, state: Tensor, codes: SketchCodes | None, known: Known) -> Tensor:
+        """A state [b, 256] as tokens [b, `INTENT_TOKENS` and those of the sketches, hidden].
+
+        Args:
+            state: of the trunk.
+            codes: that sketches are written in, where they are.
+            known: what a second sketch is judged by.
+        """
         tokens: Tensor = self.tokens(state)
         tokens = tokens.view(len(tokens), INTENT_TOKENS, tokens.shape[1] // INTENT_TOKENS)
         if self.sketch is None or codes is None:
             return tokens
-        return torch.cat([tokens, codes.tokens(self.sketch(state)).to(tokens.dtype)], dim=1)
+        sketch = self.sketch(state)
+        parts = [tokens, codes.tokens(sketch)]
+        if self.second is not None:
+            assert codes.space is not None, "second sketches need the codec's space"
+            found = self.second(sketch.float() * codes.spread, codes.space, known)
+            second = codes.tokens(found.vectors / codes.spread)
+            parts += [self.second.token(found), self.second.marked(second)]
+        return torch.cat([part.to(tokens.dtype) for part in parts], dim=1)
 
 
 class TrackReader(IntentReader):
     """A scene's tracks as tokens of the prompt, read with the ego's history and route in mind."""
 
-    def __init__(self, hidden_size: int, *, sketches: bool = False) -> None:
-        super().__init__(hidden_size, TrackPool.size, sketches=sketches)
+    def __init__(self, hidden_size: int, *, sketches: bool = False, second: bool = False) -> None:
+        super().__init__(hidden_size, TrackPool.size, sketches=sketches, second=second)
         self.pool = TrackPool()
 
     def state(self, tracks: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
@@ -223,4 +232,5 @@ class TrackReader(IntentReader):
             has_route: bool [b].
             codes: that sketches are written in, where they are.
         """
-        return self.written(self.state(tracks, history, route, has_route), codes)
+        known = Known(history, route, has_route, tracks=tracks)
+        return self.written(self.state(tracks, history, route, has_route), codes, known)

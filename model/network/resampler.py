@@ -17,6 +17,7 @@ from looktwice.model.driving.facts import FACTS
 from looktwice.model.network.encoders import HistoryEncoder, RouteEncoder
 from looktwice.model.network.fact_reader import FactReader, likely, weighed
 from looktwice.model.network.intent import IntentReader, SketchCodes
+from looktwice.model.network.second_sketch import Known
 
 _HEADS: Final = 4
 _LAYERS: Final = 2
@@ -31,9 +32,18 @@ class SceneResampler(nn.Module):
         vision_tokens: of a scene, all cameras together.
         queries: how many. A token comes out for each, and those that say what to do about it.
         sketches: whether a sketch is among them.
+        second: and what else might be driven.
     """
 
-    def __init__(self, hidden_size: int, vision_tokens: int, queries: int, *, sketches: bool = False) -> None:
+    def __init__(
+        self,
+        hidden_size: int,
+        vision_tokens: int,
+        queries: int,
+        *,
+        sketches: bool = False,
+        second: bool = False,
+    ) -> None:
         super().__init__()
         self.queries = nn.Parameter(0.3 * torch.randn(queries, hidden_size))
         self.places = nn.Parameter(0.02 * torch.randn(vision_tokens, hidden_size))
@@ -44,7 +54,7 @@ class SceneResampler(nn.Module):
         self.layers = nn.ModuleList(_CrossLayer(hidden_size) for _ in range(_LAYERS))
         self.norm = nn.RMSNorm(hidden_size, eps=_EPSILON)
         self.facts = FactReader(hidden_size)
-        self.intent = _SceneIntent(hidden_size, len(FACTS), sketches=sketches)
+        self.intent = _SceneIntent(hidden_size, len(FACTS), sketches=sketches, second=second)
 
     def forward(
         self,
@@ -56,8 +66,10 @@ class SceneResampler(nn.Module):
     ) -> Tensor:
         """What stands in the prompt, [b, scene_tokens, hidden]; see `gather` and `IntentReader.written`."""
         gathered = self.gather(vision_tokens, history, route, has_route)
-        state = self.intent.state(likely(self.facts(gathered)), history, route, has_route)
-        return torch.cat([gathered, self.intent.written(state, codes)], dim=1)
+        facts = likely(self.facts(gathered))
+        state = self.intent.state(facts, history, route, has_route)
+        known = Known(history, route, has_route, facts=facts)
+        return torch.cat([gathered, self.intent.written(state, codes, known)], dim=1)
 
     def gather(self, vision_tokens: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
         """What the queries gather, [b, queries, hidden].

@@ -26,7 +26,8 @@ from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray
 from looktwice.model.network.card import CARD_FILE, files_revision, weights_revision
 from looktwice.model.network.checkpoint import load
 from looktwice.model.network.codec import CODEC_FILE, CodecError, TrajectoryCodec
-from looktwice.model.network.intent import IntentTrunk, TrackPool, present_speeds
+from looktwice.model.network.intent import IntentTrunk, TrackPool
+from looktwice.model.network.motion import present_speeds
 from looktwice.model.network.track_features import track_features
 from looktwice.model.network.trajectory_head import Guesses, TrajectoryHead
 

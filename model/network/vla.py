@@ -69,16 +69,23 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         hidden_size = config.text_config.hidden_size
         self.history_encoder = HistoryEncoder(hidden_size)
         self.route_encoder = RouteEncoder(hidden_size) if self.settings.with_route else None
-        stages = self.settings.sketch_tokens
-        self.sketch_books = SketchBooks(stages, self.settings.codec_size) if stages else None
+        stages, second = self.settings.sketch_tokens, self.settings.second_sketch
+        size = self.settings.codec_size
+        self.sketch_books = SketchBooks(stages, size, curves=second) if stages else None
         self.code_token_id: int | None = extra.get("code_token_id")
         self.track_reader = (
-            TrackReader(hidden_size, sketches=stages > 0) if self.settings.with_tracks else None
+            TrackReader(hidden_size, sketches=stages > 0, second=second)
+            if self.settings.with_tracks
+            else None
         )
         self.track_token_id: int | None = extra.get("track_token_id")
         self.resampler = (
             SceneResampler(
-                hidden_size, self.settings.vision_tokens, self.settings.scene_queries, sketches=stages > 0
+                hidden_size,
+                self.settings.vision_tokens,
+                self.settings.scene_queries,
+                sketches=stages > 0,
+                second=second,
             )
             if self.settings.scene_tokens
             else None

@@ -12,6 +12,7 @@ from looktwice.model.driving.scene import CAMERAS, CLIP_FRAMES, CLIP_PERIOD_S, F
 from looktwice.model.families.registry import FROM_SCRATCH
 from looktwice.model.families.trajectory_codes import CODES
 from looktwice.model.network.intent import INTENT_TOKENS
+from looktwice.model.network.second_sketch import VERDICT_TOKENS
 
 CONFIG_KEY: Final = "looktwice"
 """Where these settings lie in a checkpoint's ``config.json``."""
@@ -36,6 +37,8 @@ class VlaSettings:
         with_tracks: whether it has a reader of tracks.
         sketch_tokens: of the prompt that tell the trajectory which a small planner's state amounts to
             (`looktwice.model.network.intent`); 0 for none.
+        second_sketch: whether the prompt also tells what else might be driven, and a verdict
+            (`looktwice.model.network.second_sketch`).
         scene_tokens: 0 where every vision token stands in the prompt, as in Qwen2.5-VL; otherwise a
             resampler brings those of all cameras down to so many.
         patch_size, temporal_patch_size, spatial_merge_size, tokens_per_second: as in the backbone's
@@ -52,6 +55,7 @@ class VlaSettings:
     with_route: bool = True
     with_tracks: bool = False
     sketch_tokens: int = 0
+    second_sketch: bool = False
     scene_tokens: int = 0
     patch_size: int = 14
     temporal_patch_size: int = 2
@@ -70,6 +74,8 @@ class VlaSettings:
             raise SettingsError(f"unknown camera {', '.join(unknown)}; known are {', '.join(CAMERAS)}")
         if not 0 <= self.sketch_tokens <= CODES:
             raise SettingsError(f"sketch_tokens must lie in 0..{CODES}, got {self.sketch_tokens}")
+        if self.second_sketch and not self.sketch_tokens:
+            raise SettingsError("a second sketch stands beside a first one: sketch_tokens must not be 0")
         least = len(FACT_GROUPS) + self.intent_tokens
         if 0 < self.scene_tokens < least:
             raise SettingsError(
@@ -105,8 +111,9 @@ class VlaSettings:
 
     @property
     def intent_tokens(self) -> int:
-        """Tokens that the state of a small planner becomes, with its sketch."""
-        return INTENT_TOKENS + self.sketch_tokens
+        """Tokens that the state of a small planner becomes, with its sketches."""
+        second = self.sketch_tokens + VERDICT_TOKENS if self.second_sketch else 0
+        return INTENT_TOKENS + self.sketch_tokens + second
 
     @property
     def sketch_codes(self) -> int:
@@ -136,6 +143,8 @@ class VlaSettings:
             del values["reflection"]
         if not self.sketch_tokens:
             del values["sketch_tokens"]
+        if not self.second_sketch:
+            del values["second_sketch"]
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     @classmethod

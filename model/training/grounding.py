@@ -29,7 +29,8 @@ from looktwice.model.driving.trajectory import POSE_MIRROR
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.fact_reader import likely
 from looktwice.model.network.inputs import InputBuilder
-from looktwice.model.network.intent import IntentTrunk, present_speeds
+from looktwice.model.network.intent import IntentTrunk
+from looktwice.model.network.motion import present_speeds
 from looktwice.model.network.patches import patchify
 from looktwice.model.network.trajectory_head import TrajectoryHead
 from looktwice.model.network.vla import LookTwiceVla

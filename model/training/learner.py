@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from looktwice.model.engines.logprobs import log_probability
 from looktwice.model.formats.replay import Decision
 from looktwice.model.network.codec import TrajectoryCodec
-from looktwice.model.network.intent import present_speeds
+from looktwice.model.network.motion import present_speeds
 from looktwice.model.network.trajectory_head import TrajectoryHead
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.network.vocabulary import FUTURE_START, Vocabulary

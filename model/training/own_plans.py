@@ -18,11 +18,13 @@ from looktwice.model.driving.labeller import labelled_track
 from looktwice.model.driving.plan import GROUPS, TICKS, WORDS, Plan
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.network.intent import IntentTrunk
+from looktwice.model.network.second_sketch import CurveSpace
 from looktwice.model.network.trajectory_head import spread_of
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.training.batches import stacked
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.intents import IntentDataset, read_facts
+from looktwice.model.training.sketched_looks import Around, SecondSketches, second_sketches
 from looktwice.model.training.vision_cache import VisionCache
 
 _BATCH: Final = 256
@@ -47,12 +49,14 @@ class OwnPlans:
     ) -> None:
         read = None if vision is None else read_facts(vla, examples, vision, seed)
         data = IntentDataset(examples, read, route_share=1.0)
-        spread = None if vla.sketch_books is None else spread_of(vla.sketch_books.books[0])
+        books = vla.sketch_books
+        spread = None if books is None else spread_of(books.books[0])
+        space = None if books is None else books.space
         self._readings = {}
         if vla.track_reader is not None:
-            self._readings[True] = _Reading(vla.track_reader, data, "tracks", spread, seed)
+            self._readings[True] = _Reading(vla.track_reader, data, "tracks", spread, space, seed)
         if read is not None and vla.resampler is not None:
-            self._readings[False] = _Reading(vla.resampler.intent, data, "read", spread, seed)
+            self._readings[False] = _Reading(vla.resampler.intent, data, "read", spread, space, seed)
 
     def draw(
         self, index: int, random: np.random.Generator, *, mirror: bool, route: bool, tracks: bool
@@ -83,11 +87,27 @@ class OwnPlans:
         found: FloatArray = sketches[int(mirror), int(route), index]
         return found
 
+    def seconds(self, *, tracks: bool) -> SecondSketches | None:
+        """What else might be driven, with or without tracks in the prompt; None where it does not tell.
+
+        Raises:
+            KeyError: the checkpoint has no planner for such prompts.
+        """
+        return self._readings[tracks].seconds
+
 
 class _Reading:
     """The states of one planner for all examples, and the linear reading of plans from them."""
 
-    def __init__(self, part: Any, data: IntentDataset, around: str, spread: Tensor | None, seed: int) -> None:
+    def __init__(
+        self,
+        part: Any,
+        data: IntentDataset,
+        around: Around,
+        spread: Tensor | None,
+        space: CurveSpace | None,
+        seed: int,
+    ) -> None:
         states, bins = [], []
         with torch.inference_mode():
             for mirror in (False, True):
@@ -106,6 +126,9 @@ class _Reading:
                 self.sketches = (
                     (part.sketch(stacked.to(part.sketch.weight.dtype)).float() * spread).cpu().numpy()
                 )
+        self.seconds: SecondSketches | None = None
+        if part.second is not None and self.sketches is not None and space is not None:
+            self.seconds = second_sketches(part, data, around, self.sketches, space)
 
     def scores(self, index: int, mirror: int, route: int) -> FloatArray:
         """How likely each word is in each tick, log [64, words of all groups]."""

@@ -21,7 +21,7 @@ from looktwice.model.families.vla_world.rewards import REWARDS as VLA_WORLD_REWA
 from looktwice.model.training.outcome.draw_rewards import RewardWeights
 from looktwice.model.training.response_targets import SectionWeights
 
-Goal = Literal["ground", "facts", "read", "respond", "outcome", "code"]
+Goal = Literal["ground", "facts", "read", "judge", "respond", "outcome", "code"]
 FeedbackWriter = Literal["teacher", "rule"]
 
 
@@ -83,9 +83,9 @@ class Recipe:
     Attributes:
         name: as the command line gives it.
         goal: ``ground`` trains the vision tower alone, ``facts`` the reading of what a frozen tower sees,
-            ``read`` what to do about tracks or, with pictures, about what was gathered from them, ``respond``
-            trains everything on responses, ``outcome`` on what comes of own draws, ``code`` the codes of
-            pictures alone.
+            ``read`` what to do about tracks or, with pictures, about what was gathered from them, ``judge``
+            what comes of trajectories, ``respond`` trains everything on responses, ``outcome`` on what comes
+            of own draws, ``code`` the codes of pictures alone.
         pictures: whether responses are learned with pictures.
         tasks: share of the examples for each response format.
         route_share: share of the examples whose route is given.
@@ -219,6 +219,7 @@ NANO: Final[Mapping[str, Recipe]] = (
             replace(_READ, name="read-facts", goal="facts", steps=2000, batch_size=64, learning_rate=3e-4),
             replace(_READ, name="read-tracks", pictures=False, steps=6000, batch_size=256),
             replace(_READ, name="read-scene", steps=4000, batch_size=64),
+            replace(_READ, name="critic", goal="judge", steps=4000),
             replace(_NANO, name="traj-only", steps=3000, tasks={"traj_only": 1.0}),
             replace(_NANO, name="meta-act"),
             _COUNTERFACTUAL,

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Final, cast
+from typing import Final, NamedTuple, cast
 
 import numpy as np
 from torch.utils.data import Dataset
 
-from looktwice.model.driving.labeller import label_plan
 from looktwice.model.driving.mends import mended
 from looktwice.model.driving.next_view import expected_view
 from looktwice.model.driving.plan import Plan
@@ -46,11 +44,26 @@ from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.reflections import mirrored
 from looktwice.model.training.response_targets import SectionWeights, Target, make_target
 from looktwice.model.training.sampler import Item
+from looktwice.model.training.sketched_looks import driven_plan, reasoned_look
 from looktwice.model.training.soft_codes import SoftCodes
 from looktwice.model.training.vision_cache import VisionCache
 
 _EXPERT_SHARE: Final = 0.5
 """Of the plans behind which sketches are learned, so many are the expert's, with the expert's trajectory."""
+
+
+class _Taught(NamedTuple):
+    """A plan, and the trajectory [d] that it leads to.
+
+    ``copied`` says that the prompt tells this trajectory, ``branches`` that a response without a reflection
+    is an example of acting at once.
+    """
+
+    plan: Plan
+    vector: Array
+    reflection: Counterfactual | None = None
+    copied: bool = False
+    branches: bool = True
 
 
 class ResponseDataset(Dataset[ResponseSample]):
@@ -71,8 +84,9 @@ class ResponseDataset(Dataset[ResponseSample]):
         attempts: to be asked for by items, which are refined in the format ``attempting``.
         own_plans: behind which trajectories are learned too, where nothing is reflected.
         sketched: plans and trajectories are those of the sketch in the prompt, and so are trajectories behind
-            plans of the model's own that hold. Behind second looks they are the sketch's with its mend,
-            and behind the expert's plan, of which then nothing is taught, the expert's.
+            plans of the model's own that hold. Behind reflections they are the sketch's with its mend,
+            and behind the expert's plan, of which then nothing is taught, the expert's. Where the prompt
+            tells what else might be driven, second looks at the sketch lead there.
         visual_codes: of the checkpoint, where items are to teach pictures.
         seed: of the codes that are drawn.
 
@@ -156,53 +170,32 @@ class ResponseDataset(Dataset[ResponseSample]):
         if item.blur:
             history = steady_history(present_speed(history))
         picture = None if item.camera is None else self._next_picture(index, item.camera, item.mirror)
-        expert = self._codec.vectors(history[None], future[None])[0]
-        found = [self._reflections[place] for place in item.reflections]
-        if item.mirror:
-            found = [mirrored(each) for each in found]
-        reflections: list[Counterfactual | None] = [*found] or [None]
-        plans, vectors = [plan] * len(reflections), [expert] * len(reflections)
-        sketch = self._sketch(item)
-        if sketch is not None and found:
-            plans = [each.revised_plan or plan for each in found]
-            vectors = [self._looked_at(each, sketch, history, future) for each in found]
-        if not found and self._own_plans is not None:
-            if item.task == self.reflecting:
-                # Nobody knows whether it deserves a second look: behind it the trajectory alone is taught.
-                behind, led_to = plan, expert
-                if sketch is None or self.random.random() >= _EXPERT_SHARE:
-                    behind = self._own_plans.draw(
-                        index, self.random, mirror=item.mirror, route=item.route, tracks=item.tracks
-                    )
-                    led_to = expert if sketch is None else sketch
-                reflections.append(Counterfactual(behind, "", judged=False))
-                plans.append(plan)
-                vectors.append(led_to)
-            if sketch is not None:
-                plans[0], vectors[0] = self._driven(sketch, history, plan), sketch
         tried = None if item.attempt is None else self._attempts[item.attempt]
-        # What the prompt sketches is copied code by code: its tokens are those of the nearest ones.
-        copied = self._inputs.settings.sketch_tokens
+        taught = self._taught(item, history, future, route, plan)
+        # What the prompt tells is copied code by code: its tokens are those of the nearest ones.
+        stages = self._inputs.settings.sketch_tokens
         soft = [
-            self._soft.draw(vector, self.random, nearest=copied if vector is sketch else 0)
-            for vector in vectors
+            self._soft.draw(each.vector, self.random, nearest=stages if each.copied else 0) for each in taught
         ]
         camera = picture.camera if picture is not None and item.camera_requested else None
         attempt = None if tried is None else tried.attempt
         expected = self._expected_codes(item, camera, history) if camera is not None else None
         lessons = [
             Lesson(
-                *(each, tuple(drawn.codes.tolist()), future, reflection, thoughts, perceived),
+                *(each.plan, tuple(drawn.codes.tolist()), future, each.reflection, thoughts, perceived),
                 next_picture=picture,
                 expected=expected,
                 attempt=tried,
             )
-            for each, drawn, reflection in zip(plans, soft, reflections, strict=True)
+            for each, drawn in zip(taught, soft, strict=True)
         ]
         situation = Situation(history, route if item.route else None, attempt, camera)
         return ResponseSample(
             prompt=self._prompt(item, situation),
-            responses=[self._target(item.task, lesson) for lesson in lessons],
+            responses=[
+                self._target(item.task, lesson, branches=each.branches)
+                for lesson, each in zip(lessons, taught, strict=True)
+            ],
             seen=self._vision.tokens(index, item.mirror) if pictures and self._vision is not None else None,
             patches=self._patches(item) if pictures and self._vision is None else None,
             history=history,
@@ -219,6 +212,44 @@ class ResponseDataset(Dataset[ResponseSample]):
             return None
         return self._own_plans.sketch(item.index, mirror=item.mirror, route=item.route, tracks=item.tracks)
 
+    def _taught(self, item: Item, history: Array, future: Array, route: Array, plan: Plan) -> list[_Taught]:
+        """What is taught behind one prompt, whose plan is the expert's."""
+        expert, sketch = self._codec.vectors(history[None], future[None])[0], self._sketch(item)
+        if item.reflections:
+            found = [self._reflections[place] for place in item.reflections]
+            if item.mirror:
+                found = [mirrored(each) for each in found]
+            if sketch is None:
+                return [_Taught(plan, expert, each) for each in found]
+            return [
+                _Taught(
+                    *(each.revised_plan or plan, self._looked_at(each, sketch, history, future), each),
+                    copied=each.mend is None,
+                )
+                for each in found
+            ]
+        at_once = _Taught(plan, expert)
+        if sketch is not None:
+            at_once = _Taught(driven_plan(self._codec, sketch, history, plan), sketch, copied=True)
+        if self._own_plans is None or item.task != self.reflecting:
+            return [at_once]
+        seconds = self._own_plans.seconds(tracks=item.tracks)
+        if sketch is not None and seconds is not None:
+            second = seconds.find(item.index, mirror=item.mirror, route=item.route)
+            given = route if item.route else None
+            look = reasoned_look(self._codec, sketch, second, history, given, plan)
+            if look is not None:
+                at_once = at_once._replace(branches=not look.judged)
+                return [at_once, _Taught(look.revised_plan or plan, second.vector, look, copied=True)]
+        # Nobody knows whether it deserves a second look: behind it the trajectory alone is taught.
+        behind, led_to, copied = plan, expert, False
+        if sketch is None or self.random.random() >= _EXPERT_SHARE:
+            behind = self._own_plans.draw(
+                item.index, self.random, mirror=item.mirror, route=item.route, tracks=item.tracks
+            )
+            led_to, copied = (expert, False) if sketch is None else (sketch, True)
+        return [at_once, _Taught(plan, led_to, Counterfactual(behind, "", judged=False), copied)]
+
     def _looked_at(self, reflection: Counterfactual, sketch: Array, history: Array, future: Array) -> Array:
         """Where a plan that the sketch carries out leads behind a reflection: a trajectory [d]."""
         if reflection.mend is None:
@@ -227,11 +258,6 @@ class ResponseDataset(Dataset[ResponseSample]):
         better = mended(reflection.mend, driven, future, history)
         vector: Array = self._codec.vectors(history[None], better[None])[0]
         return vector
-
-    def _driven(self, sketch: Array, history: Array, plan: Plan) -> Plan:
-        """The plan that a sketch carries out; lanes, which it does not tell, are the expert's."""
-        trajectory = self._codec.trajectories(history[None], sketch[None])[0]
-        return replace(label_plan(trajectory, history, None), lane=plan.lane)
 
     def _next_picture(self, index: int, camera: str, mirror: bool) -> NextPicture:
         """What ``camera`` saw half a second later; its mirror image is that of the other side's camera."""
@@ -260,13 +286,13 @@ class ResponseDataset(Dataset[ResponseSample]):
             raise ValueError("pictures are to be taught, and there are no codes to write them in")
         return tuple(self._visual_codes.encode(frame).tolist())
 
-    def _target(self, task: str, lesson: Lesson) -> Target:
+    def _target(self, task: str, lesson: Lesson, *, branches: bool = True) -> Target:
         return make_target(
             self._families[task],
             self.formats[task],
             lesson,
             self._weights,
-            expert_branches=self._expert_branches,
+            expert_branches=self._expert_branches and branches,
         )
 
     def _prompt(self, item: Item, situation: Situation) -> list[int]:

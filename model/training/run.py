@@ -17,6 +17,7 @@ from torch import nn
 from torch.utils.data import Dataset, Subset
 
 from looktwice.model.driving.feedback_store import read_feedback
+from looktwice.model.driving.followed_store import read_followed
 from looktwice.model.driving.reflection_store import read_reflections
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import read_scenes
@@ -30,6 +31,7 @@ from looktwice.model.network.checkpoint import (
     load,
     save,
     with_formats,
+    with_second_sketches,
     with_sketches,
     with_visual_codes,
 )
@@ -42,6 +44,13 @@ from looktwice.model.network.vla_settings import EXPANDED_SETTINGS, NANO_SETTING
 from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
 from looktwice.model.training.attempts import PlacedAttempts, place_attempts
 from looktwice.model.training.batches import collate, stacked
+from looktwice.model.training.critics import (
+    CriticLearner,
+    PlacedVerdicts,
+    VerdictDataset,
+    place_verdicts,
+    told_apart,
+)
 from looktwice.model.training.dense import DENSE_SHAPE
 from looktwice.model.training.examples import Examples, load_examples
 from looktwice.model.training.fact_reading import FactDataset, FactLearner, reading_errors
@@ -147,6 +156,7 @@ def run(
     reflections: Path | None = None,
     visual_codes: Path | None = None,
     failures: Path | None = None,
+    followed: Path | None = None,
 ) -> None:
     """Train ``source`` by a recipe and write the outcome to ``target``, weights in bfloat16.
 
@@ -165,9 +175,11 @@ def run(
         reflections: file of the reflections that the recipe asks for.
         visual_codes: folder of codes of pictures, which the checkpoint gets; without it, it keeps its own.
         failures: file of a model's own answers with feedback, for recipes that can learn from them.
+        followed: file of trajectories that were followed, which ``critic`` learns from.
 
     Raises:
         FeedbackFileError: ``failures`` is missing, damaged, or of another version.
+        FollowedFileError: ``followed`` is.
         ValueError: the recipe wants reflections and there are none, or the other way round, or they are on
             other scenes, or on plans made with tracks where ``source`` takes none; it learns from pictures or
             judges draws, and no scene can be learned from so; it takes no failures, and
@@ -175,16 +187,26 @@ def run(
             that scenes bring; it teaches sketches, and ``source`` has none; only one of ``source`` and
             ``vision_source`` writes sketches.
     """
-    if (reflections is None) != (recipe.reflections is None):
-        wants = "needs reflections" if reflections is None else "takes no reflections"
-        raise ValueError(f"recipe {recipe.name} {wants}")
     if failures is not None and recipe.attempting is None:
         raise ValueError(f"recipe {recipe.name} takes no failures")
     loaded = load(source)
+    # What second sketches change is learned from all scenes, and no reflection of a build tells it.
+    told = recipe.sketched and loaded.settings.second_sketch
+    if (reflections is None) != (recipe.reflections is None or told):
+        wants = "needs reflections" if reflections is None else "takes no reflections"
+        why = f": {loaded.card.name} tells in the prompt what else might be driven" if told else ""
+        raise ValueError(f"recipe {recipe.name} {wants}{why}")
     _check_refining(recipe, loaded)
     refining = [recipe.attempting] if failures is not None and recipe.attempting is not None else []
     if new := [task for task in (*recipe.tasks, *refining) if task not in loaded.settings.formats]:
         loaded = with_formats(loaded, new, seed=recipe.seed)
+    if (followed is None) != (recipe.goal != "judge"):
+        wants = "needs followed trajectories" if followed is None else "takes no followed trajectories"
+        raise ValueError(f"recipe {recipe.name} {wants}")
+    if recipe.goal == "judge" and not loaded.settings.second_sketch:
+        if not loaded.settings.sketch_tokens:
+            raise ValueError(f"recipe {recipe.name} judges sketches, and {loaded.card.name} writes none")
+        loaded = with_second_sketches(loaded, seed=recipe.seed)
     if recipe.goal == "read" and not loaded.settings.sketch_tokens:
         loaded = with_sketches(loaded, NANO_SETTINGS.sketch_tokens, seed=recipe.seed)
     if visual_codes is not None:
@@ -192,10 +214,11 @@ def run(
     stages = list(loaded.card.details.get("stages", []))
     if vision_source is not None:
         vision = load(vision_source)
-        if vision.settings.sketch_tokens != loaded.settings.sketch_tokens:
+        if vision.settings.intent_tokens != loaded.settings.intent_tokens:
             raise ValueError(
-                f"{source} has {loaded.settings.sketch_tokens} tokens of a sketch and {vision_source} "
-                f"{vision.settings.sketch_tokens}: `looktwice train read-scene` gives them to the one without"
+                f"{source} has {loaded.settings.intent_tokens} tokens of an intent and {vision_source} "
+                f"{vision.settings.intent_tokens}: `looktwice train read-scene` gives sketches to one "
+                "without, and `looktwice train critic` second ones"
             )
         for mine, theirs in zip(vision_parts(loaded.model), vision_parts(vision.model), strict=True):
             mine.load_state_dict(theirs.state_dict())
@@ -222,8 +245,9 @@ def run(
     if failures is not None and recipe.attempting is not None:
         times_s = family_named(recipe.attempting).times_s
         tried = place_attempts(examples, read_feedback(failures), times_s, taught)
+    judged = None if followed is None else place_verdicts(examples, read_followed(followed))
     learner, dataset, sampler, collator = _prepare(
-        recipe, loaded, scenes, examples, taught, on_examples, tried, settings
+        recipe, loaded, scenes, examples, taught, on_examples, tried, judged, settings
     )
     if isinstance(learner, IntentLearner | FactLearner) and validation:
         held_out = Examples.from_scenes(validation, loaded.settings.cameras)
@@ -238,6 +262,11 @@ def run(
                 workers=settings.workers,
             )
         validate = _reading(learner, loaded, held_out, held_out_seen)
+    if isinstance(learner, CriticLearner):
+        assert isinstance(dataset, Subset)
+        assert isinstance(dataset.dataset, VerdictDataset)
+        _, left_out = dataset.dataset.split()
+        validate = partial(told_apart, learner, dataset.dataset, left_out) if left_out else None
     trainer = LearnerTrainer(
         learner,
         recipe,
@@ -363,6 +392,7 @@ def _prepare(
     taught: npt.NDArray[np.bool_],
     on_examples: PlacedReflections | None,
     tried: PlacedAttempts | None,
+    judged: PlacedVerdicts | None,
     settings: RunSettings,
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
     if recipe.goal == "ground":
@@ -389,6 +419,12 @@ def _prepare(
         reader = FactLearner(loaded.model)
         seen_facts = FactDataset(examples, vision, recipe.route_share, recipe.seed)
         return reader, Subset(seen_facts, looked_at(examples)), None, stacked
+    if recipe.goal == "judge":
+        assert vision is not None, "facts are read from pictures"
+        assert judged is not None, "critics learn from followed trajectories"
+        told = read_facts(loaded.model, examples, vision, recipe.seed, recipe.misread_share)
+        verdicts = VerdictDataset(examples, judged, told, recipe.route_share, recipe.seed)
+        return CriticLearner(loaded.model), Subset(verdicts, verdicts.split()[0]), None, stacked
     if recipe.goal == "read":
         source: Source = "scene" if recipe.pictures else "tracks"
         reading = IntentLearner(loaded.model, loaded.codec, source)
@@ -425,6 +461,8 @@ def _prepare(
         # decoder learns from would. What the state becomes in the prompt is learned with the decoder.
         planner.requires_grad_(planner.sketch is None)
         planner.tokens.requires_grad_(True)
+        if planner.second is not None:
+            planner.second.verdict.requires_grad_(True)
     if loaded.model.sketch_books is not None:
         loaded.model.sketch_books.requires_grad_(False)
     learner = ResponseLearner(

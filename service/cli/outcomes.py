@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
 from pathlib import Path
 from typing import Final
 
@@ -18,8 +17,7 @@ from looktwice.clients.metadrive.outcomes import (
     MomentOutcomes,
     ReplayError,
     ResultStore,
-    follow_episodes,
-    outcome_key,
+    follow_unknown,
     outcome_store,
 )
 from looktwice.model.driving.scene import LabelledScene
@@ -95,17 +93,10 @@ def followed_table(
         )
         for labelled in scenes
     }
-    keys = {scene_id: outcome_key(each, setting) for scene_id, each in asked.items()}
     found: dict[str, MomentOutcomes] = {}
-    for scene_id, key in keys.items():
-        if (known := store.find(key)) is not None:
-            found[scene_id] = known
-            on_scene()
-    rest = [each for scene_id, each in asked.items() if scene_id not in found]
-    for scene_id, outcomes in follow_episodes(_episodes(rest), setting, workers):
+    for scene_id, outcomes in follow_unknown(asked.values(), setting, workers, store):
         if isinstance(outcomes, str):
             raise ReplayError(outcomes)
-        store.store(keys[scene_id], outcomes)
         found[scene_id] = outcomes
         on_scene()
     draws: list[FollowedDraw | None] = []
@@ -141,12 +132,6 @@ def _draws(
             yield None
         else:
             yield FollowedDraw(episode_id, draw.think_probability, first, draw.looked_twice, last)
-
-
-def _episodes(asked: Sequence[FollowTask]) -> Iterator[list[FollowTask]]:
-    by_seed = sorted(asked, key=lambda each: each.moment.seed)
-    for _, episode in groupby(by_seed, lambda each: each.moment.seed):
-        yield list(episode)
 
 
 def follow_pairs(

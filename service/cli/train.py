@@ -19,7 +19,7 @@ def train(
         str,
         typer.Argument(
             help="create, language, ground, read-facts, traj-only, meta-act, counterfactual, multi-round, "
-            "sketched; branch: when to look twice, learned alone; "
+            "critic, sketched; branch: when to look twice, learned alone; "
             "ladder: all of it, then rollouts, labels and training round by round, and the table; "
             "blind, teacher: the small planners of the tables, without pictures; "
             "visual-codes: pictures as codes, for models that imagine; "
@@ -44,6 +44,10 @@ def train(
     failures: Annotated[
         Path | None,
         typer.Option(help="File that `looktwice failures` wrote, for elf-sft: it learns to refine, too."),
+    ] = None,
+    followed: Annotated[
+        Path | None,
+        typer.Option(help="File that `looktwice scenes follow` wrote, for critic."),
     ] = None,
     visual_codes: Annotated[
         Path | None,
@@ -215,6 +219,7 @@ def train(
             reflections,
             visual_codes,
             failures,
+            followed,
         )
         training_curves(target / LOG_FILE, target / "curves.png")
 

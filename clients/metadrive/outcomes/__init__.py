@@ -9,7 +9,7 @@ from looktwice.clients.metadrive.outcomes.replayed_worlds import (
     redriver,
     setting_of,
 )
-from looktwice.clients.metadrive.outcomes.store import outcome_key, outcome_store
+from looktwice.clients.metadrive.outcomes.store import follow_unknown, outcome_store
 from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes
 from looktwice.clients.metadrive.outcomes.workers import WorkerDied, follow_episodes
 from looktwice.clients.metadrive.result_store import ResultStore
@@ -26,9 +26,9 @@ __all__ = [
     "ResultStore",
     "WorkerDied",
     "follow_episodes",
+    "follow_unknown",
     "fork_along",
     "fork_expert",
-    "outcome_key",
     "outcome_store",
     "redriver",
     "setting_of",

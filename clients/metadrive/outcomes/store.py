@@ -1,13 +1,17 @@
-"""Outcomes that are known already."""
+"""Outcomes that are known already, and those that are not: what was followed once is not followed again."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from looktwice.clients.metadrive.generation.redrive import DescribedPilot
 from looktwice.clients.metadrive.outcomes.replayed_worlds import EpisodeSetting, FollowTask
 from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes
+from looktwice.clients.metadrive.outcomes.workers import follow_episodes
 from looktwice.clients.metadrive.result_store import ResultStore
 from looktwice.model.driving.hashing import hash_of
 from looktwice.model.driving.outcome import OUTCOMES_VERSION, Outcome
@@ -32,3 +36,43 @@ def outcome_key(task: FollowTask, setting: EpisodeSetting) -> str:
     told = [moment.scene_id, OUTCOMES_VERSION, asdict(setting)]
     arrays = (moment.history, moment.future, *trajectories)
     return hash_of(told, *(array.astype("<f4").tobytes() for array in arrays))
+
+
+def follow_unknown(
+    asked: Iterable[FollowTask],
+    setting: EpisodeSetting,
+    workers: int,
+    store: ResultStore[MomentOutcomes],
+    makes: Callable[[], DescribedPilot] | None = None,
+) -> Iterator[tuple[str, MomentOutcomes | str]]:
+    """What comes of trajectories, of those that are known first; new outcomes are stored.
+
+    Args:
+        asked: one of each scene.
+        setting: of their episodes.
+        workers: processes.
+        store: of what is known.
+        makes: see `follow_episodes`.
+
+    Yields:
+        Scene ids, each with how its trajectories fared or why that cannot be said.
+
+    Raises:
+        ReplayError: another one drove.
+        WorkerDied: a process died.
+    """
+    keys: dict[str, str] = {}
+    rest: list[FollowTask] = []
+    for task in asked:
+        key = outcome_key(task, setting)
+        if (known := store.find(key)) is not None:
+            yield task.moment.scene_id, known
+        else:
+            keys[task.moment.scene_id] = key
+            rest.append(task)
+    rest.sort(key=lambda task: task.moment.seed)
+    episodes = (list(episode) for _, episode in groupby(rest, lambda task: task.moment.seed))
+    for scene_id, outcomes in follow_episodes(episodes, setting, workers, makes):
+        if not isinstance(outcomes, str):
+            store.store(keys[scene_id], outcomes)
+        yield scene_id, outcomes

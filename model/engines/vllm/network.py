@@ -135,18 +135,22 @@ class LookTwiceForVllm(Qwen2_5_VLForConditionalGeneration):
         super().__init__(vllm_config=vllm_config, prefix=prefix)
         hidden_size = self.config.text_config.hidden_size
         self.settings = settings = VlaSettings.of_config(self.config)
-        stages = settings.sketch_tokens
+        stages, second = settings.sketch_tokens, settings.second_sketch
         with self._mark_tower_model(vllm_config, {*kinds_of(settings)} - {CLIPS}):
             if stages:
-                self.sketch_books = SketchBooks(stages, settings.codec_size)
+                self.sketch_books = SketchBooks(stages, settings.codec_size, curves=second)
             self.history_encoder = HistoryEncoder(hidden_size)
             if settings.with_route:
                 self.route_encoder = RouteEncoder(hidden_size)
             if settings.with_tracks:
-                self.track_reader = TrackReader(hidden_size, sketches=stages > 0)
+                self.track_reader = TrackReader(hidden_size, sketches=stages > 0, second=second)
             if settings.scene_tokens:
                 self.resampler = SceneResampler(
-                    hidden_size, settings.vision_tokens, settings.scene_queries, sketches=stages > 0
+                    hidden_size,
+                    settings.vision_tokens,
+                    settings.scene_queries,
+                    sketches=stages > 0,
+                    second=second,
                 )
 
     @classmethod

@@ -19,7 +19,7 @@ from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.reflection_store import LabelledReflection, write_reflections
 from looktwice.model.driving.scene import LabelledScene, NextFrame
 from looktwice.model.driving.scene_store import write_scenes
-from looktwice.model.network.checkpoint import load, save, with_sketches
+from looktwice.model.network.checkpoint import load, save, with_second_sketches, with_sketches
 from looktwice.model.network.visual_codes import VisualCodes
 from looktwice.model.network.vla_settings import NANO_SETTINGS
 from looktwice.model.training.recipes import NANO, Recipe
@@ -167,7 +167,7 @@ def test_readers_learn_to_sketch_where_they_did_not(scenes: Path, tmp_path: Path
     assert unread is not None
     assert unread.sketch is not None
     assert not torch.equal(reader.sketch.weight, unread.sketch.weight)
-    with pytest.raises(ValueError, match="0 tokens of a sketch"):
+    with pytest.raises(ValueError, match="2 tokens of an intent"):
         run(short("language"), scenes, before, tmp_path / "no", settings, vision_source=tmp_path / "tracks")
 
 
@@ -282,6 +282,22 @@ def test_sketches_are_learned_where_the_prompt_has_them(
     assert books.widths.tolist() == pytest.approx(narrow, rel=0.01), "wide mixtures cannot be copied"
     with pytest.raises(ValueError, match="teaches sketches"):
         run(short("sketched"), scenes, untrained_checkpoint, tmp_path / "no", settings, reflections=file)
+
+
+def test_second_sketches_are_learned_without_reflections(
+    resampling_checkpoint: Path, scenes: Path, tmp_path: Path
+) -> None:
+    file, settings = tmp_path / "reflections.parquet", RunSettings(tmp_path / "cache", bf16=False)
+    write_reflections(file, [reflection(SCENES[3])])
+    wider = with_second_sketches(load(resampling_checkpoint))
+    save(tmp_path / "wider", wider.model, wider.vocabulary, wider.codec, dtype=torch.bfloat16)
+    with pytest.raises(ValueError, match="takes no reflections"):
+        run(short("sketched"), scenes, tmp_path / "wider", tmp_path / "no", settings, reflections=file)
+    run(short("sketched", 2), scenes, tmp_path / "wider", tmp_path / "to", settings)
+    before, after = (load(tmp_path / name).model.state_dict() for name in ("wider", "to"))
+    moved = {name for name, value in before.items() if not torch.equal(value, after[name])}
+    assert not {name for name in moved if "critic" in name or ".sketch." in name}
+    assert {name for name in moved if "second.verdict" in name}
 
 
 def reflection(

@@ -11,10 +11,9 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from looktwice.clients.metadrive.outcomes import outcome_store
+from looktwice.clients.metadrive.outcomes import outcome_store, store
 from looktwice.model.bundled import SCENES
 from looktwice.model.driving.scene_store import MANIFEST
-from looktwice.service.cli import outcomes
 from looktwice.service.cli.commands import app
 
 DRAWS = 2
@@ -53,7 +52,7 @@ def test_what_second_looks_bring(generated: Path, tmp_path: Path, monkeypatch: p
         return iter(())
 
     with monkeypatch.context() as patched:
-        patched.setattr(outcomes, "follow_episodes", nothing_left)
+        patched.setattr(store, "follow_episodes", nothing_left)
         assert told(*asked, "--think-threshold", 0) == first
     # A line that a kill cut short is followed again.
     file = keep.with_name("draws.sqlite.outcomes")
