@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,8 +28,10 @@ from looktwice.model.network.vla import with_own_head
 from looktwice.model.training.batches import collate
 from looktwice.model.training.examples import Examples, load_examples
 from looktwice.model.training.learner import ResponseLearner
+from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.recipes import NANO
 from looktwice.model.training.reflections import PlacedReflections, place_reflections
+from looktwice.model.training.response_targets import Target
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.run import RunSettings
 from looktwice.model.training.sampler import Item
@@ -52,15 +54,30 @@ Looks = npt.NDArray[np.bool_]
 """Whether each of n plans deserves a second look."""
 
 
+class _JudgedPlans(NamedTuple):
+    """Plans of which is known whether they deserve a second look.
+
+    Attributes:
+        states: [n, hidden] that the branch behind each is drawn from.
+        looks: [n], whether it deserves one.
+        episode: int64 [n], of its scene.
+    """
+
+    states: Array
+    looks: Looks
+    episode: npt.NDArray[np.int64]
+
+
 def train_branch(
-    scenes: Path, source: Path, target: Path, reflections: Path, settings: RunSettings
+    scenes: Path, source: Path, target: Path, reflections: Path | None, settings: RunSettings
 ) -> Mapping[str, float]:
-    """Write ``source`` to ``target`` with a branch that is learned from a build's reflections.
+    """Write ``source`` to ``target`` with a branch that is learned alone.
 
     Args:
-        scenes: that the reflections are on, a file or a folder.
+        scenes: to learn on, a file or a folder.
         source, target: checkpoint folders.
-        reflections: of a build with outcomes: those that are judged.
+        reflections: of a build with outcomes, on these scenes: those that are judged count. None for a
+            checkpoint with second sketches, whose critic judges a sketch for every scene.
         settings: ``cache``, ``bf16`` and ``workers`` count.
 
     Returns:
@@ -68,27 +85,39 @@ def train_branch(
         ``think_rate``, and of those looks the share that was right (``right``).
 
     Raises:
-        ValueError: the checkpoint has no branch, or the plans that are judged do not go both ways.
+        ValueError: the checkpoint has no branch, the plans that are judged do not go both ways, or there are
+            reflections where a critic judges, or none where none does.
         CheckpointError: the source cannot be read.
     """
     loaded = load(source)
     options = _options(loaded)
-    examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
-    placed = place_reflections(examples, read_reflections(reflections))
-    places = [place for place, each in enumerate(placed.reflections) if each.judged]
-    looks = np.array([bool(placed.reflections[place].thinking) for place in places], np.bool_)
-    if looks.all() or not looks.any():
+    criticised = loaded.settings.second_sketch
+    if criticised != (reflections is None):
         raise ValueError(
-            f"{reflections}: all plans that are judged go the same way, so nothing tells them apart"
+            f"{loaded.card.name} has a critic that says when to look twice: leave the reflections out"
+            if criticised
+            else f"{loaded.card.name} has no critic: give a build's reflections, --reflections FILE"
         )
+    examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
+    placed = None
+    if reflections is not None:
+        placed = place_reflections(examples, read_reflections(reflections))
+        judged = {bool(each.thinking) for each in placed.reflections if each.judged}
+        if judged != {False, True}:
+            raise ValueError(
+                f"{reflections}: all plans that are judged go the same way, so nothing tells them apart"
+            )
     vision = open_vision(
         loaded, examples, settings.cache, mirrored=True, bf16=settings.bf16, workers=settings.workers
     )
-    states = _states(loaded, options, examples, vision, placed, places)
-    both = np.tile(looks, 2)
-    figures = _held_out(states, both, np.tile(examples.episode[placed.examples[places]], 2))
-    _write(loaded, options, _fitted(states, both))
-    counts = {"reflections_count": int(looks.sum()), "right_plans_count": int((~looks).sum())}
+    plans = _judged_plans(loaded, options, examples, vision, placed)
+    if plans.looks.all() or not plans.looks.any():
+        raise ValueError(
+            f"{loaded.card.name}'s critic judges all sketches alike, so nothing tells them apart"
+        )
+    figures = _held_out(plans)
+    _write(loaded, options, _fitted(plans.states, plans.looks))
+    counts = {"looks_count": int(plans.looks.sum()), "plans_count": len(plans.looks)}
     stages = [*loaded.card.details.get("stages", []), {"name": NAME} | counts | figures]
     save(
         target,
@@ -123,20 +152,15 @@ def _options(loaded: Loaded) -> Tensor:
     return torch.tensor([loaded.vocabulary.encode(text)[0] for text in (branch.direct, branch.reflecting)])
 
 
-@torch.inference_mode()
-def _states(
+def _judged_plans(
     loaded: Loaded,
     options: Tensor,
     examples: Examples,
     vision: VisionCache,
-    placed: PlacedReflections,
-    places: Sequence[int],
-) -> Array:
-    """The states [2 n, hidden] behind the plans of some reflections, as their model was told the scenes.
-
-    The second half of them is of the mirror images.
-    """
-    recipe = NANO["counterfactual"]
+    placed: PlacedReflections | None,
+) -> _JudgedPlans:
+    """All plans that are judged, as the model was told their scenes, and their mirror images behind them."""
+    recipe = NANO["sketched" if placed is None else "counterfactual"]
     responses = ResponseDataset(
         examples,
         loaded.codec,
@@ -145,30 +169,53 @@ def _states(
         recipe.weights,
         pictures=recipe.pictures,
         vision=vision,
-        reflections=placed.reflections,
+        reflections=() if placed is None else placed.reflections,
+        own_plans=OwnPlans(loaded.model, examples, vision) if placed is None else None,
+        sketched=recipe.sketched,
     )
+    assert responses.reflecting is not None
+    items = _items(examples, placed, responses.reflecting)
     loaded.model.set_attn_implementation(MATMUL_ATTENTION)
     learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec).eval()
-    assert responses.reflecting is not None
-    items = [
-        Item(
-            int(placed.examples[place]),
-            responses.reflecting,
-            bool(route),
-            (place,),
-            tracks=bool(tracks),
-            mirror=mirror,
-        )
+    states, looks, episodes = [], list[bool](), list[int]()
+    for start in range(0, len(items), _BATCH):
+        some = items[start : start + _BATCH]
+        samples = [responses[item] for item in some]
+        branches = [
+            (examples.episode[item.index], *_branch(response, options.tolist()))
+            for item, sample in zip(some, samples, strict=True)
+            for response in sample.responses
+        ]
+        with torch.inference_mode():
+            found = learner.states_before(collate(samples), options).double()
+        states.append(found[[taught for _, _, taught in branches]])
+        looks += [looked for _, looked, taught in branches if taught]
+        episodes += [int(episode) for episode, _, taught in branches if taught]
+    return _JudgedPlans(torch.cat(states).numpy(), np.array(looks, np.bool_), np.array(episodes, np.int64))
+
+
+def _items(examples: Examples, placed: PlacedReflections | None, task: str) -> list[Item]:
+    """The prompts behind which plans are judged; without reflections, all that the model may be given."""
+    if placed is not None:
+        return [
+            Item(int(index), task, bool(route), (place,), tracks=bool(tracks), mirror=mirror)
+            for mirror in (False, True)
+            for place, (index, (route, tracks)) in enumerate(zip(placed.examples, placed.told, strict=True))
+            if placed.reflections[place].judged
+        ]
+    return [
+        Item(index, task, bool(examples.has_route[index]), tracks=tracks, mirror=mirror)
         for mirror in (False, True)
-        for place in places
-        for route, tracks in [placed.told[place]]
+        for tracks in (False, True)
+        for index in range(len(examples))
+        if tracks or examples.pictured[index]
     ]
-    states = [
-        learner.states_before(collate([responses[item] for item in items[start : start + _BATCH]]), options)
-        for start in range(0, len(items), _BATCH)
-    ]
-    found: Array = torch.cat(states).double().numpy()
-    return found
+
+
+def _branch(response: Target, options: Sequence[int]) -> tuple[bool, bool]:
+    """Whether a response looks twice, and whether it teaches that; ``options`` as `_options` gives them."""
+    place = next(place for place, id in enumerate(response.ids) if id in options)
+    return response.ids[place] == options[1], response.weights[place] > 0
 
 
 def _write(loaded: Loaded, options: Tensor, difference: Array) -> None:
@@ -182,8 +229,9 @@ def _write(loaded: Loaded, options: Tensor, difference: Array) -> None:
         rows[direct], rows[reflecting] = middle - apart / 2, middle + apart / 2
 
 
-def _held_out(states: Array, looks: Looks, episode: npt.NDArray[np.int64]) -> dict[str, float]:
-    """Figures over all plans, each judged by rows that were fitted without its episode [n]."""
+def _held_out(plans: _JudgedPlans) -> dict[str, float]:
+    """Figures over all plans, each judged by rows that were fitted without its episode."""
+    states, looks, episode = plans
     score = np.zeros(len(looks))
     episodes = np.random.default_rng(0).permutation(np.unique(episode))
     for left_out in np.array_split(episodes, _FOLDS):

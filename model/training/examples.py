@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -106,9 +107,14 @@ class Examples:
         first, last = self.next_spans[index, CAMERAS.index(camera)]
         return self.pictures[first:last].tobytes()
 
+    @cached_property
+    def has_route(self) -> npt.NDArray[np.bool_]:
+        """Which examples have a route, bool [N]."""
+        return np.asarray(np.isfinite(self.route).all(axis=(1, 2)))
+
     def motion(self, index: int, *, mirror: bool, route: bool) -> tuple[FloatArray, FloatArray, bool]:
         """History [16, 4], route [20, 2], and whether it counts: where it is asked for, and known."""
-        known = route and bool(np.isfinite(self.route[index]).all())
+        known = route and bool(self.has_route[index])
         history, way = self.history[index], np.nan_to_num(self.route[index])
         if mirror:
             history, way = history * POSE_MIRROR, way * POSE_MIRROR[:2]

@@ -126,7 +126,7 @@ def read_facts(
             for start in range(0, len(with_pictures), _BATCH):
                 places = with_pictures[start : start + _BATCH]
                 seen = np.stack([vision.tokens(int(place), bool(side)) for place in places])
-                known = np.isfinite(examples.route[places]).all(axis=(1, 2)) & bool(has_route)
+                known = examples.has_route[places] & bool(has_route)
                 inputs = (seen.astype(np.float32), history[places], route[places], known)
                 gathered = vla.resampler.gather(*(torch.from_numpy(each).to(device) for each in inputs))
                 read[places, side, has_route] = likely(vla.resampler.facts(gathered)).cpu().numpy()

@@ -71,7 +71,7 @@ class LookLearner(nn.Module):
                 "motion": examples.dense_motion,
                 "history": examples.history,
                 "route": np.nan_to_num(examples.route),
-                "has_route": np.isfinite(examples.route).all(axis=(1, 2)),
+                "has_route": examples.has_route,
                 "futures": examples.future,
             }.items()
         }

@@ -463,6 +463,7 @@ def _prepare(
         planner.tokens.requires_grad_(True)
         if planner.second is not None:
             planner.second.verdict.requires_grad_(True)
+            planner.second.mark.requires_grad_(True)
     if loaded.model.sketch_books is not None:
         loaded.model.sketch_books.requires_grad_(False)
     learner = ResponseLearner(
@@ -490,9 +491,8 @@ def _prepare(
         if not places:
             raise ValueError(f"recipe {recipe.name} judges draws, and no scene with pictures tells the road")
         return judging, ScenePlaces(places), None, collate_places
-    has_route = np.asarray(np.isfinite(examples.route).all(axis=(1, 2)))
     sampler = TaskSampler(
-        has_route,
+        examples.has_route,
         recipe.batch_size,
         recipe.tasks,
         recipe.route_share,

@@ -39,7 +39,7 @@ def train(
     vision_from: Annotated[Path | None, typer.Option(help="Checkpoint whose vision tower is taken.")] = None,
     reflections: Annotated[
         Path | None,
-        typer.Option(help="A build's reflections, for counterfactual, multi-round, sketched, branch."),
+        typer.Option(help="A build's reflections, for counterfactual, multi-round, and, where no critic judges, sketched and branch."),
     ] = None,
     failures: Annotated[
         Path | None,
@@ -153,10 +153,8 @@ def train(
         mixed = bfloat16_is_fast("cuda" if gpu else "cpu") if bf16 is None else bf16
         run_settings = RunSettings(cache, bf16=mixed, compiled=compiled, use_cpu=not gpu, workers=workers)
         if recipe == BRANCH:
-            if source is None or reflections is None:
-                raise ValueError(
-                    "give the checkpoint and what it learns from: --from FOLDER --reflections FILE"
-                )
+            if source is None:
+                raise ValueError("give the checkpoint to start from: --from FOLDER")
             _tell(train_branch(scenes, source, target, reflections, run_settings))
             return
         if recipe == "ladder":

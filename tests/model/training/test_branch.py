@@ -16,12 +16,17 @@ from looktwice.model.driving.plan import Plan, parse_plan
 from looktwice.model.driving.reflection_store import LabelledReflection, write_reflections
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.driving.trajectory import present_speed
 from looktwice.model.engines.engine import Controls, DrawFinished, PlanRequest
 from looktwice.model.engines.torch.engine import TorchEngine
-from looktwice.model.network.checkpoint import load
+from looktwice.model.network.checkpoint import load, save, with_second_sketches
 from looktwice.model.training.branch import train_branch
+from looktwice.model.training.examples import Examples
+from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.run import RunSettings
+from looktwice.model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
+from tests.model.training.second_sketches import standing_still
 
 WAIT = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
 KEEP = parse_plan("- longitudinal\n  - 0.0s-6.4s: Keep Speed\n")
@@ -89,6 +94,44 @@ def think_probabilities(checkpoint: Path, plan: Plan) -> np.ndarray[tuple[int], 
         return [event.draw.think_probability for event in events if isinstance(event, DrawFinished)]
 
     return np.array(asyncio.run(ask()), np.float64)
+
+
+def test_behind_a_critic_it_is_learned_without_reflections(
+    resampling_checkpoint: Path, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, target, settings = tmp_path / "from", tmp_path / "to", RunSettings(tmp_path / "cache", bf16=False)
+    critical = with_second_sketches(load(resampling_checkpoint))
+    save(source, critical.model, critical.vocabulary, critical.codec, dtype=torch.bfloat16, details={})
+    examples = Examples.from_scenes(SCENES, critical.settings.cameras)
+    fast = np.array([present_speed(history) > 10 for history in examples.history])
+    own_plans = OwnPlans(
+        critical.model, examples, open_vision(critical, examples, settings.cache, mirrored=True)
+    )
+    choices = {}
+    for tracks in (False, True):
+        found = standing_still(own_plans, examples, critical.codec, range(len(SCENES)), tracks=tracks)
+        choices[tracks] = found._replace(gains=found.gains * fast)
+    monkeypatch.setattr(OwnPlans, "seconds", lambda _, *, tracks: choices[tracks])
+    figures = train_branch(scenes, source, target, None, settings)
+    assert figures["auc"] > 0.75, "a state knows how fast the ego is, even before it has learned"
+    [stage] = load(target).card.details["stages"]
+    assert stage["plans_count"] == 4 * len(SCENES), "with and without tracks, mirrored too"
+    assert stage["looks_count"] == 4 * sum(fast)
+
+
+def test_either_reflections_or_a_critic_say_when(
+    resampling_checkpoint: Path, scenes: Path, tmp_path: Path
+) -> None:
+    critical, target = tmp_path / "from", tmp_path / "to"
+    file, settings = tmp_path / "reflections.parquet", RunSettings(tmp_path / "cache", bf16=False)
+    write_reflections(file, [judged(SCENES[0], WAIT, TEXT)])
+    loaded = with_second_sketches(load(resampling_checkpoint))
+    save(critical, loaded.model, loaded.vocabulary, loaded.codec, dtype=torch.bfloat16, details={})
+    with pytest.raises(ValueError, match="has a critic that says when to look twice: leave the reflections"):
+        train_branch(scenes, critical, target, file, settings)
+    with pytest.raises(ValueError, match="has no critic: give a build's reflections"):
+        train_branch(scenes, resampling_checkpoint, target, None, settings)
+    assert not target.exists()
 
 
 def test_plans_that_all_go_one_way_are_refused(

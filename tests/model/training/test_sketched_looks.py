@@ -15,7 +15,6 @@ from looktwice.model.driving.plan import Plan, parse_plan
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
 from looktwice.model.families.cf_vla.targets import NANO_WEIGHTS
 from looktwice.model.network.checkpoint import Loaded, load, with_second_sketches
-from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.intent import INTENT_TOKENS
 from looktwice.model.training.batches import stacked
 from looktwice.model.training.examples import Examples
@@ -23,9 +22,10 @@ from looktwice.model.training.intents import IntentDataset
 from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.sampler import Item
-from looktwice.model.training.sketched_looks import SecondSketches, second_look
+from looktwice.model.training.sketched_looks import second_look
 from looktwice.model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
+from tests.model.training.second_sketches import standing_still
 
 EXAMPLES = Examples.from_scenes((training_scene(index) for index in range(8)), (FRONT_WIDE, FRONT_TELE))
 LEAD = Thing("vehicle", "my lane", 20, "slower")
@@ -110,21 +110,6 @@ def test_what_is_copied_stands_in_the_prompt(
     assert (told - prompt[:, -2 * stages - 1 : -stages - 1]).abs().amax() > 0.01, "not twice the same"
 
 
-def chosen(own_plans: OwnPlans, codec: TrajectoryCodec, *, tracks: bool, gain: float = 1.0) -> SecondSketches:
-    """As a critic might choose: to stand still behind whoever is ahead, or, every other time, the sketch."""
-    found = own_plans.seconds(tracks=tracks)
-    assert found is not None
-    vectors, places = found.vectors.copy(), range(len(EXAMPLES))
-    stands = codec.vectors(EXAMPLES.history, np.zeros_like(EXAMPLES.future))
-    for mirror in (False, True):
-        for route in (False, True):
-            for place in places:
-                sketch = own_plans.sketch(place, mirror=mirror, route=route, tracks=tracks)
-                vectors[int(mirror), int(route), place] = sketch if place % 2 == 0 else stands[place]
-    ahead = IntentDataset(EXAMPLES, None, 1.0).look(1, mirror=False, route=True).facts
-    return SecondSketches(vectors, np.broadcast_to(ahead, found.facts.shape), np.full_like(found.gains, gain))
-
-
 def dataset(loaded: Loaded, own_plans: OwnPlans) -> ResponseDataset:
     parts = (EXAMPLES, loaded.codec, loaded.inputs, loaded.vocabulary, NANO_WEIGHTS)
     return ResponseDataset(*parts, pictures=True, own_plans=own_plans, sketched=True)
@@ -141,7 +126,10 @@ def items() -> list[Item]:
 def test_second_looks_lead_to_the_second_sketch(
     loaded: Loaded, own_plans: OwnPlans, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    choices = {tracks: chosen(own_plans, loaded.codec, tracks=tracks) for tracks in (False, True)}
+    choices = {
+        tracks: standing_still(own_plans, EXAMPLES, loaded.codec, range(1, 8, 2), tracks=tracks)
+        for tracks in (False, True)
+    }
     monkeypatch.setattr(OwnPlans, "seconds", lambda _, *, tracks: choices[tracks])
     data, looks, others = dataset(loaded, own_plans), 0, 0
     for item in items() * 6:
@@ -167,7 +155,11 @@ def test_second_looks_lead_to_the_second_sketch(
 def test_the_critic_says_which_sketches_deserve_a_look(
     loaded: Loaded, own_plans: OwnPlans, monkeypatch: pytest.MonkeyPatch, gain: float
 ) -> None:
-    choices = {tracks: chosen(own_plans, loaded.codec, tracks=tracks, gain=gain) for tracks in (False, True)}
+    choices = {
+        tracks: standing_still(own_plans, EXAMPLES, loaded.codec, range(1, 8, 2), tracks=tracks)
+        for tracks in (False, True)
+    }
+    choices = {key: each._replace(gains=gain * each.gains) for key, each in choices.items()}
     monkeypatch.setattr(OwnPlans, "seconds", lambda _, *, tracks: choices[tracks])
     data, taught = dataset(loaded, own_plans), Counter[str]()
     for item in items() * 6:
