@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import typer
 
@@ -39,7 +39,10 @@ def train(
     vision_from: Annotated[Path | None, typer.Option(help="Checkpoint whose vision tower is taken.")] = None,
     reflections: Annotated[
         Path | None,
-        typer.Option(help="A build's reflections, for counterfactual, multi-round, and, where no critic judges, sketched and branch."),
+        typer.Option(
+            help="A build's reflections, for counterfactual, multi-round and, without a critic, for sketched "
+            "and branch."
+        ),
     ] = None,
     failures: Annotated[
         Path | None,
@@ -144,6 +147,7 @@ def train(
             _tell({f"codec {name}": value for name, value in figures.items()})
             return
         if recipe in DRIVING_KINDS:
+            _refuse_others(context, recipe, "steps seed validation rounds round_episodes")
             codec_from = source or BUNDLED_CHECKPOINT
             settings = SmallSettings(seed=seed, steps=steps or SmallSettings.steps)
             train_small_in_rounds(
@@ -153,6 +157,7 @@ def train(
         mixed = bfloat16_is_fast("cuda" if gpu else "cpu") if bf16 is None else bf16
         run_settings = RunSettings(cache, bf16=mixed, compiled=compiled, use_cpu=not gpu, workers=workers)
         if recipe == BRANCH:
+            _refuse_others(context, recipe, "reflections cache bf16 workers")
             if source is None:
                 raise ValueError("give the checkpoint to start from: --from FOLDER")
             _tell(train_branch(scenes, source, target, reflections, run_settings))
@@ -225,6 +230,16 @@ def train(
 def _tell(figures: Mapping[str, float]) -> None:
     for name, value in figures.items():
         typer.echo(f"{name} {value:.3f}")
+
+
+_ALWAYS: Final = ("recipe", "scenes", "target", "source", "threads")
+
+
+def _refuse_others(context: typer.Context, recipe: str, taken: str) -> None:
+    """Raise ValueError for options that a recipe would ignore; ``taken`` names its own."""
+    others = [each for each in _options(context, (*_ALWAYS, *taken.split())) if each.startswith("--")]
+    if others:
+        raise ValueError(f"{recipe} takes no {', '.join(others)}")
 
 
 def _options(context: typer.Context, but: Sequence[str]) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from typer.testing import CliRunner, Result
 
 from looktwice.model.driving.scene_store import write_scenes
@@ -40,4 +41,19 @@ def test_what_is_no_backbone_is_refused_by_name(tmp_path: Path) -> None:
     refused = ran(*asked, "--from", tmp_path / "none", "--to", tmp_path / "made")
     assert refused.exit_code == 2
     assert "no config.json" in refused.output
+    assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.parametrize(
+    ("recipe", "ignored"),
+    [("branch", ["--failures", "failures.parquet"]), ("branch", ["--steps", "5"]), ("blind", ["--compiled"])],
+)
+def test_options_that_a_recipe_would_ignore_are_refused(
+    tmp_path: Path, recipe: str, ignored: list[str]
+) -> None:
+    scenes = tmp_path / "scenes.parquet"
+    write_scenes(scenes, [training_scene(0)])
+    refused = ran("train", recipe, "--scenes", scenes, "--to", tmp_path / "made", "--threads", "2", *ignored)
+    assert refused.exit_code == 2
+    assert f"{recipe} takes no {ignored[0]}" in refused.output
     assert not (tmp_path / "made").exists()
