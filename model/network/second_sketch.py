@@ -21,8 +21,10 @@ from looktwice.model.network.motion import present_speeds
 from looktwice.model.network.route_line import RouteLine
 
 VERDICT_TOKENS: Final = 1
+LOOK_GAIN: Final = 0.15
+"""A sketch deserves a second look where the second one is so much likelier to hold."""
+_GAIN_WIDTH: Final = 0.05
 _CERTAIN: Final = 6.0
-_GAIN_SCALE: Final = 4.0
 
 
 class CurveSpace(NamedTuple):
@@ -93,10 +95,11 @@ class SecondSketcher(nn.Module):
     def __init__(self, hidden_size: int) -> None:
         super().__init__()
         self.critic = Critic()
-        told = (1 + len(ALTERNATIVES)) * len(VERDICTS) + 1 + len(ALTERNATIVES)
+        told = (1 + len(ALTERNATIVES)) * len(VERDICTS) + len(ALTERNATIVES)
         self.verdict = nn.Linear(told, hidden_size)
-        # Without it, both sketches are the same kind of token, and attention cannot choose between them.
-        self.mark = nn.Parameter(torch.randn(hidden_size) / hidden_size**0.5)
+        # Without a mark, both sketches are the same kind of token. It is as long as a code's embedding, and
+        # the same in all planners, as is what says that a look pays: what begins small is found late.
+        self.mark, self.gain = _direction(1, hidden_size), _direction(2, hidden_size)
 
     def forward(self, sketch: Tensor, space: CurveSpace, known: Known) -> SecondSketch:
         """What else might be driven than sketches [b, d], vectors of the codec's space."""
@@ -125,9 +128,16 @@ class SecondSketcher(nn.Module):
         """The verdict as a token [b, 1, hidden]."""
         which = nn.functional.one_hot(found.places, len(ALTERNATIVES)).to(found.verdicts.dtype)
         verdicts = found.verdicts.clamp_min(-_CERTAIN).flatten(1) / 3
-        told = torch.cat([verdicts, _GAIN_SCALE * found.gains[:, None], which], dim=1)
-        token: Tensor = self.verdict(told.to(self.verdict.weight.dtype))
+        told = torch.cat([verdicts, which], dim=1).to(self.gain.dtype)
+        deserves = torch.tanh((found.gains - LOOK_GAIN) / _GAIN_WIDTH).to(self.gain.dtype)
+        token: Tensor = self.verdict(told) + deserves[:, None] * self.gain
         return token[:, None]
+
+
+def _direction(number: int, size: int) -> nn.Parameter:
+    """A direction [size] of length 1, the same on every device; two numbers' have little in common."""
+    chirp = torch.sin(number * torch.arange(size, dtype=torch.float32).square())
+    return nn.Parameter(nn.functional.normalize(chirp, dim=0))
 
 
 def _kept_speed(history: Tensor) -> Tensor:

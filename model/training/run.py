@@ -462,8 +462,8 @@ def _prepare(
         planner.requires_grad_(planner.sketch is None)
         planner.tokens.requires_grad_(True)
         if planner.second is not None:
-            planner.second.verdict.requires_grad_(True)
-            planner.second.mark.requires_grad_(True)
+            planner.second.requires_grad_(True)
+            planner.second.critic.requires_grad_(False)
     if loaded.model.sketch_books is not None:
         loaded.model.sketch_books.requires_grad_(False)
     learner = ResponseLearner(

@@ -23,14 +23,12 @@ from looktwice.model.driving.reasons import reasons_read
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.families.family import Counterfactual
 from looktwice.model.network.codec import TrajectoryCodec
-from looktwice.model.network.second_sketch import CurveSpace, Known
+from looktwice.model.network.second_sketch import LOOK_GAIN, CurveSpace, Known
 from looktwice.model.training.batches import stacked
 from looktwice.model.training.intents import IntentDataset
 
 Around = Literal["tracks", "read"]
 """What a planner goes by: tracks, or facts that are read from pictures."""
-LOOK_GAIN: Final = 0.15
-"""A sketch deserves a second look where the second one is so much likelier to hold."""
 _BATCH: Final = 256
 
 
