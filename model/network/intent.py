@@ -198,6 +198,7 @@ class IntentReader(nn.Module):
         if self.second is not None:
             assert codes.space is not None, "second sketches need the codec's space"
             found = self.second(sketch.float() * codes.spread, codes.space, known)
+            parts[0] = tokens + self.second.doubt(found).to(tokens.dtype)
             second = codes.tokens(found.vectors / codes.spread)
             parts += [self.second.token(found), self.second.marked(second)]
         return torch.cat([part.to(tokens.dtype) for part in parts], dim=1)

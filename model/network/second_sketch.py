@@ -99,7 +99,7 @@ class SecondSketcher(nn.Module):
         self.verdict = nn.Linear(told, hidden_size)
         # Without a mark, both sketches are the same kind of token. It is as long as a code's embedding, and
         # the same in all planners, as is what says that a look pays: what begins small is found late.
-        self.mark, self.gain = _direction(1, hidden_size), _direction(2, hidden_size)
+        self.mark, self.pays = _direction(1, hidden_size), _direction(2, hidden_size)
 
     def forward(self, sketch: Tensor, space: CurveSpace, known: Known) -> SecondSketch:
         """What else might be driven than sketches [b, d], vectors of the codec's space."""
@@ -128,10 +128,17 @@ class SecondSketcher(nn.Module):
         """The verdict as a token [b, 1, hidden]."""
         which = nn.functional.one_hot(found.places, len(ALTERNATIVES)).to(found.verdicts.dtype)
         verdicts = found.verdicts.clamp_min(-_CERTAIN).flatten(1) / 3
-        told = torch.cat([verdicts, which], dim=1).to(self.gain.dtype)
-        deserves = torch.tanh((found.gains - LOOK_GAIN) / _GAIN_WIDTH).to(self.gain.dtype)
-        token: Tensor = self.verdict(told) + deserves[:, None] * self.gain
+        token: Tensor = self.verdict(torch.cat([verdicts, which], dim=1).to(self.verdict.weight.dtype))
         return token[:, None]
+
+    def doubt(self, found: SecondSketch) -> Tensor:
+        """Whether a second look pays, [b, 1, hidden], to be added to the tokens of the planner's state.
+
+        Behind each plan the decoder looks at these anyway, and so reads it at once; in a token of its own, a
+        thousand steps did not teach it to look there.
+        """
+        pays = torch.tanh((found.gains - LOOK_GAIN) / _GAIN_WIDTH)
+        return (pays[:, None].to(self.pays.dtype) * self.pays)[:, None]
 
 
 def _direction(number: int, size: int) -> nn.Parameter:

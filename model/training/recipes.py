@@ -14,7 +14,12 @@ from typing import Any, Final, Literal
 from looktwice.model.driving.pdm.comfort import Version
 from looktwice.model.driving.pdm.judged import THRESHOLD
 from looktwice.model.engines.engine import Decision
-from looktwice.model.families.cf_vla.targets import CODE_WEIGHTS, NANO_WEIGHTS, PAPER_WEIGHTS
+from looktwice.model.families.cf_vla.targets import (
+    CODE_WEIGHTS,
+    NANO_WEIGHTS,
+    PAPER_WEIGHTS,
+    SKETCHED_WEIGHTS,
+)
 from looktwice.model.families.elf_vla import targets as elf_vla
 from looktwice.model.families.vla_world import targets as vla_world
 from looktwice.model.families.vla_world.rewards import REWARDS as VLA_WORLD_REWARDS
@@ -250,6 +255,7 @@ NANO: Final[Mapping[str, Recipe]] = (
             steps=1500,
             learning_rate=3e-4,
             sketched=True,
+            weights=SKETCHED_WEIGHTS,
             blur_share=0.0,  # the prompt of a blurred history sketches otherwise
         ),
         "cf-rl": replace(

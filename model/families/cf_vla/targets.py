@@ -31,6 +31,10 @@ NANO_WEIGHTS: Final = _weights(3.0, 10.0)
 """A model from scratch learns trajectories too, which the paper's brings along. The tenths of a plan's times
 are next to unknowable: with the paper's weights their noise drowns what codes teach."""
 
+SKETCHED_WEIGHTS: Final[Mapping[str, float]] = MappingProxyType({**NANO_WEIGHTS, BRANCH: 60.0})
+"""What a critic says of a sketch stands in one token of the prompt, and the branch alone needs it: among a
+hundred words that weigh as much, it is hardly ever read."""
+
 CODE_WEIGHTS: Final = _weights(0.0, 10.0)
 """Codes alone: beside what a model learns from its own draws, which decide about words."""
 

@@ -13,8 +13,14 @@ from looktwice.model.driving.scene import Scene
 from looktwice.model.network.alternatives import ALTERNATIVES
 from looktwice.model.network.checkpoint import Loaded, create_nano, load, save, with_second_sketches
 from looktwice.model.network.codec import TrajectoryCodec
-from looktwice.model.network.intent import IntentReader
-from looktwice.model.network.second_sketch import VERDICT_TOKENS, CurveSpace, Known
+from looktwice.model.network.intent import INTENT_TOKENS, IntentReader
+from looktwice.model.network.second_sketch import (
+    LOOK_GAIN,
+    VERDICT_TOKENS,
+    CurveSpace,
+    Known,
+    SecondSketch,
+)
 from looktwice.model.network.vla_settings import NANO_SETTINGS, SettingsError
 from looktwice.model.network.vocabulary import Vocabulary
 from tests.model.network.conftest import CODEC_SIZE, made_up_scene
@@ -57,10 +63,25 @@ def test_a_prompt_has_them_behind_the_first_sketch(before: Loaded, loaded: Loade
             each.model.encode_prompt_embeddings(each.inputs.build(scene, "cf_vla")).embeddings
             for each in (before, loaded)
         )
-    assert len(other) == len(one) + MORE * (2 if scene.tracks is not None else 1)
-    # Codebooks are filled anew, in full precision.
+    planners = 2 if scene.tracks is not None else 1
+    assert len(other) == len(one) + MORE * planners
+    # Codebooks are filled anew, in full precision. The tokens of a state tell more than they did.
     kept = [each for each in one if ((other - each).abs().amax(dim=1) < 0.05).any()]
-    assert len(kept) == len(one)
+    assert len(kept) == len(one) - INTENT_TOKENS * planners
+
+
+def test_a_state_tells_whether_a_look_pays(loaded: Loaded) -> None:
+    assert loaded.model.track_reader is not None
+    second = loaded.model.track_reader.second
+    assert second is not None
+    holds = torch.tensor([[0.5, 0.9, 0.2], [0.5, 0.6, 0.1], [0.5, 0.5 + LOOK_GAIN, 0.1]])
+    verdicts = torch.stack([holds, 1 - holds], dim=2).log()
+    found = SecondSketch(torch.zeros(3, 20), verdicts, verdicts[:, 1:, 0].argmax(dim=1))
+    with torch.inference_mode():
+        told = second.doubt(found)[:, 0] @ second.pays
+    assert told[0] > 0.95
+    assert told[1] < -0.7
+    assert abs(told[2]) < 1e-5
 
 
 @pytest.mark.parametrize("by", ["facts", "tracks"])
