@@ -115,8 +115,8 @@ def train_branch(
         raise ValueError(
             f"{loaded.card.name}'s critic judges all sketches alike, so nothing tells them apart"
         )
-    figures = _held_out(plans)
-    _write(loaded, options, _fitted(plans.states, plans.looks))
+    figures, level = _held_out(plans)
+    _write(loaded, options, _fitted(plans.states, plans.looks) - level * _constant(plans.states))
     counts = {"looks_count": int(plans.looks.sum()), "plans_count": len(plans.looks)}
     stages = [*loaded.card.details.get("stages", []), {"name": NAME} | counts | figures]
     save(
@@ -229,8 +229,12 @@ def _write(loaded: Loaded, options: Tensor, difference: Array) -> None:
         rows[direct], rows[reflecting] = middle - apart / 2, middle + apart / 2
 
 
-def _held_out(plans: _JudgedPlans) -> dict[str, float]:
-    """Figures over all plans, each judged by rows that were fitted without its episode."""
+def _held_out(plans: _JudgedPlans) -> tuple[dict[str, float], float]:
+    """Figures over all plans, each judged by rows that were fitted without its episode.
+
+    And the log odds beyond which as many are looked at as deserve it. Few plans are likelier to deserve that
+    than not, however well they are told apart: beyond even odds, most looks would be missed.
+    """
     states, looks, episode = plans
     score = np.zeros(len(looks))
     episodes = np.random.default_rng(0).permutation(np.unique(episode))
@@ -238,13 +242,22 @@ def _held_out(plans: _JudgedPlans) -> dict[str, float]:
         out = np.isin(episode, left_out)
         if out.any() and not out.all():
             score[out] = states[out] @ _fitted(states[~out], looks[~out])
-    thinks, area = score > 0, auc(score, looks)
+    level, area = float(np.quantile(score, 1 - looks.mean())), auc(score, looks)
     assert area is not None, "plans go both ways"
-    return {
+    thinks = score > level
+    figures = {
         "auc": area,
         "think_rate": float(thinks.mean()),
         "right": float(looks[thinks].mean()) if thinks.any() else 0.0,
     }
+    return figures, level
+
+
+def _constant(states: Array) -> Array:
+    """The direction [hidden] along which all states lie at 1; they are normed, and have a large mean."""
+    curve = states.T @ states + np.eye(states.shape[1])
+    direction: Array = np.linalg.solve(curve, states.sum(axis=0))
+    return direction
 
 
 def _fitted(states: Array, looks: Looks) -> Array:
