@@ -256,6 +256,7 @@ NANO: Final[Mapping[str, Recipe]] = (
             learning_rate=3e-4,
             sketched=True,
             weights=SKETCHED_WEIGHTS,
+            head_weight=0.0,  # a head that starts from nothing drowns what little there is to learn
             blur_share=0.0,  # the prompt of a blurred history sketches otherwise
         ),
         "cf-rl": replace(
