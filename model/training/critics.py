@@ -22,7 +22,6 @@ from looktwice.model.driving.trajectory import POSE_MIRROR, FloatArray
 from looktwice.model.evaluation.perception import auc
 from looktwice.model.network.critic import Critic, objects_of_facts, objects_of_tracks
 from looktwice.model.network.route_line import RouteLine
-from looktwice.model.network.track_features import MIRRORED, without_route
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.training.batches import stacked
 from looktwice.model.training.examples import Examples
@@ -106,11 +105,9 @@ class VerdictDataset(Dataset[VerdictSample]):
         """One trajectory as it is asked for."""
         place = int(self._placed.examples[index])
         history, way, has_route = self._examples.motion(place, mirror=mirror, route=route)
-        tracks, poses = self._examples.tracks[place].copy(), self._placed.poses[index]
-        if not has_route:
-            tracks = without_route(tracks)
+        tracks = self._examples.tracks_given(place, mirror=mirror, route=has_route)
+        poses = self._placed.poses[index]
         if mirror:
-            tracks[:, MIRRORED] *= -1
             poses = poses * POSE_MIRROR
         return VerdictSample(
             history,

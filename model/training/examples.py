@@ -30,7 +30,7 @@ from looktwice.model.driving.trajectory import POSE_MIRROR, FloatArray
 from looktwice.model.driving.whole_files import written_whole
 from looktwice.model.families.family import LessonPart
 from looktwice.model.network.inputs import InputBuilder
-from looktwice.model.network.track_features import track_features
+from looktwice.model.network.track_features import MIRRORED, track_features, without_route
 from looktwice.model.training.dense import coarse, no_target, relative_motion
 
 CACHE_VERSION: Final = 8
@@ -119,6 +119,13 @@ class Examples:
         if mirror:
             history, way = history * POSE_MIRROR, way * POSE_MIRROR[:2]
         return history, way, known
+
+    def tracks_given(self, index: int, *, mirror: bool, route: bool) -> FloatArray:
+        """Tracks [16, features]; without a route, what they tell of it is left out."""
+        tracks = self.tracks[index].copy() if route else without_route(self.tracks[index])
+        if mirror:
+            tracks[:, MIRRORED] *= -1
+        return tracks
 
     def thought(self, index: int) -> Thoughts | None:
         """The expert's thoughts; None where they are not known."""

@@ -25,7 +25,6 @@ from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.fact_reader import likely
 from looktwice.model.network.intent import IntentTrunk
 from looktwice.model.network.motion import present_speeds
-from looktwice.model.network.track_features import MIRRORED, without_route
 from looktwice.model.network.trajectory_head import TrajectoryHead
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.training.batches import mean_values
@@ -84,12 +83,10 @@ class IntentDataset(Dataset[IntentSample]):
         examples = self._examples
         history, way, has_route = examples.motion(index, mirror=mirror, route=route)
         future, facts = examples.future[index], examples.facts[index]
-        tracks, bins = examples.tracks[index].copy(), examples.plan_bins[index]
-        if not has_route:
-            tracks = without_route(tracks)
+        tracks = examples.tracks_given(index, mirror=mirror, route=has_route)
+        bins = examples.plan_bins[index]
         if mirror:
             future = future * POSE_MIRROR
-            tracks[:, MIRRORED] *= -1
             bins, facts = self._mirrored_bins[index], mirrored(facts)
         read = self._nothing if self._read is None else self._read[index, int(mirror), int(has_route)]
         return IntentSample(history, way, np.array(has_route), tracks, future, bins, facts, read)

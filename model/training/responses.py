@@ -35,7 +35,6 @@ from looktwice.model.network.chat_prompt import motion_text
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.patches import patchify
-from looktwice.model.network.track_features import MIRRORED, without_route
 from looktwice.model.network.visual_codes import Frame, VisualCodes, frame_of
 from looktwice.model.network.vocabulary import Vocabulary
 from looktwice.model.training.batches import Array, ResponseSample
@@ -157,13 +156,12 @@ class ResponseDataset(Dataset[ResponseSample]):
     def __getitem__(self, item: Item) -> ResponseSample:
         examples, index, pictures = self._examples, item.index, self._pictures and item.pictures
         history, future = examples.history[index], examples.future[index]
-        route, tracks = np.nan_to_num(examples.route[index]), examples.tracks[index]
+        route = np.nan_to_num(examples.route[index])
+        tracks = examples.tracks_given(index, mirror=item.mirror, route=item.route)
         plan, thoughts = examples.plan(index), examples.thought(index)
         perceived = examples.perception(index)
-        tracks = tracks.copy() if item.route else without_route(tracks)
         if item.mirror:
             history, future, route = history * POSE_MIRROR, future * POSE_MIRROR, route * POSE_MIRROR[:2]
-            tracks[:, MIRRORED] *= -1
             plan = plan.mirrored()
             thoughts = None if thoughts is None else thoughts.mirrored()
             perceived = None if perceived is None else perceived.mirrored()
