@@ -37,6 +37,11 @@ REPLICAS = 2
 """As many as are added to the one at the beginning make."""
 BURST = 2 * (REPLICAS * ONGOING + QUEUED)
 START_S = 600
+PATIENT: Final = {
+    "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
+    "RAY_SERVE_PROXY_HEALTH_CHECK_TIMEOUT_S": "60",
+}
+"""By default Ray kills a proxy that has not started within 5 s, which a busy machine takes longer for."""
 ANSWER_S = 120
 
 
@@ -76,7 +81,7 @@ def serving(configuration: Path) -> Iterator[tuple[str, psutil.Process]]:
         process = subprocess.Popen(
             [Path(sys.executable).parent / "serve", "run", "--address", "local", configuration],
             cwd=ROOT,
-            env=os.environ | {"RAY_USAGE_STATS_ENABLED": "0"},
+            env=os.environ | {"RAY_USAGE_STATS_ENABLED": "0"} | PATIENT,
             stdout=told,
             stderr=told,
             # A shell's background jobs ignore it, and `serve run` ends by nothing else.
