@@ -72,6 +72,14 @@ from looktwice.model.training.looks import LookLearner
 from looktwice.model.training.open_loop_validation import open_loop
 from looktwice.model.training.outcome.outcome_learner import OutcomeLearner, ScenePlaces, collate_places
 from looktwice.model.training.own_plans import OwnPlans
+from looktwice.model.training.recipe_checks import (
+    check_checkpoint,
+    check_files,
+    check_pictures,
+    check_reflections,
+    check_vision,
+    taught_by,
+)
 from looktwice.model.training.recipes import Recipe
 from looktwice.model.training.reflections import PlacedReflections, place_reflections
 from looktwice.model.training.responses import ResponseDataset
@@ -187,25 +195,13 @@ def run(
             that scenes bring; it teaches sketches, and ``source`` has none; only one of ``source`` and
             ``vision_source`` writes sketches.
     """
-    if failures is not None and recipe.attempting is None:
-        raise ValueError(f"recipe {recipe.name} takes no failures")
     loaded = load(source)
-    # What second sketches change is learned from all scenes, and no reflection of a build tells it.
-    told = recipe.sketched and loaded.settings.second_sketch
-    if (reflections is None) != (recipe.reflections is None or told):
-        wants = "needs reflections" if reflections is None else "takes no reflections"
-        why = f": {loaded.card.name} tells in the prompt what else might be driven" if told else ""
-        raise ValueError(f"recipe {recipe.name} {wants}{why}")
-    _check_refining(recipe, loaded)
+    check_files(recipe, loaded, reflections=reflections, failures=failures, followed=followed)
+    check_checkpoint(recipe, loaded)
     refining = [recipe.attempting] if failures is not None and recipe.attempting is not None else []
     if new := [task for task in (*recipe.tasks, *refining) if task not in loaded.settings.formats]:
         loaded = with_formats(loaded, new, seed=recipe.seed)
-    if (followed is None) != (recipe.goal != "judge"):
-        wants = "needs followed trajectories" if followed is None else "takes no followed trajectories"
-        raise ValueError(f"recipe {recipe.name} {wants}")
     if recipe.goal == "judge" and not loaded.settings.second_sketch:
-        if not loaded.settings.sketch_tokens:
-            raise ValueError(f"recipe {recipe.name} judges sketches, and {loaded.card.name} writes none")
         loaded = with_second_sketches(loaded, seed=recipe.seed)
     if recipe.goal == "read" and not loaded.settings.sketch_tokens:
         loaded = with_sketches(loaded, NANO_SETTINGS.sketch_tokens, seed=recipe.seed)
@@ -214,12 +210,7 @@ def run(
     stages = list(loaded.card.details.get("stages", []))
     if vision_source is not None:
         vision = load(vision_source)
-        if vision.settings.intent_tokens != loaded.settings.intent_tokens:
-            raise ValueError(
-                f"{source} has {loaded.settings.intent_tokens} tokens of an intent and {vision_source} "
-                f"{vision.settings.intent_tokens}: `looktwice train read-scene` gives sketches to one "
-                "without, and `looktwice train critic` second ones"
-            )
+        check_vision(source, loaded, vision_source, vision)
         for mine, theirs in zip(vision_parts(loaded.model), vision_parts(vision.model), strict=True):
             mine.load_state_dict(theirs.state_dict())
         stages += [stage for stage in vision.card.details.get("stages", []) if stage not in stages]
@@ -228,19 +219,18 @@ def run(
     loaded.model.set_attn_implementation(MATMUL_ATTENTION)
     torch.manual_seed(recipe.seed)
     examples = load_examples(scenes, settings.cache, loaded.settings.cameras)
-    _check_pictures(recipe, examples, loaded)
+    check_pictures(recipe, examples, loaded)
     if recipe.sketched:
-        if loaded.model.sketch_books is None:
-            raise ValueError(f"recipe {recipe.name} teaches sketches, and {loaded.card.name} has none")
+        assert loaded.model.sketch_books is not None, "which write sketches"
         # Older checkpoints sketch in mixtures too wide to be copied.
         loaded.model.sketch_books.fill(loaded.codec)
     validate: Validate | None = None
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
-    taught = _taught_by(recipe, examples)
+    taught = taught_by(recipe, examples)
     on_examples = None if reflections is None else place_reflections(examples, read_reflections(reflections))
-    if on_examples is not None and on_examples.told[:, 1].any() and not loaded.settings.with_tracks:
-        raise ValueError(f"{reflections} has plans made with tracks, which {loaded.card.name} cannot be told")
+    if reflections is not None and on_examples is not None:
+        check_reflections(reflections, on_examples, loaded)
     tried = None
     if failures is not None and recipe.attempting is not None:
         times_s = family_named(recipe.attempting).times_s
@@ -317,46 +307,6 @@ def _workers(recipe: Recipe, settings: RunSettings) -> int:
     if recipe.goal != "ground":
         return settings.workers
     return max(settings.workers, 1) if settings.device.type == "cpu" else 0
-
-
-def _check_refining(recipe: Recipe, loaded: Loaded) -> None:
-    """Raise ValueError unless a checkpoint can refine what a recipe has it refine."""
-    refining = None if recipe.outcome is None else recipe.outcome.refining
-    if refining is None or refining.threshold == 0:
-        return
-    if refining.format not in loaded.settings.formats:
-        raise ValueError(
-            f"recipe {recipe.name} refines what fails, and {loaded.card.name} does not write "
-            f"{refining.format}: `looktwice train elf-sft --failures` teaches it"
-        )
-
-
-def _check_pictures(recipe: Recipe, examples: Examples, loaded: Loaded) -> None:
-    """Raise ValueError unless pictures that a recipe teaches are there, and can be written as codes."""
-    if not recipe.picture_share:
-        return
-    known = [bool(examples.next_cameras(index)) for index in range(len(examples))]
-    if recipe.picture_share == 1 and not all(known):
-        raise ValueError(
-            f"recipe {recipe.name} teaches pictures half a second ahead, and {known.count(False)} scenes "
-            "bring none: `looktwice scenes generate --next-frames` makes such scenes"
-        )
-    if any(known) and loaded.visual_codes is None:
-        raise ValueError(
-            f"recipe {recipe.name} teaches pictures, and {loaded.card.name} has no codes for them: "
-            "--visual-codes names the folder that `looktwice train visual-codes` made"
-        )
-
-
-def _taught_by(recipe: Recipe, examples: Examples) -> npt.NDArray[np.bool_]:
-    """Which examples tell all that a recipe's responses say, bool [N]; raises ValueError where none does."""
-    taught = np.ones(len(examples), np.bool_)
-    for task in recipe.tasks:
-        for part in family_named(task).lesson_needs:
-            taught &= examples.tell(part)
-    if not taught.any():
-        raise ValueError(f"no scene tells what recipe {recipe.name} teaches: all lack agents, lanes or road")
-    return taught
 
 
 def vision_parts(vla: LookTwiceVla) -> list[nn.Module]:
