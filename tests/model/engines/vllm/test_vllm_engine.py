@@ -261,7 +261,7 @@ def test_draws_are_valid_and_repeat_with_their_seed(
 ) -> None:
     def request(name: str, seed: int) -> PlanRequest:
         controls = Controls(n=6, temperature=1.5, seed=seed, numbers=numbers)
-        return PlanRequest(f"{numbers}-{name}", BUNDLED[2], "cf_vla", controls=controls)
+        return PlanRequest(f"{numbers}-{name}", BUNDLED[3], "cf_vla", controls=controls)
 
     async def all_three() -> list[list[Draw]]:
         return [await plan(vllm, request(f"{k}", seed)) for k, seed in enumerate((3, 3, 4))]
@@ -300,7 +300,7 @@ def test_decisions_are_as_likely_as_training_says(
 
 @pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
 def test_the_contract(loop: asyncio.AbstractEventLoop, vllm: VllmEngine, check: Check) -> None:
-    loop.run_until_complete(check(vllm, BUNDLED[2]))
+    loop.run_until_complete(check(vllm, BUNDLED[3]))
 
 
 def test_new_weights_are_refused(loop: asyncio.AbstractEventLoop, vllm: VllmEngine) -> None:
