@@ -422,7 +422,11 @@ def test_keys_are_made_on_the_command_line() -> None:
 def test_a_log_that_nobody_reads_holds_up_nobody_and_dear_requests_are_refused() -> None:
     """Standard error is a pipe that is never emptied: it takes some hundred lines."""
     polite = make_call(RequestKind("direct", 1), [labelled_scene(8.0, pictures=1)], seed=1)
-    with process(subprocess.PIPE) as (started, url), httpx.Client(base_url=url, timeout=60) as http:
+    patient = {"LOOKTWICE_QUEUE_TIMEOUT_S": "600", "LOOKTWICE_DECODE_TIMEOUT_S": "600"}
+    with (
+        process(subprocess.PIPE, **patient) as (started, url),
+        httpx.Client(base_url=url, timeout=600) as http,
+    ):
         for _ in range(600):
             assert http.get("/v1/models").status_code == 200
         statuses = [
