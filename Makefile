@@ -19,7 +19,7 @@ VLLM_UNUSED := torchaudio torchcodec triton
 # No browser, no simulator, no Ray, no processes of the service, no long oracle: under two minutes on one core.
 FAST_TESTS := tests/model/formats tests/model/driving tests/service
 NOT_FAST := $(addprefix tests/service/,cli vllm test_fuzz.py routes/test_scenes.py) \
-	$(addprefix tests/service/http/,test_connection.py test_server.py test_trust.py) \
+	$(addprefix tests/service/http/,test_checkpoint_swaps.py test_connection.py test_server.py test_trust.py) \
 	tests/model/driving/pdm/test_oracle.py tests/model/formats/test_grammar_export.py
 
 # One more than there are cores: tests wait for clocks, browsers and other processes. A process may take 3 GB.

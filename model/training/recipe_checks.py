@@ -28,17 +28,13 @@ def check_files(
     """
     # What second sketches change is learned from all scenes, and no reflection of a build tells it.
     told = recipe.sketched and loaded.settings.second_sketch
-    wanted = {
-        "reflections": (reflections, recipe.reflections is not None and not told),
-        "followed trajectories": (followed, recipe.goal == "judge"),
-    }
-    for name, (file, is_needed) in wanted.items():
-        if (file is not None) != is_needed:
-            wants = "needs" if is_needed else "takes no"
-            why = f": {loaded.card.name} tells in the prompt what else might be driven"
-            raise ValueError(
-                f"recipe {recipe.name} {wants} {name}{why if told and name == 'reflections' else ''}"
-            )
+    if (reflections is None) != (recipe.reflections is None or told):
+        wants = "needs reflections" if reflections is None else "takes no reflections"
+        why = f": {loaded.card.name} tells in the prompt what else might be driven" if told else ""
+        raise ValueError(f"recipe {recipe.name} {wants}{why}")
+    if (followed is None) != (recipe.goal != "judge"):
+        wants = "needs followed trajectories" if followed is None else "takes no followed trajectories"
+        raise ValueError(f"recipe {recipe.name} {wants}")
     if failures is not None and recipe.attempting is None:
         raise ValueError(f"recipe {recipe.name} takes no failures")
 

@@ -228,8 +228,9 @@ def run(
     if recipe.goal == "respond" and recipe.pictures and validation:
         validate = partial(open_loop, loaded, validation, list(recipe.tasks), settings.draws)
     taught = taught_by(recipe, examples)
-    on_examples = None if reflections is None else place_reflections(examples, read_reflections(reflections))
-    if reflections is not None and on_examples is not None:
+    on_examples = None
+    if reflections is not None:
+        on_examples = place_reflections(examples, read_reflections(reflections))
         check_reflections(reflections, on_examples, loaded)
     tried = None
     if failures is not None and recipe.attempting is not None:
