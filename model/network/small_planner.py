@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from looktwice.model.driving.facts import FACTS
 from looktwice.model.driving.scene import Scene, SceneError
 from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray
+from looktwice.model.driving.whole_files import written_whole
 from looktwice.model.network.card import CARD_FILE, files_revision, weights_revision
 from looktwice.model.network.checkpoint import load
 from looktwice.model.network.codec import CODEC_FILE, CodecError, TrajectoryCodec
@@ -110,12 +111,16 @@ class SmallPlanner(nn.Module):
         return trajectories
 
     def save(self, folder: Path, details: dict[str, object]) -> None:
-        """Write weights and codec into ``folder``; ``details`` tell how it was made."""
+        """Write codec and weights into ``folder``; ``details`` tell how it was made.
+
+        The weights come last, and are whole or not there: a folder that has them is complete.
+        """
         folder.mkdir(parents=True, exist_ok=True)
+        self.codec.save(folder)
         about = {"version": _VERSION, "kind": self.kind, "details": details}
         state = {name: value.contiguous() for name, value in self.state_dict().items()}
-        save_file(state, folder / WEIGHTS_FILE, metadata={"looktwice": json.dumps(about)})
-        self.codec.save(folder)
+        with written_whole(folder / WEIGHTS_FILE) as temporary:
+            save_file(state, temporary, metadata={"looktwice": json.dumps(about)})
 
 
 def small_inputs(scenes: Sequence[Scene], kind: SmallKind) -> SmallInputs:
@@ -154,17 +159,32 @@ def load_small(folder: Path) -> SmallPlanner:
         return _reader_of_tracks(folder)
     if not path.is_file():
         raise SmallPlannerError(f"{folder} has no {WEIGHTS_FILE}: train one with `looktwice train blind`")
+    kind, _ = how_it_was_made(folder)
+    try:
+        planner = SmallPlanner(kind, TrajectoryCodec.load(folder))
+        planner.load_state_dict(load_file(path))
+    except (SafetensorError, CodecError, RuntimeError) as error:
+        raise SmallPlannerError(f"{path} is damaged: {error}") from error
+    return planner.eval()
+
+
+def how_it_was_made(folder: Path) -> tuple[SmallKind, dict[str, object]]:
+    """The kind of the planner that `SmallPlanner.save` wrote into ``folder``, and its details.
+
+    Raises:
+        SmallPlannerError: its weights are damaged, of another version, or of a kind that does not drive.
+    """
+    path = folder / WEIGHTS_FILE
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {}).get("looktwice", "{}"))
-        if about.get("version") != _VERSION or about.get("kind") not in DRIVING_KINDS:
-            found = about.get("version")
-            raise SmallPlannerError(f"{path} has version {found}; this LookTwice reads {_VERSION}")
-        planner = SmallPlanner(about["kind"], TrajectoryCodec.load(folder))
-        planner.load_state_dict(load_file(path))
-    except (SafetensorError, CodecError, json.JSONDecodeError, RuntimeError) as error:
+    except (SafetensorError, json.JSONDecodeError) as error:
         raise SmallPlannerError(f"{path} is damaged: {error}") from error
-    return planner.eval()
+    if (found := about.get("version")) != _VERSION:
+        raise SmallPlannerError(f"{path} has version {found}; this LookTwice reads {_VERSION}")
+    if (kind := about["kind"]) not in DRIVING_KINDS:
+        raise SmallPlannerError(f"{path} is a planner of {kind}, which drives nowhere")
+    return kind, about["details"]
 
 
 def _reader_of_tracks(folder: Path) -> SmallPlanner:

@@ -7,6 +7,7 @@ makes them, so a killed run goes on with the round that it was in.
 from __future__ import annotations
 
 import shutil
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -16,8 +17,14 @@ from rich.progress import Progress, TextColumn
 
 from looktwice.clients.metadrive.generation import GenerateConfig, generate
 from looktwice.model.driving.scene import split_of_seed
-from looktwice.model.network.codec import TrajectoryCodec
-from looktwice.model.network.small_planner import WEIGHTS_FILE, SmallKind
+from looktwice.model.driving.whole_files import written_whole
+from looktwice.model.network.codec import CODEC_FILE, TrajectoryCodec
+from looktwice.model.network.small_planner import (
+    WEIGHTS_FILE,
+    SmallKind,
+    SmallPlannerError,
+    how_it_was_made,
+)
 from looktwice.model.training.small import SmallSettings, train_small
 from looktwice.service.cli.small_pilot import SmallPilot
 
@@ -41,6 +48,7 @@ def train_small_in_rounds(
 
     Raises:
         ValueError: rounds for the blind planner, which they would not help.
+        SmallPlannerError: a round's planner was trained otherwise.
     """
     if rounds and kind == "blind":
         raise ValueError("rounds are for the teacher: a blind planner cannot see what it should learn")
@@ -52,11 +60,22 @@ def train_small_in_rounds(
             own.append(folder / _SCENES)
             first = FIRST_ROUND_SEED + (number - 1) * episodes
             _drive(target / f"round-{number - 1}", range(first, first + episodes), own[-1])
-        if not (folder / WEIGHTS_FILE).exists():
+        if (folder / WEIGHTS_FILE).exists():
+            _check_made_so(folder, kind, settings)
+        else:
             _train(kind, scenes, codec, folder, settings, validation, own)
-    for file in (target / f"round-{rounds}").iterdir():
-        if file.is_file():
-            shutil.copyfile(file, target / file.name)
+    for name in (CODEC_FILE, WEIGHTS_FILE):
+        with written_whole(target / name) as temporary:
+            shutil.copyfile(target / f"round-{rounds}" / name, temporary)
+
+
+def _check_made_so(folder: Path, kind: SmallKind, settings: SmallSettings) -> None:
+    found_kind, details = how_it_was_made(folder)
+    if (found_kind, details["settings"]) != (kind, asdict(settings)):
+        raise SmallPlannerError(
+            f"{folder} has a {found_kind} planner of other settings ({details['settings']}): "
+            "name another folder"
+        )
 
 
 def _train(

@@ -8,7 +8,7 @@ over from where the car is, however it stands, and comes back to its lane on a s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from typing import Final
 
@@ -66,13 +66,20 @@ class Forked:
         return self.collided_s is None and self.off_road_s is None
 
 
-def fork_expert(world: EpisodeWorld, steps: int = FUTURE_STEPS, *, times_speed: float = 1.0) -> Forked:
+def fork_expert(
+    world: EpisodeWorld,
+    steps: int = FUTURE_STEPS,
+    *,
+    times_speed: float = 1.0,
+    known: Container[int] | None = None,
+) -> Forked:
     """Let the expert drive on from now in a copy of ``world``.
 
     Args:
         world: to copy.
         steps: to drive.
         times_speed: what the ego's speed is multiplied by at first. Its past stays in the log as it was.
+        known: ids of those whom the expert knows of; it drives as if nobody else were there. None: of all.
 
     Raises:
         ForkError: the episode has ended.
@@ -81,7 +88,12 @@ def fork_expert(world: EpisodeWorld, steps: int = FUTURE_STEPS, *, times_speed: 
     forked.ego.speed *= times_speed
     if isinstance(forked.ego, FreeVehicle):
         forked.ego = on_rails(forked.ego, forked.live.road_map)
-    return _run(forked, steps, None)
+
+    def drive(bodies: list[Body]) -> None:
+        known_of = bodies if known is None else [body for body in bodies if body.actor_id in known]
+        forked.drive_as_expert(known_of)
+
+    return _run(forked, steps, lambda _: drive)
 
 
 def fork_along(world: EpisodeWorld, trajectory: FloatArray, steps: int = FUTURE_STEPS) -> Forked:
@@ -93,7 +105,8 @@ def fork_along(world: EpisodeWorld, trajectory: FloatArray, steps: int = FUTURE_
     forked = _copied(world, steps)
     if not isinstance(forked.ego, FreeVehicle):
         forked.ego = FreeVehicle.from_rails(forked.ego)
-    return _run(forked, steps, world_trajectory(forked.live.ego[forked.now], trajectory))
+    way = world_trajectory(forked.live.ego[forked.now], trajectory)
+    return _run(forked, steps, lambda age_s: _follower(forked, way, age_s))
 
 
 def on_rails(car: Vehicle, road_map: RoadMap) -> Vehicle:
@@ -135,13 +148,14 @@ def _copied(world: EpisodeWorld, steps: int) -> EpisodeWorld:
     return world.copied(steps)
 
 
-def _run(world: EpisodeWorld, steps: int, way: Array | None) -> Forked:
+def _run(world: EpisodeWorld, steps: int, driver: Callable[[float], Callable[[list[Body]], None]]) -> Forked:
+    """What happens while ``driver``, told how many seconds have passed, says who drives the next step."""
     start, began_m = world.now, world.ego.progress
     near = world.nearby()
     off_road_s: float | None = None
     off_route_s: float | None = None
     for step in range(steps):
-        world.move(near, world.drive_as_expert if way is None else _follower(world, way, step * STEP_S))
+        world.move(near, driver(step * STEP_S))
         near = world.remember()
         if off_road_s is None and world.is_off_road:
             off_road_s = (step + 1) * STEP_S

@@ -112,6 +112,13 @@ def test_whom_a_fork_hits_is_told() -> None:
     assert None not in hits
 
 
+def test_the_expert_heeds_only_those_whom_it_knows_of() -> None:
+    world = driven(100)
+    plain, all_known = fork_expert(world), fork_expert(world, known=range(10_000))
+    np.testing.assert_array_equal(plain.trajectory, all_known.trajectory)
+    assert fork_expert(world, known=()).driven_m > plain.driven_m + 10
+
+
 def test_vehicles_on_rails_follow_a_trajectory_as_free_ones() -> None:
     world = driven(60)
     assert type(world.ego) is Vehicle

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from looktwice.model.driving.facts import IS_YES_OR_NO, mirrored
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
@@ -198,3 +200,11 @@ def test_folders_of_no_small_planner_are_refused(tmp_path: Path) -> None:
     (tmp_path / WEIGHTS_FILE).write_bytes(b"none")
     with pytest.raises(SmallPlannerError, match="is damaged"):
         load_small(tmp_path)
+    for about, told in (
+        ({"version": 1, "kind": "teacher"}, "has version 1; this LookTwice reads 2"),
+        ({"version": 2, "kind": "facts"}, "is a planner of facts, which drives nowhere"),
+    ):
+        weights = {"weight": torch.zeros(1)}
+        save_file(weights, tmp_path / WEIGHTS_FILE, metadata={"looktwice": json.dumps(about)})
+        with pytest.raises(SmallPlannerError, match=told):
+            load_small(tmp_path)
