@@ -37,7 +37,7 @@ class RefineSettings:
 
     Attributes:
         format: that it refines in; what it writes there must be an answer in the format of its draws.
-        threshold: scenes are refined whose best draw scores less.
+        threshold: scenes are refined whose worst draw scores less.
         feedback: the ``teacher``'s five sections, or the verdict by ``rule`` with what the expert did, which
             ELF-VLA compares with as Rule-GRPO (section 9.1).
         count: refinements of a scene.
@@ -59,7 +59,8 @@ class OutcomeSettings:
         draws: of each scene, compared with each other.
         temperature: that they are drawn at.
         clip: see `policy_loss`.
-        codes: how codes are chosen; those of least expected error are no draws, and nothing is
+        numbers: how numbers that are one token each are chosen; digits are drawn as words are.
+        codes: how codes are chosen. Numbers and codes of least expected error are no draws, and nothing is
             learned from how they turned out.
         imitation: weight of the loss on the expert's responses, beside that of the draws.
         rewards: what counts: what comes of draws, or the rewards of their family by name, with weights.
@@ -71,6 +72,7 @@ class OutcomeSettings:
 
     draws: int = 8
     temperature: float = 1.0
+    numbers: Decision = "drawn"
     codes: Decision = "least_error"
     clip: float = 0.2
     imitation: float = 0.01

@@ -5,9 +5,9 @@ their times, the branch and the codes of CF-VLA, thoughts and poses of ELF-VLA, 
 is the distribution that decodes: over the tokens that the format allows, at the temperature of the draws.
 Beside it the expert is imitated a little, against drivers who find a gap in the score.
 
-Where all draws of a scene fail, nothing says what would be better. There the network refines its best draw by
-feedback, of the built-in teacher or by rule, which knows what the expert did. The refinement joins the draws
-as an answer to the first prompt: so the first answer learns what feedback led to (ELF-VLA section 9).
+Where a draw of a scene fails, the network refines the worst one by feedback, of the built-in teacher or by
+rule, which knows what the expert did. The refinement joins the draws as an answer to the first prompt: so the
+first answer learns what feedback led to (ELF-VLA section 9).
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from looktwice.model.families.registry import family_named
 from looktwice.model.families.trajectory_codes import TRAJECTORY
 from looktwice.model.formats.replay import Decision, decisions
 from looktwice.model.network.checkpoint import Loaded
+from looktwice.model.network.vocabulary import Vocabulary
 from looktwice.model.training.batches import ResponseSample, collate
 from looktwice.model.training.learner import ResponseLearner
 from looktwice.model.training.outcome.draw_rewards import Rewards, RewardWeights, family_rewards, rewards
@@ -100,6 +101,7 @@ class OutcomeLearner(nn.Module):
         self._loaded, self._data, self._scenes = loaded, data, scenes
         self._task, self._family, self._settings = task, family_named(task), settings
         self._route_share, self._tracks_share = route_share, tracks_share
+        self._chosen = _chosen_alphabets(loaded.vocabulary, settings)
         self._runner: Runner | None = None
         # In a tuple, so that it is none of this module's own: it is neither trained nor saved.
         self._first = (deepcopy(learner).requires_grad_(False),) if settings.divergence else ()
@@ -132,7 +134,7 @@ class OutcomeLearner(nn.Module):
         parts |= {"reward": float(reward.mean()), "reward_spread": float(reward.std(axis=1).mean())}
         if self._settings.refining is not None:
             gains = [
-                0.0 if other is None else float(other.outcome.mean() - own.outcome.max())
+                0.0 if other is None else float(other.outcome.mean() - own.outcome.min())
                 for own, other in zip(judged, again, strict=True)
             ]
             # Over all scenes of the step: those that are not refined gain nothing.
@@ -169,7 +171,7 @@ class OutcomeLearner(nn.Module):
         controls = Controls(
             n=settings.draws,
             temperature=settings.temperature,
-            numbers="drawn",
+            numbers=settings.numbers,
             codes=settings.codes,
             logprobs=True,
         )
@@ -201,11 +203,11 @@ class OutcomeLearner(nn.Module):
         draws: Sequence[Sequence[Draw]],
         judged: Sequence[Rewards],
     ) -> list[list[Draw]]:
-        """Refinements of each scene's best draw, none where it is good enough."""
+        """Refinements of each scene's worst draw, none where it is good enough."""
         refining, found = self._settings.refining, [list[Draw]() for _ in items]
         if refining is None:
             return found
-        failed = [place for place, own in enumerate(judged) if own.outcome.max() < refining.threshold]
+        failed = [place for place, own in enumerate(judged) if own.outcome.min() < refining.threshold]
         requests = []
         for place in failed:
             asked = self._request(place, items[place])
@@ -216,7 +218,7 @@ class OutcomeLearner(nn.Module):
                     controls=replace(asked.controls, n=refining.count),
                     attempt=self._attempt(
                         judges[place],
-                        draws[place][int(judged[place].outcome.argmax())],
+                        draws[place][int(judged[place].outcome.argmin())],
                         refining.feedback,
                     ),
                 )
@@ -279,13 +281,19 @@ class OutcomeLearner(nn.Module):
         return loss, found.ratio, apart.detach()
 
     def _drawn(self, draw: Draw) -> list[Decision]:
-        """The decisions of a draw that were drawn: all but codes of least expected error."""
+        """The decisions of a draw that were drawn: all but numbers and codes of least expected error."""
         imagination = self._family.imagination
         # Nobody asks for a camera, so nothing is expected of its picture.
         fixed = {} if imagination is None else imagination.fixed_values(None)
         found = decisions(self._data.formats[self._task].start(fixed=fixed), draw.ids)
-        if self._settings.codes == "drawn":
-            return found
-        alphabets = self._loaded.vocabulary.alphabets
-        codes = [*alphabets[TRAJECTORY], *alphabets.get(PICTURE, ())]
-        return [each for each in found if not any(int(each.ids[0]) in book for book in codes)]
+        return [each for each in found if not any(int(each.ids[0]) in book for book in self._chosen)]
+
+
+def _chosen_alphabets(vocabulary: Vocabulary, settings: OutcomeSettings) -> list[range]:
+    """Ids of the tokens that are chosen by their expected error, and not drawn."""
+    return [
+        ids
+        for name, books in vocabulary.alphabets.items()
+        if (settings.codes if name in (TRAJECTORY, PICTURE) else settings.numbers) == "least_error"
+        for ids in books
+    ]

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from looktwice.model.driving.trajectory import (
 from looktwice.model.engines.engine import Draw, PlanRequest
 from looktwice.model.families.family import Foreseen
 from looktwice.model.families.registry import family_named
-from looktwice.model.formats.replay import decisions
+from looktwice.model.formats.replay import Decision, decisions
 from looktwice.model.network.checkpoint import load
 from looktwice.model.network.vla_settings import NANO_SETTINGS
 from looktwice.model.training.batches import collate
@@ -226,14 +227,36 @@ def test_failed_drafts_are_refined_by_feedback_and_learned_as_first_answers(
         assert refined.attempt is not None
         assert "Meta action analysis" in refined.attempt.feedback
         labelled = next(each for each in scenes if each.scene.scene_id == refined.scene.scene_id)
-        best = int(rewards(SceneJudge(labelled), drafts, version="v1.1").outcome.argmax())
-        np.testing.assert_array_equal(refined.attempt.trajectory, drafts[best].trajectory)
+        worst = int(rewards(SceneJudge(labelled), drafts, version="v1.1").outcome.argmin())
+        np.testing.assert_array_equal(refined.attempt.trajectory, drafts[worst].trajectory)
     # What is learned stands behind the prompt without feedback.
     loaded = load(refining_checkpoint)
     longest = max(len(loaded.inputs.build(training_scene(k).scene, ELF[0]).prompt.ids) for k in (1, 2))
     assert max(prompts) <= longest + 20
     [stage] = load(tmp_path / "rl").card.details["stages"]
     assert stage["outcome"]["refining"]["gamma"] == 0.1
+
+
+def test_numbers_of_least_error_are_not_learned_from(
+    refining_checkpoint: Path, two_scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Thoughts alone are the policy then, and each draw's poses are those that its thoughts lead to."""
+    learned: list[tuple[list[float], int]] = []
+    plain = OutcomeLearner._drawn
+
+    def learning(self: OutcomeLearner, draw: Draw) -> list[Decision]:
+        found = plain(self, draw)
+        books = chain.from_iterable(self._loaded.vocabulary.alphabets.values())
+        numbers = set(chain.from_iterable(books))
+        assert not any(numbers & set(each.ids.tolist()) for each in found)
+        learned.append(([draw.logprobs[each.position] or 0.0 for each in found], len(draw.ids)))
+        return found
+
+    monkeypatch.setattr(OutcomeLearner, "_drawn", learning)
+    recipe = refining_with(elf_recipe(numbers="least_error"), threshold=0.0)
+    ratios = noted("policy_ratio", recipe, two_scenes, refining_checkpoint, tmp_path)
+    assert ratios == pytest.approx([1.0, 1.0], abs=1e-4)
+    assert all(0 < len(decided) < length for decided, length in learned)
 
 
 def test_below_no_threshold_nothing_is_refined_and_nobody_needs_to_refine(
