@@ -159,6 +159,12 @@ class Metrics:
         for parts in PARTS:
             for endpoint in ("plan", "reflect"):
                 self._disagreements.labels(parts, endpoint)
+        self._inconsistent = Counter(
+            "looktwice_inconsistent_draws",
+            "Draws with any parts that do not agree, each once, labelled as branches are.",
+            ["branch", "thinking", "endpoint"],
+            registry=registry,
+        )
         self._labels = Counter(
             "looktwice_labels", "Reflections written by a teacher.", ["teacher"], registry=registry
         )
@@ -287,15 +293,14 @@ class Metrics:
         self._teacher_tokens.labels(teacher, "output").inc(output_tokens)
         self._teacher_cost.labels(teacher).inc(cost_usd)
 
-    def draw_judged(self, agreement: Agreement, endpoint: str) -> None:
-        """Count what does not agree in one draw."""
-        for parts in agreement.disagreements:
-            self._disagreements.labels(parts, endpoint).inc()
-
-    def draw_finished(self, draw: Draw, thinking: Thinking, endpoint: str) -> None:
-        """Count one draw."""
+    def draw_finished(self, draw: Draw, agreement: Agreement, thinking: Thinking, endpoint: str) -> None:
+        """Count one draw, and what does not agree in it."""
         taken = "none" if draw.branch is None else "think" if draw.looked_twice else "direct"
         self._branches.labels(taken, thinking, endpoint).inc()
+        # Nothing is added for the others, so that every share begins at 0 instead of missing.
+        self._inconsistent.labels(taken, thinking, endpoint).inc(agreement.consistent is False)
+        for parts in agreement.disagreements:
+            self._disagreements.labels(parts, endpoint).inc()
         if draw.plan is not None and draw.revised_plan is not None:
             self._revised_iou.labels(endpoint).observe(plan_iou(draw.plan, draw.revised_plan))
         if draw.think_probability is not None:

@@ -160,8 +160,8 @@ class SceneSubmitter:
             draws.sort(key=lambda draw: draw.index)
             deadline_met = _met(asked.controls.deadline_ms, arrival)
             for draw in draws:
-                self._metrics.draw_finished(draw, request.controls.thinking, endpoint)
-                self._metrics.draw_judged(agreements[draw.index], endpoint)
+                agreement = agreements[draw.index]
+                self._metrics.draw_finished(draw, agreement, request.controls.thinking, endpoint)
             queue_s = place.waited_s + began_s - submitted_s
             self._metrics.answered(endpoint, queue_s, finished_s - submitted_s)
             if deadline_met is not None:

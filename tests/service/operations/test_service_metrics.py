@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 from prometheus_client.openmetrics import parser as openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
 from looktwice.service.operations.service_metrics import LATENCY_BUCKETS_S
+from tests.service.scenes import history, scene
 from tests.service.serving import Served, body
 
 
@@ -23,6 +26,28 @@ def test_tokens_are_counted_by_section(served: Served) -> None:
     assert served.metric("looktwice_section_tokens_sum", section="plan") == 4 * 40
     assert served.metric("looktwice_section_tokens_count", section="thinking") == 3
     assert served.metric("looktwice_section_tokens_sum", section="thinking") == 3 * 48
+
+
+def test_a_draw_that_disagrees_twice_is_one_inconsistent_draw(served: Served) -> None:
+    # It waits first, and stands still where its revised plan slows down: that is neither slower than
+    # before, as its reasoning asks for, nor what the trajectory does.
+    stands = replace(scene(), history=history(speed_mps=0.0))
+    waits = "- longitudinal\n  - 0.0s-6.4s: Wait\n"
+    asked = served.http.post("/v1/plan", json=body(stands, n=3, thinking="always", prefill=waits))
+    assert [draw["disagreements"] for draw in asked.json()["draws"]] == [
+        ["plan_trajectory", "reason_change"]
+    ] * 3
+    count = "looktwice_inconsistent_draws_total"
+    labels = {"branch": "think", "thinking": "always", "endpoint": "plan"}
+    assert served.metric(count, **labels) == served.metric("looktwice_branches_total", **labels) == 3
+    for parts in ("plan_trajectory", "reason_change"):
+        assert served.metric("looktwice_disagreements_total", parts=parts, endpoint="plan") == 3
+
+    assert served.http.post("/v1/plan", json=body(n=2, thinking="always")).json()["draws"][0]["consistent"]
+    assert served.metric(count, **labels) == 3, "draws whose parts agree are none"
+    served.http.post("/v1/plan", json=body(n=2, thinking="never"))
+    begun = f'{count}{{branch="direct",endpoint="plan",thinking="never"}} 0.0'
+    assert begun in served.http.get("/metrics").text, "a share of them begins at 0"
 
 
 def test_requests_are_counted_by_endpoint_and_status(served: Served) -> None:
