@@ -8,7 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import AsyncGenerator, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,8 +21,9 @@ from looktwice.model.bundled import SCENES
 from looktwice.model.driving.images import decode_image
 from looktwice.model.driving.next_view import Motion
 from looktwice.model.driving.scene_store import read_scenes
+from looktwice.model.engines.engine import DrawFinished, Event, PlanRequest
 from looktwice.service.operations.settings import Settings
-from tests.service.scripted_engine import ScriptedEngine
+from tests.service.scripted_engine import KEEP_ON, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, serve
 
 ROOT = Path(__file__).parents[2]
@@ -57,10 +58,25 @@ def finished(arguments: list[str], folder: Path | None = None) -> str:
 def test_plan_in_ten_lines(served: Served) -> None:
     printed = run("plan_in_ten_lines.py", served.url)
     assert printed.count("think probability") == 6
-    assert printed.rstrip().splitlines()[-1].startswith("  - ")
     lines = (EXAMPLES / "plan_in_ten_lines.py").read_text().split('"""')[2].splitlines()
     # What needs saying besides imports and blank lines.
     assert len([line for line in lines if line and not line.startswith(("import", "from"))]) <= 10
+
+
+class LastSlowsDown(ScriptedEngine):
+    """The last draw's plan is another one than that of the others."""
+
+    async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
+        async for event in super().submit(request):
+            if isinstance(event, DrawFinished) and event.draw.index == request.controls.n - 1:
+                event = DrawFinished(replace(event.draw, plan=SLOW_DOWN))
+            yield event
+
+
+def test_the_plan_that_is_shown_is_the_one_to_drive_by() -> None:
+    with serve(LastSlowsDown(), Settings()) as made:
+        printed = run("plan_in_ten_lines.py", made.url)
+    assert printed.endswith(f"Draw 0 lies nearest to the others:\n{KEEP_ON}\n")
 
 
 def test_reflect_on_another_plan(served: Served) -> None:
