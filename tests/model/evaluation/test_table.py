@@ -25,6 +25,8 @@ BASELINE = evaluate_baselines(SCENES)["constant velocity"]
 CONTRACT = {
     "name",
     "thinking",
+    "agreed_ade_m",
+    "greedy_ade_m",
     "min_ade_m",
     "avg_ade_m",
     "min_fde_m",
@@ -32,6 +34,9 @@ CONTRACT = {
     "corner_distance_m",
     "collision_rate",
     "off_road_rate",
+    "agreement_plan_trajectory",
+    "agreement_reason_change",
+    "agreement_reason_view",
     "plan_iou_first",
     "plan_iou_revised",
     "output_tokens",
