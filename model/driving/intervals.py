@@ -32,7 +32,18 @@ def interval_of(values: Array) -> Interval:
 
 def ratio_interval(amounts: Array, by: Array) -> Interval:
     """The 95 % interval of sum(amounts) / sum(by) over episodes [n]; draws without any ``by`` count as 0."""
+    return interval_of(_resampled_ratios(amounts, by))
+
+
+def ratio_difference_interval(amounts: Array, by: Array, others: Array, others_by: Array) -> Interval:
+    """The same of the ratio's difference from sum(others) / sum(others_by) over the same episodes [n].
+
+    Both ratios are of the same drawn episodes, so what they share cancels out.
+    """
+    return interval_of(_resampled_ratios(amounts, by) - _resampled_ratios(others, others_by))
+
+
+def _resampled_ratios(amounts: Array, by: Array) -> Array:
     weights = episode_weights(len(amounts))
     totals = weights @ by
-    ratios = np.divide(weights @ amounts, totals, out=np.zeros(len(weights)), where=totals > 0)
-    return interval_of(ratios)
+    return np.divide(weights @ amounts, totals, out=np.zeros(len(weights)), where=totals > 0)

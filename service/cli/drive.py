@@ -69,6 +69,7 @@ def drive(
         Rig,
         ServicePilot,
         drive_store,
+        driver_comparisons,
         driver_rows,
         drives_to_json,
         format_driver_rows,
@@ -162,7 +163,10 @@ def drive(
                     progress.update(task, advance=1, description=f"{name}: {drove.ended}")
         if gif is not None:
             film.save(gif)
-        typer.echo(json.dumps(drives_to_json(found)) if as_json else format_driver_rows(driver_rows(found)))
+        if as_json:
+            typer.echo(json.dumps(drives_to_json(found)))
+        else:
+            typer.echo(format_driver_rows(driver_rows(found), driver_comparisons(found)))
 
 
 @contextmanager

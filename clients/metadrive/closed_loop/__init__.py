@@ -1,6 +1,7 @@
 """Cars that drive by somebody's trajectories. A door: others import from here."""
 
 from looktwice.clients.metadrive.closed_loop.driver_table import (
+    driver_comparisons,
     driver_rows,
     drives_to_json,
     format_driver_rows,
@@ -25,6 +26,7 @@ __all__ = [
     "ServicePilot",
     "drive",
     "drive_store",
+    "driver_comparisons",
     "driver_rows",
     "drives_to_json",
     "format_driver_rows",

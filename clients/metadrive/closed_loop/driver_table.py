@@ -9,8 +9,9 @@ from typing import Any, Final
 import numpy as np
 
 from looktwice.clients.metadrive.closed_loop.drives import EXPERT, Drive
+from looktwice.clients.metadrive.closed_loop.pilots import ConstantVelocity
 from looktwice.model.driving.columns import Columns, aligned, cells, titles
-from looktwice.model.driving.intervals import ratio_interval
+from looktwice.model.driving.intervals import Array, ratio_difference_interval, ratio_interval
 
 _COLUMNS: Final[Columns] = {
     "episodes": ("episodes", "{:d}"),
@@ -27,6 +28,12 @@ _COLUMNS: Final[Columns] = {
     "deadline_misses": ("deadline misses", "{:d}"),
     "plan_ms": ("plan ms", "{:.0f}"),
 }
+_COMPARED: Final[Columns] = {
+    "completion_ratio": ("completion ratio", "{:.2f}"),
+    "collisions_per_km_difference": ("collisions per km, difference", "{:+.2f}"),
+    "off_road_per_km_difference": ("off road per km, difference", "{:+.2f}"),
+}
+_NEVER: Final = "never"
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,29 @@ class DriverRow:
     intervals: dict[str, tuple[float, float]]
 
 
+@dataclass(frozen=True)
+class DriverComparison:
+    """A driver against another, paired over the episodes that both drove.
+
+    Attributes:
+        driver, against: their names.
+        episodes: that both drove.
+        completion_ratio: metres driven along the route, as a share of what the other drove; None where that
+            is nothing.
+        collisions_per_km_difference, off_road_per_km_difference: by how much the driver has more of them
+            than the other; None where one of the two drove nothing.
+        intervals: their 95 % intervals, over episodes drawn with replacement for both at once.
+    """
+
+    driver: str
+    against: str
+    episodes: int
+    completion_ratio: float | None
+    collisions_per_km_difference: float | None
+    off_road_per_km_difference: float | None
+    intervals: dict[str, tuple[float, float]]
+
+
 def driver_rows(drives: Mapping[str, Sequence[Drive]]) -> list[DriverRow]:
     """A row for each driver, in the order given."""
     experts = {drive.seed: drive.driven_m for drive in drives.get(EXPERT, ())}
@@ -76,9 +106,7 @@ def driver_rows(drives: Mapping[str, Sequence[Drive]]) -> list[DriverRow]:
 def _row(name: str, drives: Sequence[Drive], experts_m: Mapping[int, float]) -> DriverRow:
     rates = [drive.thought for drive in drives if drive.thought is not None]
     times = [drive.milliseconds for drive in drives if drive.milliseconds is not None]
-    km = np.array([drive.driven_m / 1000 for drive in drives])
-    collided = np.array([drive.ended == "collision" for drive in drives], np.float64)
-    left = np.array([drive.off_road for drive in drives], np.float64)
+    km, collided, left = _amounts(drives)
     whole_km = np.array([experts_m.get(drive.seed, 0.0) / 1000 for drive in drives])
     ratios = {
         "route_completion": (km, whole_km),
@@ -105,18 +133,81 @@ def _row(name: str, drives: Sequence[Drive], experts_m: Mapping[int, float]) -> 
     )
 
 
+def _amounts(drives: Sequence[Drive]) -> tuple[Array, Array, Array]:
+    """Kilometres driven, and 1 where it collided and where it left the road, each [episodes]."""
+    km = np.array([drive.driven_m / 1000 for drive in drives])
+    collided = np.array([drive.ended == "collision" for drive in drives], np.float64)
+    left = np.array([drive.off_road for drive in drives], np.float64)
+    return km, collided, left
+
+
+def driver_comparisons(drives: Mapping[str, Sequence[Drive]]) -> list[DriverComparison]:
+    """Every other driver against ``never`` or, where it did not drive, the first that is not a limit.
+
+    The expert and constant velocity are the limits. A driver that shares no episode with the other is left
+    out.
+    """
+    limits = (EXPERT, ConstantVelocity.name)
+    against = _NEVER if _NEVER in drives else next((name for name in drives if name not in limits), None)
+    if against is None:
+        return []
+    others = {drive.seed: drive for drive in drives[against]}
+    comparisons = []
+    for name, of in drives.items():
+        shared = [drive for drive in of if drive.seed in others]
+        if name != against and shared:
+            comparisons.append(_comparison(name, shared, against, [others[drive.seed] for drive in shared]))
+    return comparisons
+
+
+def _comparison(
+    driver: str, drives: Sequence[Drive], against: str, others: Sequence[Drive]
+) -> DriverComparison:
+    """Of drives of the same episodes, in the same order."""
+    km, collided, left = _amounts(drives)
+    others_km, others_collided, others_left = _amounts(others)
+    values, intervals = dict[str, float](), dict[str, tuple[float, float]]()
+    if others_km.any():
+        values["completion_ratio"] = float(km.sum() / others_km.sum())
+        intervals["completion_ratio"] = ratio_interval(km, others_km)
+    if km.any() and others_km.any():
+        for name, count, others_count in (
+            ("collisions_per_km_difference", collided, others_collided),
+            ("off_road_per_km_difference", left, others_left),
+        ):
+            values[name] = float(count.sum() / km.sum() - others_count.sum() / others_km.sum())
+            intervals[name] = ratio_difference_interval(count, km, others_count, others_km)
+    return DriverComparison(
+        driver=driver,
+        against=against,
+        episodes=len(drives),
+        completion_ratio=values.get("completion_ratio"),
+        collisions_per_km_difference=values.get("collisions_per_km_difference"),
+        off_road_per_km_difference=values.get("off_road_per_km_difference"),
+        intervals=intervals,
+    )
+
+
 def drives_to_json(drives: Mapping[str, Sequence[Drive]]) -> dict[str, Any]:
-    """``drivers[]`` with every episode of each."""
+    """``drivers[]`` with every episode of each, and ``comparisons[]``."""
     return {
         "drivers": [
             asdict(row) | {"drives": [asdict(drive) for drive in drives[row.name]]}
             for row in driver_rows(drives)
-        ]
+        ],
+        "comparisons": [asdict(comparison) for comparison in driver_comparisons(drives)],
     }
 
 
-def format_driver_rows(rows: Sequence[DriverRow]) -> str:
-    """The rows as plain text."""
+def format_driver_rows(rows: Sequence[DriverRow], comparisons: Sequence[DriverComparison] = ()) -> str:
+    """The rows as plain text; where there are comparisons, they follow with their 95 % intervals."""
     lines = [["", *titles(_COLUMNS)]]
     lines += [[row.name, *cells(_COLUMNS, asdict(row))] for row in rows]
-    return "\n".join(aligned(lines))
+    if not comparisons:
+        return "\n".join(aligned(lines))
+    compared = [["", "episodes", *titles(_COMPARED, _COMPARED)]]
+    for each in comparisons:
+        intervals = {name: each.intervals.get(name) for name in _COMPARED}
+        figures = cells(_COMPARED, asdict(each), intervals, _COMPARED)
+        compared.append([f"{each.driver} : {each.against}", str(each.episodes), *figures])
+    return "\n".join([*aligned(lines), "", *aligned(compared)])

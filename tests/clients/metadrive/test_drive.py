@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from PIL import Image
 
 from looktwice.clients import wire
 from looktwice.clients.metadrive.closed_loop.driver_table import (
+    driver_comparisons,
     driver_rows,
     drives_to_json,
     format_driver_rows,
@@ -184,6 +187,25 @@ def test_it_drives_through_the_api(rig: Rig, tmp_path: Path) -> None:
         Film().save(tmp_path / "none.gif")
 
 
+@pytest.mark.parametrize("tracks", [False, True])
+def test_the_served_model_is_told_the_tracks_where_it_is_to_be(
+    rig: Rig, tmp_path: Path, tracks: bool
+) -> None:
+    engine, seen = ScriptedEngine(), list[Scene]()
+    engine.card_shown = replace(CARD, inputs=("route", "tracks"))
+    with (
+        serve(engine, Settings(bundled_scenes=tmp_path / "none")) as served,
+        PlannerClient(served.url) as planner,
+    ):
+        pilot = ServicePilot(planner, "never", wire.Controls(n=1, thinking="never"), tracks=tracks)
+        config = replace(CONFIG, duration_s=3.0)
+        drive(SEED, pilot, rig, config, on_plan=lambda _, scene: seen.append(scene))
+    assert len(engine.submitted) == len(seen) > 1
+    for request, scene in zip(engine.submitted, seen, strict=True):
+        assert scene.tracks, "somebody is around"
+        assert request.scene.tracks == (scene.tracks if tracks else None)
+
+
 def test_a_film_shows_what_was_imagined_beside_what_came(rig: Rig, tmp_path: Path) -> None:
     engine, film, shots = ScriptedEngine(), Film(imagines=True), list[Shot]()
     engine.card_shown = replace(CARD, formats=("cf_vla", "vla_world"), paints=True)
@@ -227,6 +249,114 @@ def test_drivers_are_compared_over_the_same_episodes() -> None:
     assert {"name", "episodes", "route_completion", "collisions", "off_road", "think_rate"} <= set(told[1])
     assert told[1]["drives"][0]["ended"] == "collision"
     assert driver_rows({"adaptive": [half]})[0].route_completion is None
+
+
+JSON_KEYS = {
+    *("name", "episodes", "km", "route_completion", "collisions", "collisions_per_km"),
+    *("off_road", "off_road_per_km", "jerk_ms3", "lateral_ms2", "think_rate", "plans"),
+    *("deadline_misses", "plan_ms", "intervals", "drives"),
+}
+JSON_DRIVE_KEYS = {
+    *("seed", "ended", "driven_m", "off_road", "jerk_ms3", "lateral_ms2", "plans", "thought", "late"),
+    *("milliseconds", "hit"),
+}
+JSON_COMPARISON_KEYS = {
+    *("driver", "against", "episodes", "completion_ratio", "collisions_per_km_difference"),
+    *("off_road_per_km_difference", "intervals"),
+}
+
+
+def driven(seed: int, driven_m: float, *, collided: bool = False, left: bool = False) -> Drive:
+    return Drive(seed, "collision" if collided else "time", driven_m, left, 3.0, 1.0)
+
+
+def test_json_has_the_keys_that_scripts_rely_on() -> None:
+    drives = {
+        EXPERT: [driven(1, 400.0), driven(2, 400.0)],
+        "never": [driven(1, 300.0, collided=True), driven(2, 200.0, left=True)],
+        "adaptive": [driven(1, 400.0), driven(2, 100.0, left=True)],
+    }
+    told = json.loads(json.dumps(drives_to_json(drives)))
+    assert set(told) == {"drivers", "comparisons"}
+    assert [driver["name"] for driver in told["drivers"]] == list(drives)
+    for driver in told["drivers"]:
+        assert set(driver) == JSON_KEYS
+        assert set(driver["intervals"]) == {"route_completion", "collisions_per_km", "off_road_per_km"}
+        assert [set(each) for each in driver["drives"]] == [JSON_DRIVE_KEYS] * 2
+    expert, never, _ = told["drivers"]
+    assert (expert["km"], never["km"]) == pytest.approx((0.8, 0.5))
+    assert (never["collisions_per_km"], never["off_road_per_km"]) == pytest.approx((2.0, 2.0))
+    # With either episode alone: a collision in 0.3 km, or none in 0.2.
+    assert never["intervals"]["collisions_per_km"] == pytest.approx([0.0, 1 / 0.3])
+    assert never["intervals"]["route_completion"] == pytest.approx([0.5, 0.75])
+
+    assert [set(each) for each in told["comparisons"]] == [JSON_COMPARISON_KEYS] * 2
+    _, adaptive = told["comparisons"]
+    assert (adaptive["driver"], adaptive["against"], adaptive["episodes"]) == ("adaptive", "never", 2)
+    assert adaptive["completion_ratio"] == pytest.approx(1.0)
+    assert adaptive["collisions_per_km_difference"] == pytest.approx(-2.0)
+    assert adaptive["off_road_per_km_difference"] == pytest.approx(0.0)
+    assert {name: pytest.approx(interval) for name, interval in adaptive["intervals"].items()} == {
+        "completion_ratio": [0.5, 4 / 3],
+        "collisions_per_km_difference": [-1 / 0.3, 0.0],
+        "off_road_per_km_difference": [0.0, 1 / 0.1 - 1 / 0.2],
+    }
+
+
+def test_drivers_are_paired_episode_by_episode() -> None:
+    never = [driven(seed, 20.0 * seed, collided=seed % 3 == 0) for seed in range(1, 31)]
+    further = [replace(each, driven_m=1.25 * each.driven_m) for each in never]
+    only_here = driven(31, 1000.0, collided=True)
+    (compared,) = driver_comparisons({"adaptive": [*reversed(further), only_here], "never": never})
+    assert compared.episodes == 30
+    # Episodes differ by much in length, and the two drivers in each of them by a quarter.
+    assert compared.completion_ratio == pytest.approx(1.25)
+    assert compared.intervals["completion_ratio"] == pytest.approx((1.25, 1.25))
+    collided, km = 10, 0.02 * sum(range(1, 31))
+    assert compared.collisions_per_km_difference == pytest.approx(collided / (1.25 * km) - collided / km)
+    (same,) = driver_comparisons({"never": never, "always": never})
+    assert (same.completion_ratio, same.collisions_per_km_difference) == (1.0, 0.0)
+    assert same.intervals["collisions_per_km_difference"] == (0.0, 0.0)
+    low, high = driver_rows({"never": never})[0].intervals["collisions_per_km"]
+    assert high - low > 0.5, "each by itself is far from certain"
+
+
+def test_all_are_compared_with_who_never_thinks_or_else_with_the_first_that_is_no_limit() -> None:
+    def pairs(*names: str) -> list[tuple[str, str]]:
+        drives = {name: [driven(1, 100.0)] for name in names}
+        return [(each.driver, each.against) for each in driver_comparisons(drives)]
+
+    limits = (EXPERT, ConstantVelocity.name)
+    assert pairs(*limits) == []
+    assert pairs("never") == []
+    assert pairs(EXPERT, "adaptive", "never") == [(EXPERT, "never"), ("adaptive", "never")]
+    assert pairs(EXPERT, "teacher a", "teacher b") == [(EXPERT, "teacher a"), ("teacher b", "teacher a")]
+
+
+def test_nothing_is_told_of_drivers_that_cannot_be_compared() -> None:
+    assert driver_comparisons({"never": [driven(1, 100.0)], "adaptive": [driven(2, 100.0)]}) == []
+    (stood,) = driver_comparisons({"never": [driven(1, 100.0)], "adaptive": [driven(1, 0.0)]})
+    assert (stood.completion_ratio, stood.collisions_per_km_difference) == (0.0, None)
+    assert set(stood.intervals) == {"completion_ratio"}
+    (against,) = driver_comparisons({"never": [driven(1, 0.0)], "adaptive": [driven(1, 100.0)]})
+    assert (against.completion_ratio, against.off_road_per_km_difference) == (None, None)
+    assert against.intervals == {}
+    assert format_driver_rows([], [against]).split()[-5:] == ["never", "1", "-", "-", "-"]
+
+
+def test_comparisons_stand_below_the_rows() -> None:
+    drives = {
+        "never": [driven(1, 300.0, collided=True), driven(2, 200.0)],
+        "adaptive": [driven(1, 400.0), driven(2, 100.0)],
+    }
+    rows, comparisons = driver_rows(drives), driver_comparisons(drives)
+    text = format_driver_rows(rows, comparisons)
+    assert text.startswith(format_driver_rows(rows) + "\n\n")
+    title, line = text.splitlines()[-2:]
+    assert title.split("  ")[-1] == "95 %"
+    pair, *figures = re.split(" {2,}", line)
+    assert pair == "adaptive : never"
+    assert figures == ["2", "1.00", "0.50..1.33", "-2.00", "-3.33..+0.00", "+0.00", "+0.00..+0.00"]
 
 
 def test_a_run_that_was_cut_goes_on_behind_what_is_kept(tmp_path: Path) -> None:
