@@ -16,6 +16,7 @@ from looktwice.model.network.checkpoint import Loaded, load, save, write_code_em
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.nano_corpus import nano_corpus, nano_phrases
 from looktwice.model.network.numbers import needed_numbers, write_number_embeddings
+from looktwice.model.network.small_planner import SmallPlanner
 from looktwice.model.network.vla import LookTwiceVla, nano_config
 from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
@@ -59,6 +60,17 @@ def write_untrained(folder: Path, *, narrow: bool = False, settings: VlaSettings
             for text in ("6.4", "\n"):
                 embeddings[vocabulary.encode(text)[0]] *= 6
     save(folder, model, vocabulary, codec)
+    return folder
+
+
+def write_blind(folder: Path, seed: int) -> Path:
+    """Write a small planner that knows nothing, another one for each seed; returns its folder."""
+    codec = TrajectoryCodec.fit(*made_up_motions(400), size=CODEC_SIZE)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        planner = SmallPlanner("blind", codec)
+        torch.nn.init.normal_(planner.head.best.weight, std=0.1)
+    planner.save(folder, {})
     return folder
 
 

@@ -79,7 +79,7 @@ def drive(
     from looktwice.model.driving.cameras import FRONT_CAMERAS
     from looktwice.model.driving.hashing import hash_of
     from looktwice.model.driving.scene import split_of_seed
-    from looktwice.service.cli.small_pilot import SmallPilot
+    from looktwice.service.cli.small_pilot import load_pilots
 
     def pilot_of(driver: str, planner: PlannerClient, *, imagines: bool) -> Pilot | None:
         if driver == "expert":
@@ -109,7 +109,8 @@ def drive(
 
     def key_of(driver: str, seed: int, models: list[str]) -> str:
         if driver in small_pilots:
-            return hash_of(driver, seed, seconds, small_pilots[driver].revision)
+            # Its name may be that of its folder, which says nothing of how it drives.
+            return hash_of(small_pilots[driver].kind, seed, seconds, small_pilots[driver].revision)
         if driver in ("expert", "constant-velocity"):
             return hash_of(driver, seed, seconds)
         asked = controls_of(driver).model_dump_json()
@@ -117,11 +118,13 @@ def drive(
         return hash_of(driver, seed, seconds, asked, route, tracks, models, width_px, *formats)
 
     with reported_errors():
-        small_pilots = {pilot.name: pilot for pilot in (SmallPilot(folder, by) for folder in small or ())}
+        small_pilots = load_pilots(small or (), by)
     wanted = [*(drivers or ([] if small else DRIVERS[:-1])), *small_pilots]
     asks = any(driver in SERVICE_DRIVERS for driver in wanted)
     if unknown := set(drivers or ()) - set(DRIVERS):
         raise typer.BadParameter(f"unknown drivers: {', '.join(sorted(unknown))}")
+    if len(set(wanted)) < len(wanted):
+        raise typer.BadParameter("the same driver is named twice", param_hint="--driver")
     with (
         reported_errors(),
         _named(service),
@@ -132,9 +135,8 @@ def drive(
             split_of_seed(seed)
         cards = planner.models() if asks else []
         models = [card.revision for card in cards]
-        widths_px = [card.image_size[0] for card in cards] + [
-            pilot.width_px for pilot in small_pilots.values()
-        ]
+        widths_px = [card.image_size[0] for card in cards]
+        widths_px += [pilot.width_px for pilot in small_pilots.values()]
         width_px = max(widths_px, default=0) or FRONT_CAMERAS[0].width
         rig = Rig.of_width(width_px)
         imagines = wanted[-1] in SERVICE_DRIVERS and any(card.imagines and card.paints for card in cards)

@@ -19,6 +19,7 @@ from looktwice.service.cli.options import (
     Json,
     ScenePath,
     reported_errors,
+    small_names,
 )
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from looktwice.model.evaluation.open_loop import SceneResult
     from looktwice.model.evaluation.report import EvaluationReport
     from looktwice.model.evaluation.variants import Variant
+    from looktwice.model.network.small_planner import SmallPlanner
 
 _Found = TypeVar("_Found")
 
@@ -192,7 +194,7 @@ def evaluate(
 
             made = engine_of(checkpoint)
             variants = standard_variants(made.card.formats, controls, made.card.inputs)
-            planners = dict(map(_small_planner, small or ()))
+            planners = _small_planners(small or ())
             evaluate = partial(evaluate_checkpoint, planners=planners)
             run = run_started(evaluate, labelled, made, variants, n, rows, quiet=as_json)
             report = asyncio.run(run)
@@ -239,12 +241,17 @@ def _outcomes(
     return told_as, "\n\n".join(f"given the {given}:\n{table}" for given, table in tables.items())
 
 
-def _small_planner(folder: Path) -> tuple[str, Callable[[LabelledScene], FloatArray]]:
-    """A small planner's kind, and how it plans; scenes need a route."""
+def _small_planners(folders: Sequence[Path]) -> dict[str, Callable[[LabelledScene], FloatArray]]:
+    """How small planners plan, by their names; scenes need a route."""
     from looktwice.model.network.small_planner import load_small
 
-    planner = load_small(folder)
-    return planner.kind, lambda labelled: planner.plan([labelled.given(route=True, tracks=True)])[0]
+    def plans_by(planner: SmallPlanner, labelled: LabelledScene) -> FloatArray:
+        trajectory: FloatArray = planner.plan([labelled.given(route=True, tracks=True)])[0]
+        return trajectory
+
+    planners = [load_small(folder) for folder in folders]
+    names = small_names([planner.kind for planner in planners], folders)
+    return {name: partial(plans_by, planner) for name, planner in zip(names, planners, strict=True)}
 
 
 def evenly(scenes: Iterable[LabelledScene], count: int, limit: int | None) -> Iterator[LabelledScene]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -73,3 +73,19 @@ SmallBy = Annotated[
         "what it reads in pictures, or by the true facts in their place."
     ),
 ]
+
+
+def small_names(kinds: Sequence[str], folders: Sequence[Path]) -> list[str]:
+    """What tables call small planners: by kind and, where several are of one kind, by folder too.
+
+    Raises:
+        ValueError: two planners of one kind lie in folders of the same name.
+    """
+    names = [
+        kind if kinds.count(kind) == 1 else f"{kind} {folder.absolute().name}"
+        for kind, folder in zip(kinds, folders, strict=True)
+    ]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"two --small would be called {name!r}: rename a folder, or give it once")
+    return names

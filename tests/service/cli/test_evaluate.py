@@ -17,6 +17,8 @@ from looktwice.model.driving.scene_store import read_scenes, write_scenes
 from looktwice.model.engines.engine import Event, PlanRequest
 from looktwice.model.engines.torch.engine import TorchEngine
 from looktwice.service.cli.commands import app
+from tests.checkpoints import write_blind
+from tests.model.evaluation.test_table import CONTRACT
 
 
 def ladder(checkpoint: Path, folder: Path, *more: str) -> dict[str, Any]:
@@ -83,6 +85,33 @@ def test_scenes_that_a_row_does_not_allow_are_refused_before_the_engine_starts(
     write_scenes(tmp_path / "none.parquet", [])
     assert "no scenes to evaluate on" in refusal("--scenes", str(tmp_path / "none.parquet"))
     assert not started
+
+
+def test_json_has_the_keys_that_scripts_rely_on_and_a_row_for_each_small_planner(
+    brief_checkpoint: Path, tmp_path: Path
+) -> None:
+    folders = [tmp_path / "a", tmp_path / "b", tmp_path / "again" / "a"]
+    for seed, folder in enumerate(folders):
+        write_blind(folder, seed)
+    asked = ["evaluate", "--checkpoint", str(brief_checkpoint), "--limit", "2", "--n", "1", "--json"]
+    one, other, another = (["--small", str(folder)] for folder in folders)
+    result = CliRunner().invoke(app, [*asked, *one, *other])
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout.splitlines()[-1])
+    assert set(told) == {"scenes", "episodes", "rows", "comparisons", "speed_response"}
+    assert all(set(row) >= CONTRACT for row in told["rows"])
+    rows = {row["name"]: row for row in told["rows"] if row["subgroup"] is None}
+    assert {"blind a", "blind b"} < rows.keys()
+    assert rows["blind a"]["agreed_ade_m"] != rows["blind b"]["agreed_ade_m"]
+    free = rows["meta-act + route"]
+    for measure in ("agreed_ade_m", "greedy_ade_m", "agreement_plan_trajectory"):
+        assert isinstance(free[measure], float)
+        assert len(free["intervals"][measure]) == 2
+    assert set(told["speed_response"]["meta-act + route"]) == {"0.5", "1.5"}
+
+    refused = CliRunner().invoke(app, [*asked, *one, *another])
+    assert refused.exit_code == 2
+    assert "'blind a'" in refused.output
 
 
 def test_perception_needs_a_resampler_and_tells_facts_and_gate(
