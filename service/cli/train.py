@@ -115,8 +115,17 @@ def train(
     ] = 0,
     round_episodes: Annotated[int, typer.Option(help="teacher: episodes of a round.", min=1)] = 200,
     test: Annotated[Path | None, typer.Option(help="ladder: scenes for its table.")] = None,
+    roll_out: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="ladder: file or folder of those among --scenes that plans are made for and followed in, "
+            "generated and with their manifest; again for more. All of them if not given."
+        ),
+    ] = None,
     every: Annotated[int, typer.Option(help="ladder: roll out every so many-th scene.", min=1)] = 6,
-    processes: Annotated[int, typer.Option(help="ladder: that train together.", min=1)] = 1,
+    processes: Annotated[
+        int, typer.Option(help="ladder: that train together; as many follow plans, or --workers.", min=1)
+    ] = 1,
 ) -> None:
     """Train a checkpoint by a recipe; started again after a kill, it goes on where it was."""
     from dataclasses import replace
@@ -136,7 +145,7 @@ def train(
     from looktwice.model.training.run import RunSettings, create, run
     from looktwice.model.training.small import SmallSettings
     from looktwice.model.training.visual_codes import train_visual_codes
-    from looktwice.service.cli.ladder import climb
+    from looktwice.service.cli.ladder import LadderScenes, climb
     from looktwice.service.cli.small_rounds import train_small_in_rounds
 
     if threads is not None:
@@ -169,10 +178,10 @@ def train(
                 raise ValueError(
                     "the paper's recipes begin with a model that writes meta-actions: --from FOLDER"
                 )
-            options = _options(
-                context, but=("recipe", "scenes", "target", "source", "test", "every", "processes")
-            )
-            climb(target, scenes, test, source, options, every=every, processes=processes)
+            options = _options(context, but=_OF_LADDERS)
+            of_ladder = LadderScenes(scenes, test, tuple(roll_out or ()))
+            following = max(processes, workers)
+            climb(target, of_ladder, source, options, every=every, processes=processes, workers=following)
             return
         recipes = {each.name: each for each in (VISUAL_CODES, COMPOSER)} | dict(PAPER if paper else NANO)
         if recipe not in recipes:
@@ -232,6 +241,7 @@ def _tell(figures: Mapping[str, float]) -> None:
         typer.echo(f"{name} {value:.3f}")
 
 
+_OF_LADDERS: Final = ("recipe", "scenes", "target", "source", "test", "roll_out", "every", "processes")
 _ALWAYS: Final = ("recipe", "scenes", "target", "source", "threads")
 
 
