@@ -247,10 +247,14 @@ _COMPARED: Final = (
         for other, measure in (
             *((META_ACT, measure) for measure in _MEASURES),
             *((f"{META_ACT}, {MULTI_ROUND}", measure) for measure in _MEASURES),
-            (f"{entry}, never thinks", "min_ade_m"),
             (f"{entry}, always thinks", "min_ade_m"),
             *((f"{WHOLE_DATASET}, adaptive", measure) for measure in _MEASURES),
         )
+    ),
+    *(
+        ((f"{entry}, adaptive", f"{entry}, never thinks"), measure)
+        for entry in (COUNTERFACTUAL, ROUND_2, WHOLE_DATASET)
+        for measure in _MEASURES
     ),
     ((f"{ROUND_2}, adaptive", f"{COUNTERFACTUAL}, adaptive"), "min_ade_m"),
     ((f"{ROUND_2}, adaptive", f"{COUNTERFACTUAL}, adaptive"), "think_rate"),

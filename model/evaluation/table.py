@@ -84,5 +84,5 @@ def comparison_cells(comparison: Comparison) -> list[str]:
         ratio,
         interval_cell(comparison.ratio_interval, "{:.2f}"),
         f"difference {comparison.difference:+.3f}",
-        interval_cell(comparison.difference_interval, "{:.2f}"),
+        interval_cell(comparison.difference_interval, "{:.3f}"),
     ]

@@ -15,8 +15,10 @@ from looktwice.model.evaluation.ladder import (
     COUNTERFACTUAL,
     LADDER,
     META_ACT,
+    ROUND_2,
     TEMPERATURES,
     THRESHOLDS,
+    WHOLE_DATASET,
     at_threshold,
     by_difficulty,
     hard_to_easy,
@@ -102,6 +104,30 @@ def test_the_ladder_compares_what_the_paper_compares() -> None:
     assert {"rows", "comparisons", "difficulty", "scenes"} <= set(told)
     assert len(told["difficulty"]["counterfactual, adaptive"]) == 10
     assert "from easy to hard" in str(report)
+
+
+def test_what_thinking_brings_is_told_of_the_same_checkpoint() -> None:
+    """Not only of its best draw: also of the mean one, and of how many meet somebody."""
+    factors = {"min_ade_m": 0.9, "avg_ade_m": 1.1, "collision_rate": 0.5}
+    results = {
+        variant: [result(scene, 2.0, 0.2) for scene in range(40)]
+        for entry in (COUNTERFACTUAL, ROUND_2, WHOLE_DATASET)
+        for route in (False, True)
+        for variant in ladder_variants(entry, Controls(n=6), route=route)
+    }
+    for variant, of in results.items():
+        if "adaptive" in variant.name:
+            changed = [{name: getattr(each, name) * by for name, by in factors.items()} for each in of]
+            results[variant] = [replace(each, **new) for each, new in zip(of, changed, strict=True)]
+    report = ladder_report(results)
+    told, lines = report.to_json()["comparisons"], str(report).splitlines()
+    for entry in (COUNTERFACTUAL, ROUND_2, WHOLE_DATASET):
+        for route in ("", " + route"):
+            name = f"{entry}, adaptive{route} : {entry}, never thinks{route}"
+            ratios = {each["measure"]: each["ratio"] for each in told if each["name"] == name}
+            assert ratios == pytest.approx(factors)
+            shown = [line.removeprefix(name).split()[0] for line in lines if line.startswith(f"{name} ")]
+            assert shown == list(factors)
 
 
 def test_revised_plans_are_measured_where_there_are_some() -> None:

@@ -50,6 +50,9 @@ def test_a_ladder_is_climbed_once_and_told_again(
     assert {"traj-only", "meta-act", "meta-act, expert plan", "meta-act, multi-round"} <= names
     for way in ("adaptive", "never thinks", "always thinks", "threshold 0", "threshold 1", "temperature 0.2"):
         assert f"counterfactual, {way}" in names
+    thinking = "counterfactual, adaptive + route : counterfactual, never thinks + route"
+    compared = {each["measure"] for each in told["comparisons"] if each["name"] == thinking}
+    assert compared == {"min_ade_m", "avg_ade_m", "collision_rate"}
     assert {path.name for path in plots.iterdir()} == {
         "thinking-by-difficulty.png",
         "thinking-by-temperature.png",
