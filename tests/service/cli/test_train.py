@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from itertools import islice
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner, Result
 
-from looktwice.model.driving.scene_store import write_scenes
+from looktwice.model.bundled import SCENES
+from looktwice.model.driving.scene_store import read_scenes, write_scenes
 from looktwice.model.network.checkpoint import load
 from looktwice.service.cli.commands import app
 from tests.model.network.stock import write_stock
@@ -32,6 +34,27 @@ def test_a_stock_backbone_is_expanded_and_plans(tmp_path: Path) -> None:
     planned = ran("plan", scenes, "--checkpoint", expanded, "--n", "1", "--format", "traj_only", "--json")
     assert planned.exit_code == 0, planned.output
     assert len(json.loads(planned.stdout)["draws"][0]["trajectory"]) == 64
+
+
+def test_a_stock_backbone_is_trained_by_the_papers_recipe(tmp_path: Path) -> None:
+    scenes, stock, expanded, target = (
+        tmp_path / name for name in ("scenes.parquet", "stock", "expanded", "traj-only")
+    )
+    write_scenes(scenes, islice(read_scenes(SCENES), 4))
+    write_stock(stock, spare_rows=0)
+    of = ("--scenes", scenes, "--cache", tmp_path / "cache")
+    made = ran("train", "create", *of, "--from", stock, "--to", expanded)
+    assert made.exit_code == 0, made.output
+    few = ("--steps", "2", "--batch-size", "2")
+    trained = ran("train", "traj-only", "--paper", *of, *few, "--from", expanded, "--to", target)
+    assert trained.exit_code == 0, trained.output
+    (stage,) = load(target).card.details["stages"]
+    told = {name: stage[name] for name in ("name", "steps", "batch_size", "learning_rate", "examples")}
+    assert told == {"name": "traj-only", "steps": 2, "batch_size": 2, "learning_rate": 1e-5, "examples": 4}
+    assert stage["vision_rate"] == 1.0, "unlike the nano recipe, the paper's trains the tower too"
+    logged = json.loads((target / "log.jsonl").read_text())
+    assert (logged["stage"], logged["step"]) == ("1 traj-only", 2)
+    assert 0 < logged["train_loss"] < 10
 
 
 def test_what_is_no_backbone_is_refused_by_name(tmp_path: Path) -> None:
