@@ -49,7 +49,7 @@ app = typer.Typer(
 )
 app.command("plan")(plan.plan)
 app.command("serve")(serve.serve)
-app.command("train")(train.train)
+app.command("train", cls=train.TrainCommand)(train.train)
 app.command("score")(score.score)
 app.command("failures")(failures.failures)
 app.command("feedback")(feedback.feedback)

@@ -5,27 +5,38 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import typer
+from typer.core import TyperArgument, TyperCommand
 
 from looktwice.model.bundled import CHECKPOINT as BUNDLED_CHECKPOINT
 from looktwice.service.cli.options import reported_errors
 
+_RECIPES: Final = (
+    "create, {}; branch: when to look twice, learned alone; "
+    "ladder: from create to counterfactual, with a data set of own plans round by round, and the table; "
+    "blind, teacher: the small planners of the tables, without pictures; "
+    "visual-codes: pictures as codes, for models that imagine; "
+    "composer: gives these codes what was seen half a second before."
+)
+
+
+class TrainCommand(TyperCommand):
+    """`looktwice train`: its help names the recipes that there are, and imports them for that alone."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help, as click asks for it."""
+        from looktwice.model.training.recipes import NANO
+
+        [recipe] = [each for each in self.params if isinstance(each, TyperArgument)]
+        recipe.help = _RECIPES.format(", ".join(NANO))
+        super().format_help(ctx, formatter)
+
 
 def train(
     context: typer.Context,
-    recipe: Annotated[
-        str,
-        typer.Argument(
-            help="create, language, ground, read-facts, traj-only, meta-act, counterfactual, multi-round, "
-            "critic, sketched; branch: when to look twice, learned alone; "
-            "ladder: all of it, then rollouts, labels and training round by round, and the table; "
-            "blind, teacher: the small planners of the tables, without pictures; "
-            "visual-codes: pictures as codes, for models that imagine; "
-            "composer: gives these codes what was seen half a second before."
-        ),
-    ],
+    recipe: str,
     scenes: Annotated[Path, typer.Option(help="Training scenes: a file or a folder.")],
     target: Annotated[Path, typer.Option("--to", help="Checkpoint folder to write.")],
     source: Annotated[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from itertools import islice
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from typer.testing import CliRunner, Result
 from looktwice.model.bundled import SCENES
 from looktwice.model.driving.scene_store import read_scenes, write_scenes
 from looktwice.model.network.checkpoint import load
+from looktwice.model.training.recipes import NANO, PAPER
 from looktwice.service.cli.commands import app
 from tests.model.network.stock import write_stock
 from tests.model.training.scenes import training_scene
@@ -80,3 +82,18 @@ def test_options_that_a_recipe_would_ignore_are_refused(
     assert refused.exit_code == 2
     assert f"{recipe} takes no {ignored[0]}" in refused.output
     assert not (tmp_path / "made").exists()
+
+
+def test_every_recipe_is_named_where_they_are_listed(tmp_path: Path) -> None:
+    asked = ("--scenes", tmp_path, "--to", tmp_path / "made")
+    refused = ran("train", "no-recipe", *asked).output
+    known = refused.removeprefix("looktwice: unknown recipe 'no-recipe'; known are ").strip().split(", ")
+    assert {"create", "branch", "ladder", "blind", "composer", *NANO} <= set(known)
+    papers = ran("train", "no-recipe", "--paper", *asked).output
+    told = re.sub(r"[^a-z0-9,;:.-]+", " ", ran("train", "--help").output)
+    commands = (Path(__file__).parents[3] / "docs" / "commands.md").read_text()
+    [row] = [line for line in commands.splitlines() if line.startswith("| `looktwice train RECIPE`")]
+    for name in known:
+        assert re.search(rf"(?<![\w-]){name}(?![\w-])", told), name
+        assert f"`{name}`" in row, name
+    assert all(name in papers and name in known for name in PAPER)
