@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
-from typing import Final, TypeVar
+from typing import Final, Protocol, TypeVar
 
 import httpx
 from pydantic import BaseModel, JsonValue, ValidationError
 
-from looktwice.clients import wire
+from looktwice.clients import wire, wire_scores
 from looktwice.clients.wire_values import plan_of_tracks
 from looktwice.model.driving.plan import Plan, PlanError
 from looktwice.model.driving.trajectory import (
@@ -27,6 +27,7 @@ from looktwice.model.driving.trajectory import (
 
 BUSY_STATUSES: Final = (429, 503)
 _Answer = TypeVar("_Answer", bound=BaseModel)
+_Told = TypeVar("_Told", covariant=True)
 
 
 class PlannerError(Exception):
@@ -248,15 +249,31 @@ def plan_result(response: httpx.Response) -> PlanResult:
 
 def batch_results(response: httpx.Response) -> list[PlanResult | PlannerProblem]:
     """The typed results of POST /v1/plan/batch; raises `PlannerError`."""
-    results: list[PlanResult | PlannerProblem] = []
-    for result in read(response, wire.BatchResponse).results:
-        if result.response is not None:
-            results.append(planned(result.response, response))
-        elif result.problem is not None:
-            results.append(typed(result.problem))
-        else:
-            raise BadAnswer(f"{response.url} gave a result without an answer and without a problem")
-    return results
+    results = (_answered(each, response) for each in read(response, wire.BatchResponse).results)
+    return [each if isinstance(each, PlannerProblem) else planned(each, response) for each in results]
+
+
+def score_results(response: httpx.Response) -> list[wire_scores.ScoreResponse | PlannerProblem]:
+    """The typed results of POST /v1/score/batch; raises `PlannerError`."""
+    return [_answered(each, response) for each in read(response, wire_scores.ScoreBatchResponse).results]
+
+
+class _OfBatch(Protocol[_Told]):
+    """One scene of a batch: its answer, or its problem."""
+
+    @property
+    def response(self) -> _Told | None: ...
+
+    @property
+    def problem(self) -> wire.Problem | None: ...
+
+
+def _answered(result: _OfBatch[_Told], response: httpx.Response) -> _Told | PlannerProblem:
+    if result.response is not None:
+        return result.response
+    if result.problem is not None:
+        return typed(result.problem)
+    raise BadAnswer(f"{response.url} gave a result without an answer and without a problem")
 
 
 def planned(answered: wire.PlanResponse, response: httpx.Response) -> PlanResult:

@@ -10,24 +10,18 @@ with PlannerClient("http://127.0.0.1:8000") as planner:
 from __future__ import annotations
 
 import asyncio
-import base64
-import os
 import time
 from collections.abc import AsyncGenerator, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from types import TracebackType
-from typing import Self, TypedDict, TypeVar
+from typing import Self, TypeVar
 
 import httpx
-import msgpack
 from httpx_sse import EventSource
 from pydantic import BaseModel
 
 from looktwice.clients import wire, wire_feedback, wire_imagine, wire_refine, wire_scores
 from looktwice.clients.answers import (
-    BUSY_STATUSES,
     BadAnswer,
     LookedAt,
     PlannedDraw,
@@ -45,9 +39,9 @@ from looktwice.clients.answers import (
     problem_of,
     read,
     reflect_result,
-    retry_after_s,
-    unreachable,
+    score_results,
 )
+from looktwice.clients.calling import Access, RetryPolicy, Tries, body_of, headers_of, typed_errors
 from looktwice.clients.requests import (
     attempt_at,
     imagine_request,
@@ -65,7 +59,6 @@ from looktwice.clients.streams import (
     plan_event,
     refine_event,
 )
-from looktwice.clients.wire_values import with_pictures
 from looktwice.model.driving.outcome import Outcome
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import Scene
@@ -103,40 +96,6 @@ __all__ = [
 _Event = TypeVar("_Event")
 
 
-@dataclass(frozen=True)
-class RetryPolicy:
-    """How long a client tries.
-
-    Attributes:
-        timeout_s: for one attempt, connecting included.
-        attempts: at most, the first one included. Only 429 and 503 answers that say how long to wait are
-            tried again, and never beyond a request's own ``deadline_ms``.
-        longest_wait_s: a longer Retry-After is reported instead of waited for.
-    """
-
-    timeout_s: float = 30.0
-    attempts: int = 3
-    longest_wait_s: float = 5.0
-
-
-@dataclass(frozen=True)
-class Access:
-    """How a client speaks to the service.
-
-    Attributes:
-        api_key: sent as a bearer token; None where the service asks for none.
-        packed: send bodies in msgpack, pictures as they are: smaller and quicker to read than JSON.
-    """
-
-    api_key: str | None = None
-    packed: bool = False
-
-    @classmethod
-    def from_environment(cls) -> Self:
-        """With the key in ``LOOKTWICE_API_KEY``, where one is set."""
-        return cls(os.environ.get("LOOKTWICE_API_KEY") or None)
-
-
 class PlannerClient:
     """Blocking client; safe to share between threads, as its httpx client is.
 
@@ -154,9 +113,9 @@ class PlannerClient:
         transport: httpx.BaseTransport | None = None,
         access: Access = Access(),
     ) -> None:
-        self._retries, self._body = retries, partial(_body, packed=access.packed)
+        self._retries, self._body = retries, partial(body_of, packed=access.packed)
         self._http = httpx.Client(
-            base_url=base_url, timeout=retries.timeout_s, transport=transport, headers=_headers(access)
+            base_url=base_url, timeout=retries.timeout_s, transport=transport, headers=headers_of(access)
         )
 
     def plan(
@@ -284,6 +243,17 @@ class PlannerClient:
         """Score trajectories by NAVSIM's rules; raises `PlannerError`."""
         return read(self._ask("/v1/score", request), wire_scores.ScoreResponse)
 
+    def score_batch(
+        self, asked: Sequence[wire_scores.ScoreRequest]
+    ) -> list[wire_scores.ScoreResponse | PlannerProblem]:
+        """Score trajectories of many scenes in one request, 64 at most; a scene that fails does so alone.
+
+        Raises:
+            PlannerError: the batch as a whole failed.
+        """
+        batch = wire_scores.ScoreBatchRequest(requests=list(asked))
+        return score_results(self._ask("/v1/score/batch", batch))
+
     def feedback(self, request: wire_feedback.FeedbackRequest) -> wire_feedback.FeedbackResponse:
         """Have trajectories judged, and be told why they fail; raises `PlannerError`."""
         return read(self._ask("/v1/feedback", request), wire_feedback.FeedbackResponse)
@@ -329,7 +299,7 @@ class PlannerClient:
 
     def _stream(self, path: str, asked: BaseModel, tell: Tell[_Event]) -> Iterator[tuple[str, _Event]]:
         body = self._body(asked.model_copy(update={"stream": True}))
-        with _typed_errors(), self._http.stream("POST", path, **body) as response:
+        with typed_errors(), self._http.stream("POST", path, **body) as response:
             if response.status_code != 200:
                 response.read()
                 raise problem_of(response)
@@ -338,11 +308,11 @@ class PlannerClient:
                     yield event.event, data
 
     def _send(self, request: httpx.Request, deadline_ms: int | None = None) -> httpx.Response:
-        attempts = _Attempts(self._retries, deadline_ms)
+        tries = Tries(self._retries, deadline_ms)
         while True:
-            with _typed_errors():
+            with typed_errors():
                 response = self._http.send(request)
-            wait_s = attempts.wait_after(response)
+            wait_s = tries.wait_after(response)
             if wait_s is None:
                 return response
             time.sleep(wait_s)
@@ -358,9 +328,9 @@ class AsyncPlannerClient:
         transport: httpx.AsyncBaseTransport | None = None,
         access: Access = Access(),
     ) -> None:
-        self._retries, self._body = retries, partial(_body, packed=access.packed)
+        self._retries, self._body = retries, partial(body_of, packed=access.packed)
         self._http = httpx.AsyncClient(
-            base_url=base_url, timeout=retries.timeout_s, transport=transport, headers=_headers(access)
+            base_url=base_url, timeout=retries.timeout_s, transport=transport, headers=headers_of(access)
         )
 
     async def plan(
@@ -425,6 +395,13 @@ class AsyncPlannerClient:
         """Score trajectories by NAVSIM's rules; raises `PlannerError`."""
         return read(await self._ask("/v1/score", request), wire_scores.ScoreResponse)
 
+    async def score_batch(
+        self, asked: Sequence[wire_scores.ScoreRequest]
+    ) -> list[wire_scores.ScoreResponse | PlannerProblem]:
+        """Score trajectories of many scenes; see `PlannerClient.score_batch`."""
+        batch = wire_scores.ScoreBatchRequest(requests=list(asked))
+        return score_results(await self._ask("/v1/score/batch", batch))
+
     async def feedback(self, request: wire_feedback.FeedbackRequest) -> wire_feedback.FeedbackResponse:
         """Have trajectories judged, and be told why they fail; raises `PlannerError`."""
         return read(await self._ask("/v1/feedback", request), wire_feedback.FeedbackResponse)
@@ -471,7 +448,7 @@ class AsyncPlannerClient:
         self, path: str, asked: BaseModel, tell: Tell[_Event]
     ) -> AsyncGenerator[tuple[str, _Event]]:
         body = self._body(asked.model_copy(update={"stream": True}))
-        with _typed_errors():
+        with typed_errors():
             async with self._http.stream("POST", path, **body) as response:
                 if response.status_code != 200:
                     await response.aread()
@@ -481,65 +458,15 @@ class AsyncPlannerClient:
                         yield event.event, data
 
     async def _send(self, request: httpx.Request, deadline_ms: int | None = None) -> httpx.Response:
-        attempts = _Attempts(self._retries, deadline_ms)
+        tries = Tries(self._retries, deadline_ms)
         while True:
-            with _typed_errors():
+            with typed_errors():
                 response = await self._http.send(request)
-            wait_s = attempts.wait_after(response)
+            wait_s = tries.wait_after(response)
             if wait_s is None:
                 return response
             await asyncio.sleep(wait_s)
 
 
-class _Attempts:
-    """Decides, without waiting itself, whether and when to try again."""
-
-    def __init__(self, retries: RetryPolicy, deadline_ms: int | None) -> None:
-        self._left = retries.attempts
-        self._longest_wait_s = retries.longest_wait_s
-        self._ends = None if deadline_ms is None else time.monotonic() + deadline_ms / 1000
-
-    def wait_after(self, response: httpx.Response) -> float | None:
-        """Seconds to wait before the next attempt; None when ``response`` is the last word."""
-        self._left -= 1
-        wait_s = retry_after_s(response)
-        if response.status_code not in BUSY_STATUSES or wait_s is None or self._left <= 0:
-            return None
-        if wait_s > self._longest_wait_s or (self._ends and time.monotonic() + wait_s > self._ends):
-            return None
-        return wait_s
-
-
-class _Body(TypedDict):
-    content: bytes
-    headers: dict[str, str]
-
-
-def _body(asked: BaseModel, request_id: str | None = None, *, packed: bool) -> _Body:
-    media_type = wire.MSGPACK_MEDIA_TYPE if packed else "application/json"
-    headers = {"Content-Type": media_type}
-    if request_id is not None:
-        headers[wire.REQUEST_ID_HEADER] = request_id
-    content = _packed(asked) if packed else asked.model_dump_json().encode()
-    return _Body(content=content, headers=headers)
-
-
-def _packed(asked: BaseModel) -> bytes:
-    content: bytes = msgpack.packb(with_pictures(asked.model_dump(), base64.b64decode))
-    return content
-
-
-def _headers(access: Access) -> dict[str, str]:
-    return {} if access.api_key is None else {"Authorization": f"Bearer {access.api_key}"}
-
-
 def _path_of(asked: wire.PlanRequest | wire.ReflectRequest) -> str:
     return "/v1/reflect" if isinstance(asked, wire.ReflectRequest) else "/v1/plan"
-
-
-@contextmanager
-def _typed_errors() -> Iterator[None]:
-    try:
-        yield
-    except httpx.HTTPError as error:
-        raise unreachable(error) from error

@@ -95,6 +95,12 @@ def example_score() -> dict[str, Any]:
     }
 
 
+def example_score_batch() -> dict[str, Any]:
+    """The same trajectories by the rules of both versions."""
+    asked = example_score()
+    return {"requests": [asked | {"version": "v1.1"}, asked | {"version": "v2.2"}]}
+
+
 def example_feedback() -> dict[str, Any]:
     """The same trajectories with what was thought of the one that does not brake, and what was driven."""
     asked = example_score()

@@ -34,9 +34,12 @@ from looktwice.service.problems import (
 )
 from looktwice.service.routes.arrivals import arrival_of
 from looktwice.service.routes.dependencies import Dependencies
-from looktwice.service.routes.request_examples import example_score
+from looktwice.service.routes.request_examples import example_score, example_score_batch
 
 EXAMPLES: Final[dict[str, Example]] = {"straight on behind a car": {"value": example_score()}}
+BATCH_EXAMPLES: Final[dict[str, Example]] = {
+    "the same by the rules of both versions": {"value": example_score_batch()}
+}
 SCORING_REFUSALS: Final = (
     *(INVALID_JSON, INVALID_BODY, UNAUTHORIZED, BODY_TIMEOUT, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE),
     *(INVALID_REQUEST, UNKNOWN_FIELD, INVALID_LABELS, INVALID_TRAJECTORY, UNKNOWN_SCENE),
@@ -82,7 +85,10 @@ def score_router(deps: Dependencies, admission: Admission) -> APIRouter:
         responses=refusals | PACKED,
         openapi_extra=payloads(wire_scores.ScoreBatchRequest),
     )
-    async def batch(request: Request, asked: wire_scores.ScoreBatchRequest) -> Any:
+    async def batch(
+        request: Request,
+        asked: Annotated[wire_scores.ScoreBatchRequest, Body(openapi_examples=BATCH_EXAMPLES)],
+    ) -> Any:
         """Many scenes at once: each gets its scores or its problem."""
         arrival = arrival_of(request)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import copy
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,8 +13,8 @@ import msgpack
 import psutil
 import pytest
 
-from looktwice.clients.planner import PlannerClient
-from looktwice.clients.wire_scores import ScoreRequest
+from looktwice.clients.planner import AsyncPlannerClient, PlannerClient, PlannerProblem, RequestRefused
+from looktwice.clients.wire_scores import ScoreRequest, ScoreResponse
 from looktwice.service.operations.no_model import NoModel
 from looktwice.service.operations.settings import Settings
 from looktwice.service.routes.request_examples import example_score
@@ -153,6 +154,34 @@ def test_nan_is_no_number(scorer: Served[NoModel]) -> None:
     content = msgpack.packb(asked(trajectories=[[[0.0, float("nan"), 0.0]] * 8]))
     answer = scorer.http.post("/v1/score", content=content, headers={"Content-Type": "application/msgpack"})
     assert answer.json()["type"].endswith("/invalid-trajectory")
+
+
+def test_both_clients_score_a_batch_and_one_scene_fails_alone(scorer: Served[NoModel]) -> None:
+    good = ScoreRequest.model_validate(asked())
+    wrong = good.model_copy(update={"trajectories": [[[0.0, 0.0, 0.0]] * 9]})
+
+    async def asynchronously() -> list[ScoreResponse | PlannerProblem]:
+        async with AsyncPlannerClient(scorer.url) as planner:
+            return await planner.score_batch([good, wrong, good])
+
+    with PlannerClient(scorer.url) as planner:
+        alone = planner.score(good)
+        told = planner.score_batch([good, wrong, good])
+    for results in (told, asyncio.run(asynchronously())):
+        first, second, third = results
+        assert isinstance(second, RequestRefused)
+        assert second.type.endswith("/invalid-trajectory")
+        for each in (first, third):
+            assert isinstance(each, ScoreResponse)
+            assert each.scores == alone.scores
+
+
+def test_the_described_batch_is_scored_by_both_versions(scorer: Served[NoModel]) -> None:
+    operation = scorer.http.get("/openapi.json").json()["paths"]["/v1/score/batch"]["post"]
+    (example,) = operation["requestBody"]["content"]["application/json"]["examples"].values()
+    told = scorer.http.post("/v1/score/batch", json=example["value"]).json()["results"]
+    assert [each["response"]["version"] for each in told] == ["v1.1", "v2.2"]
+    assert [each["response"]["missing"] for each in told] == [[], ["extended_comfort"]]
 
 
 def test_the_client_scores(scorer: Served[NoModel]) -> None:
