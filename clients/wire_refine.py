@@ -24,6 +24,7 @@ from looktwice.clients.wire import (
     Scene,
     Timing,
 )
+from looktwice.clients.wire_feedback import PlanId
 from looktwice.clients.wire_scores import ScoreVersion, TrajectoryScore
 
 AUTO: Final = "auto"
@@ -46,6 +47,11 @@ class SectionsGiven(RequestModel):
     safety_failure: _Section
     efficiency_failure: _Section
     correction: _Section
+    plan_id: PlanId | None = Field(
+        default=None,
+        description="Of the trajectory that they were written for, as POST /v1/feedback names it. Where it "
+        "is given, it must be the draft's.",
+    )
 
 
 def _form_of_feedback(value: object) -> str:

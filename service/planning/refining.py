@@ -42,12 +42,13 @@ from looktwice.service.problems import (
     INVALID_TRACKS,
     INVALID_TRAJECTORY,
     NEEDS_TRACKS,
+    OTHER_PLAN,
     UNKNOWN_FORMAT,
     ProblemError,
     at,
 )
 from looktwice.service.scoring.request_scores import answer as score_answer
-from looktwice.service.scoring.rule_feedback import CALLER
+from looktwice.service.scoring.rule_feedback import CALLER, plan_id_of
 
 VERSION: Final[Version] = "v1.1"
 """PDMS, which the paper judges by."""
@@ -207,8 +208,11 @@ def _feedback(
 ) -> wire_refine.DraftFeedback:
     given = asked.feedback
     if isinstance(given, wire_refine.SectionsGiven):
+        plan_id = plan_id_of([[x, y, heading] for x, y, _, heading in asked.draft])
+        if given.plan_id not in (None, plan_id):
+            raise at(OTHER_PLAN, "/feedback/plan_id", f"this draft is {plan_id}")
         try:
-            text = str(Feedback(**given.model_dump()))
+            text = str(Feedback(**given.model_dump(exclude={"plan_id"})))
         except FeedbackError as error:
             raise at(INVALID_FEEDBACK, "/feedback", str(error)) from None
         return wire_refine.DraftFeedback(text=text, written_by=CALLER, correct=None)

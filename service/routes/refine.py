@@ -18,24 +18,26 @@ from looktwice.service.http.payloads import payload_route, respond
 from looktwice.service.planning.events import PlannedScene
 from looktwice.service.planning.refining import RefineTeller, Refining, refine_answer, refining_of
 from looktwice.service.planning.submitting import last
-from looktwice.service.problems import INVALID_FEEDBACK, INVALID_TRAJECTORY, NEEDS_TRACKS
+from looktwice.service.problems import INVALID_FEEDBACK, INVALID_TRAJECTORY, NEEDS_TRACKS, OTHER_PLAN
 from looktwice.service.routes.arrivals import arrival_of
 from looktwice.service.routes.dependencies import Dependencies
 from looktwice.service.routes.plan import REFUSALS
-from looktwice.service.routes.request_examples import example_refinement
+from looktwice.service.routes.request_examples import example_refinement, example_taught_refinement
 from looktwice.service.routes.streaming import server_sent, streamed
 
-_DRAFT: Final = example_refinement((FRONT_WIDE, FRONT_TELE))
+_CAMERAS: Final = (FRONT_WIDE, FRONT_TELE)
+_DRAFT: Final = example_refinement(_CAMERAS)
 EXAMPLES: Final[dict[str, Example]] = {
     "a draft that does not brake": {"value": _DRAFT},
     "the same, told as it is refined": {"value": _DRAFT | {"stream": True}},
+    "the same with feedback that was written for it": {"value": example_taught_refinement(_CAMERAS)},
 }
 
 
 def refine_router(deps: Dependencies) -> APIRouter:
     """The endpoint; refinements take places as draws of /v1/plan do."""
     router = APIRouter(route_class=payload_route(deps.check_planning), tags=["planning"])
-    refusals = problems(*REFUSALS, INVALID_TRAJECTORY, INVALID_FEEDBACK, NEEDS_TRACKS)
+    refusals = problems(*REFUSALS, INVALID_TRAJECTORY, INVALID_FEEDBACK, NEEDS_TRACKS, OTHER_PLAN)
 
     @router.post(
         "/v1/refine",

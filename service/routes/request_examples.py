@@ -10,6 +10,7 @@ import numpy as np
 from looktwice.model.driving.images import encode_jpeg
 from looktwice.model.driving.scene import CLIP_FRAMES
 from looktwice.model.driving.trajectory import HISTORY_STEPS, ROUTE_POINTS, ROUTE_SPACING_M
+from looktwice.service.scoring.rule_feedback import plan_id_of
 
 
 def example_request(cameras: tuple[str, ...]) -> dict[str, Any]:
@@ -43,6 +44,20 @@ def example_refinement(cameras: tuple[str, ...]) -> dict[str, Any]:
         "feedback": "auto",
         "controls": {"n": 2, "seed": 7},
     }
+
+
+def example_taught_refinement(cameras: tuple[str, ...]) -> dict[str, Any]:
+    """The same with a teacher's sections, and the draft that they were written for."""
+    asked = example_refinement(cameras)
+    sections = {
+        "meta_action": "The plan is to maintain speed and keep lane. The right action is to decelerate.",
+        "think_process": "The reasoning overlooks the slower vehicle ahead.",
+        "safety_failure": "NC is 0.0: the car hits the vehicle ahead.",
+        "efficiency_failure": "EP is 0.00: the metres driven do not count, since the plan is not safe.",
+        "correction": "Brake, and stay behind the vehicle ahead.",
+    }
+    judged = [[x, y, heading] for x, y, _, heading in asked["draft"]]
+    return asked | {"feedback": sections | {"plan_id": plan_id_of(judged)}}
 
 
 def example_imagining(cameras: tuple[str, ...]) -> dict[str, Any]:

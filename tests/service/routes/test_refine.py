@@ -23,6 +23,7 @@ from looktwice.clients.planner import (
     attempt_at,
     refine_request,
 )
+from looktwice.clients.wire_feedback import FeedbackRequest, FeedbackSections
 from looktwice.clients.wire_refine import DraftJudged, RefineRequest, RefineResponse, SectionsGiven
 from looktwice.model.driving.pdm.feedback import Feedback, parse_feedback
 from looktwice.model.driving.scene import Track
@@ -30,7 +31,7 @@ from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.service.operations.no_model import NoModel
 from looktwice.service.operations.settings import Settings
-from looktwice.service.routes.request_examples import example_refinement
+from looktwice.service.routes.request_examples import example_refinement, example_score
 from tests.checkpoints import write_untrained
 from tests.service.http.test_problem_documents import problem
 from tests.service.scenes import scene
@@ -243,8 +244,35 @@ def test_the_caller_may_write_words_or_sections(served: Served[TorchEngine]) -> 
         correction="Brake.",
     )
     told = refined(served, refine_request(BEHIND_LEADER, DRAFT, sections, controls))
-    assert parse_feedback(told.feedback.text) == Feedback(**sections.model_dump())
+    assert parse_feedback(told.feedback.text) == Feedback(**sections.model_dump(exclude={"plan_id"}))
     assert told.draws[0].logprobs != words.draws[0].logprobs
+
+
+def test_feedback_that_names_its_plan_is_taken_for_that_plan_alone(served: Served[TorchEngine]) -> None:
+    """Judged by POST /v1/feedback first, poses with x, y and heading; then refined."""
+    poses = [[x, y, heading] for x, y, _, heading in DRAFT.tolist()]
+    judged = FeedbackRequest.model_validate(example_score() | {"trajectories": [poses], "version": "v1.1"})
+    controls = wire.ReflectControls(n=1)
+    with PlannerClient(served.url) as planner:
+        (told,) = planner.feedback(judged).feedback
+        assert told.sections is not None
+        sections = SectionsGiven(**told.sections.model_dump(), plan_id=told.plan_id)
+        assert planner.refine(refine_request(scene(), DRAFT, sections, controls)).feedback.text == told.text
+        other = DRAFT + np.array([0.0, 0.1, 0.0, 0.0], np.float32)
+        with pytest.raises(RequestRefused, match="this draft is") as caught:
+            planner.refine(refine_request(scene(), other, sections, controls))
+    assert caught.value.type.endswith("/other-plan")
+    assert caught.value.errors[0].pointer == "/feedback/plan_id"
+
+
+def test_the_described_examples_are_refined(served: Served[TorchEngine]) -> None:
+    operation = served.http.get("/openapi.json").json()["paths"][PATH]["post"]
+    examples = operation["requestBody"]["content"]["application/json"]["examples"].values()
+    written_by = []
+    for example in examples:
+        told = refined(served, example["value"] | {"stream": False})
+        written_by.append(told.feedback.written_by)
+    assert written_by == ["rules", "rules", "caller"]
 
 
 def test_without_tracks_nothing_is_scored_and_the_caller_has_to_write(served: Served[TorchEngine]) -> None:
@@ -280,7 +308,7 @@ def test_both_clients_ask_for_the_example_and_it_is_counted(served: Served[Torch
 
 POSE = [0.0, 0.0, 0.0, 0.0]
 TRACK = example_refinement(CAMERAS)["scene"]["tracks"][0]
-SECTIONS = dict.fromkeys(SectionsGiven.model_fields, "Brake.")
+SECTIONS = dict.fromkeys(FeedbackSections.model_fields, "Brake.")
 
 
 @pytest.mark.parametrize(
@@ -297,6 +325,8 @@ SECTIONS = dict.fromkeys(SectionsGiven.model_fields, "Brake.")
         ({"feedback": SECTIONS | {"correction": "x" * 701}}, "invalid-feedback", "/feedback/correction"),
         ({"feedback": SECTIONS | {"correction": "a\nb"}}, "invalid-feedback", "/feedback"),
         ({"feedback": SECTIONS | {"said": "x"}}, "unknown-field", "/feedback/said"),
+        ({"feedback": SECTIONS | {"plan_id": "0" * 12}}, "other-plan", "/feedback/plan_id"),
+        ({"feedback": SECTIONS | {"plan_id": "that one"}}, "invalid-feedback", "/feedback/plan_id"),
         ({"feedback": "Brake.</feedback>"}, "request-refused", None),
         ({"feedback": "Z " * 1900}, "request-refused", None),
         ({"threshold": 1.01}, "invalid-request", "/threshold"),
