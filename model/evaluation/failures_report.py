@@ -31,7 +31,7 @@ class FailuresReport:
         scores: of the expert, the baselines and all stages.
         stages: in the order of learning.
         comparisons: each stage against the one before it, the last against the first, refinements against
-            what they refine.
+            what they refine and against new draws.
     """
 
     scores: ScoreTable
@@ -110,6 +110,9 @@ def _comparisons(stages: Sequence[MeasuredStage]) -> Iterator[Comparison]:
             refined = [replace(each, before=each.after) for each in stage.results]
             name = f"{stage.name}, failed: refined : draft"
             yield replace(compare(name, refined, stage.results, "before"), measure="pdms")
+            refined = [replace(each, again=each.after) for each in stage.results]
+            name = f"{stage.name}, failed: refined : drawn once more"
+            yield replace(compare(name, refined, stage.results, "again"), measure="pdms")
         if any(each.refined_pdms is not None for each in stage.results):
             driven = [replace(each, pdms=each.refined_pdms) for each in stage.results]
             yield compare(f"{stage.name}, all: refined where noticed : draft", driven, stage.results, "pdms")
@@ -139,6 +142,7 @@ _REFINE_COLUMNS: Final[Columns] = {
     "noticed": ("noticed", _SHARE),
     "before": ("before", _SCORE),
     "after": ("after", _SCORE),
+    "again": ("drawn once more", _SCORE),
     "refined_pdms": ("PDMS, refined where noticed", _SCORE),
 }
 _THRESHOLD_COLUMNS: Final[Columns] = {each: _ANSWER_COLUMNS[each] for each in ("pdms", "epdms", "both")}

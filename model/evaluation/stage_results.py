@@ -22,7 +22,7 @@ from looktwice.model.driving.pdm.rule_teacher import feedback_on
 from looktwice.model.driving.pdm.scoring import Others, score
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.trajectory import agreed
-from looktwice.model.engines.engine import Controls, Draw, Engine
+from looktwice.model.engines.engine import Controls, Draw, Engine, PlanRequest
 from looktwice.model.evaluation.open_loop import SceneResult
 from looktwice.model.evaluation.report import evaluate_variants
 from looktwice.model.evaluation.scores import (
@@ -38,6 +38,8 @@ from looktwice.model.network.model_card import ModelCard
 
 VERSION: Final[Version] = "v1.1"
 """PDMS: what the paper judges failures by."""
+_OTHER_SEED: Final = 1 << 40
+"""Beside the seeds of all variants and scenes, which have fewer bits."""
 
 
 class Formats(NamedTuple):
@@ -90,6 +92,7 @@ class StageResult:
             where none failed.
         before, after: PDMS of failed answers, and of their refinements; None where none failed, or the
             checkpoint refines nothing.
+        again: PDMS of one more draw for each failed answer, without feedback; None as of those.
         refined_pdms: of what would be driven if all answers that automatic feedback calls wrong were refined;
             None where the checkpoint refines nothing.
     """
@@ -106,6 +109,7 @@ class StageResult:
     noticed: float | None
     before: float | None
     after: float | None
+    again: float | None
     refined_pdms: float | None
 
 
@@ -132,6 +136,13 @@ class MeasuredStage:
     results: Sequence[StageResult]
     seed_pdms: Sequence[float]
     scores: Mapping[Version, Sequence[SceneScore]]
+
+
+class _SecondAnswers(NamedTuple):
+    """PDMS by scene of what comes second: refinements, and new draws without feedback."""
+
+    refined: Mapping[str, float]
+    again: Mapping[str, float]
 
 
 class _JudgedAnswer(NamedTuple):
@@ -189,14 +200,14 @@ async def evaluate_stage(
             judge.labelled.scene.scene_id: _answer(judge, drawn[judge.labelled.scene.scene_id])
             for judge in judges
         }
-        refined: Mapping[str, float] = {}
+        second = None
         if refining is not None:
-            refined = await _refined(engine, judges, variant, refining, answers, concurrency)
+            second = await _second_answers(engine, judges, variant, refining, answers, concurrency)
         planner = by_scene(scenes, {scene_id: each.draw.scored for scene_id, each in answers.items()})
         scores.append(scene_scores(judges, planner))
         results.append(
             [
-                _result(judge.labelled, answers[pdms.scene_id], pdms, epdms, refining, refined)
+                _result(judge.labelled, answers[pdms.scene_id], pdms, epdms, second)
                 for judge, pdms, epdms in zip(judges, scores[-1]["v1.1"], scores[-1]["v2.2"], strict=True)
             ]
         )
@@ -226,36 +237,44 @@ def _answer(judge: SceneJudge, draws: Sequence[Draw]) -> _JudgedAnswer:
     return _JudgedAnswer(draws[chosen], float(worth[chosen]), float(worth.mean()), judged)
 
 
-async def _refined(
+async def _second_answers(
     engine: Engine,
     judges: Sequence[SceneJudge],
     variant: Variant,
     refining: Family,
     answers: Mapping[str, _JudgedAnswer],
     concurrency: int,
-) -> dict[str, float]:
-    """PDMS of one refinement of each answer that fails or seems to, by automatic feedback."""
-    asked = [
-        judge
-        for judge in judges
-        if (answer := answers[judge.labelled.scene.scene_id]).failed or not answer.foreseen.correct
-    ]
+) -> _SecondAnswers:
+    """One refinement of each answer that fails or seems to, and one more draw for each that fails."""
 
-    async def refine(judge: SceneJudge) -> float:
-        answer = answers[judge.labelled.scene.scene_id]
-        request = request_for(judge.labelled, variant)
-        request = replace(
-            request,
-            request_id=f"{request.request_id}/refined",
+    def refinement(asked: PlanRequest, answer: _JudgedAnswer) -> PlanRequest:
+        return replace(
+            asked,
+            request_id=f"{asked.request_id}/refined",
             format=refining.name,
-            controls=replace(request.controls, n=1),
+            controls=replace(asked.controls, n=1),
             attempt=Attempt(answer.draw.trajectory, str(feedback_on(answer.foreseen))),
         )
-        [draw] = await planned(engine, request)
-        return float(judge.scores(plans_of(draw.scored[None]), VERSION).partial_score[0])
 
-    worth = await over_scenes(asked, refine, concurrency)
-    return {judge.labelled.scene.scene_id: value for judge, value in zip(asked, worth, strict=True)}
+    def one_more(asked: PlanRequest, answer: _JudgedAnswer) -> PlanRequest:
+        controls = replace(asked.controls, n=1, seed=asked.controls.seed ^ _OTHER_SEED)
+        return replace(asked, request_id=f"{asked.request_id}/again", controls=controls)
+
+    async def worth(
+        of: Sequence[SceneJudge], request: Callable[[PlanRequest, _JudgedAnswer], PlanRequest]
+    ) -> dict[str, float]:
+        async def one(judge: SceneJudge) -> float:
+            answer = answers[judge.labelled.scene.scene_id]
+            [draw] = await planned(engine, request(request_for(judge.labelled, variant), answer))
+            return float(judge.scores(plans_of(draw.scored[None]), VERSION).partial_score[0])
+
+        found = await over_scenes(of, one, concurrency)
+        return {judge.labelled.scene.scene_id: value for judge, value in zip(of, found, strict=True)}
+
+    judged = [(judge, answers[judge.labelled.scene.scene_id]) for judge in judges]
+    seems_wrong = [judge for judge, answer in judged if answer.failed or not answer.foreseen.correct]
+    failed = [judge for judge, answer in judged if answer.failed]
+    return _SecondAnswers(await worth(seems_wrong, refinement), await worth(failed, one_more))
 
 
 def _result(
@@ -263,17 +282,19 @@ def _result(
     answer: _JudgedAnswer,
     pdms: SceneScore,
     epdms: SceneScore,
-    refining: Family | None,
-    refined: Mapping[str, float],
+    second: _SecondAnswers | None,
 ) -> StageResult:
     graph, draw = LaneGraph(labelled.lane_lines), answer.draw
     expert, own = action_of(labelled.future, graph), action_of(draw.trajectory, graph, draw.times_s)
     right: tuple[float | None, float | None] = (None, None)
     if expert is not None and own is not None:
         right = float(own.longitudinal == expert.longitudinal), float(own.lateral == expert.lateral)
-    after, driven = refined.get(pdms.scene_id) if answer.failed else None, None
-    if refining is not None:
-        driven = answer.score if answer.foreseen.correct else refined[pdms.scene_id]
+    before, after, again, driven = None, None, None, None
+    if second is not None:
+        driven = answer.score if answer.foreseen.correct else second.refined[pdms.scene_id]
+        if answer.failed:
+            before = answer.score
+            after, again = second.refined[pdms.scene_id], second.again[pdms.scene_id]
     return StageResult(
         scene_id=pdms.scene_id,
         episode_id=pdms.episode_id,
@@ -285,8 +306,9 @@ def _result(
         both=None if None in right else float(all(right)),
         failed=float(answer.failed),
         noticed=float(not answer.foreseen.correct) if answer.failed else None,
-        before=None if after is None else answer.score,
+        before=before,
         after=after,
+        again=again,
         refined_pdms=driven,
     )
 

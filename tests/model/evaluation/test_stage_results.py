@@ -89,6 +89,40 @@ def test_failed_answers_are_refined_by_what_is_foreseen_alone() -> None:
         assert "hits the vehicle #0" in each.attempt.feedback
 
 
+def test_failed_answers_are_drawn_once_more_too_without_feedback() -> None:
+    engine = Learner("elf_vla", "elf_vla_refine")
+    [wall, free] = stage("rl", engine).results
+    assert wall.again == wall.before
+    assert free.again is None
+    plain = [each for each in engine.requests if each.attempt is None]
+    more = [each for each in plain if each.controls.n == 1]
+    assert [(each.scene.scene_id, each.format) for each in more] == [("a-0015", "elf_vla")] * 2
+    first = {each.controls.seed for each in plain if each.controls.n > 1}
+    assert len({each.controls.seed for each in more} - first) == 2
+
+
+def test_a_refinement_that_is_no_better_than_luck_shows() -> None:
+    class Lucky(Learner):
+        """Fails in what it draws first, and never again."""
+
+        async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
+            self._good = request.controls.n == 1
+            async for event in super().submit(request):
+                yield event
+
+    refining = ("elf_vla", "elf_vla_refine")
+    told = report(stage("learned", Learner(*refining)), stage("lucky", Lucky(*refining)))
+    gains = {each.name: each.difference for each in told.comparisons if each.measure == "pdms"}
+    assert gains["learned, failed: refined : draft"] > 0.5
+    assert gains["learned, failed: refined : drawn once more"] == gains["learned, failed: refined : draft"]
+    assert gains["lucky, failed: refined : draft"] > 0.5
+    assert gains["lucky, failed: refined : drawn once more"] == 0
+    [learned, lucky] = told.to_json()["stages"]
+    assert learned["again"] == learned["before"]
+    assert lucky["again"] == lucky["after"]
+    assert "drawn once more" in str(told)
+
+
 def test_actions_are_compared_with_the_experts() -> None:
     [wall, free] = stage("sft", Learner("elf_vla")).results
     assert (wall.longitudinal, wall.lateral, wall.both) == (0.0, 1.0, 0.0)
@@ -123,7 +157,7 @@ def test_what_cannot_refine_has_no_refinements() -> None:
     engine = Learner("elf_vla")
     told = report(stage("sft", engine, seeds=1))
     [row] = told.to_json()["stages"]
-    assert (row["before"], row["after"], row["refined_pdms"]) == (None, None, None)
+    assert [row[name] for name in ("before", "after", "again", "refined_pdms")] == [None] * 4
     assert row["failed"] == pytest.approx(0.5)
     assert row["noticed"] == 1.0
     assert told.comparisons == []

@@ -34,7 +34,8 @@ def test_stages_are_told_in_json_and_in_tables(refining_checkpoint: Path, tmp_pa
     assert [row["name"] for row in told["scores"]["epdms"]][-2:] == ["sft", "rl"]
     compared = {each["name"]: each["difference"] for each in told["comparisons"]}
     assert compared["rl : sft"] == 0
-    assert "sft, failed: refined : draft" in compared
+    assert 0 <= sft["again"] <= 1
+    assert {"sft, failed: refined : draft", "sft, failed: refined : drawn once more"} <= compared.keys()
 
     text = evaluated(*stages, *kept)
     assert text.exit_code == 0, text.output
