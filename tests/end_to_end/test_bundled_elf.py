@@ -8,11 +8,13 @@ import numpy as np
 
 from looktwice.clients import wire
 from looktwice.clients.planner import PlannerClient, refine_request
+from looktwice.clients.wire_refine import RefineResponse
 from looktwice.model.bundled import CHECKPOINTS, SCENES
+from looktwice.model.driving.pdm.feedback import RuleFeedback
 from looktwice.model.driving.pdm.judging import SceneJudge
 from looktwice.model.driving.pdm.labelled import plans_of
 from looktwice.model.driving.scene_store import read_scenes
-from looktwice.model.driving.trajectory import constant_velocity
+from looktwice.model.driving.trajectory import FloatArray, constant_velocity
 from looktwice.model.engines.torch.engine import TorchEngine
 from tests.end_to_end.test_bundled import looktwice
 from tests.service.serving import Served
@@ -46,12 +48,15 @@ def test_it_says_what_is_there_and_scores_better_than_keeping_on(planner: Planne
     assert np.nan_to_num(own).mean() > np.nan_to_num(kept_on).mean() + 0.1
 
 
-def test_refinements_of_drafts_that_fail_score_better(planner: PlannerClient) -> None:
+def test_refinements_of_drafts_that_fail_score_better_and_heed_what_is_said(planner: PlannerClient) -> None:
+    """Any own plan may score better than such a draft; told that it is right, models stay nearer to it."""
     before, after = list[float](), list[float]()
+    away_m, away_if_right_m = list[float](), list[float]()
+    controls = wire.ReflectControls(n=4, seed=1)
     for labelled in BUNDLED:
         scene = labelled.given(route=True, tracks=True)
         steady = constant_velocity(labelled.scene.history)[4:40:5]
-        told = planner.refine(refine_request(scene, steady, controls=wire.ReflectControls(n=4, seed=1)))
+        told = planner.refine(refine_request(scene, steady, controls=controls))
         scores = [
             None if each is None else each.partial_score
             for each in (told.before, *(draw.after for draw in told.draws))
@@ -61,8 +66,20 @@ def test_refinements_of_drafts_that_fail_score_better(planner: PlannerClient) ->
         if known[0] < 0.8:
             before.append(known[0])
             after.append(sum(known[1:]) / 4)
+            right = str(RuleFeedback(1.0, correct=True))
+            away_m.append(apart_m(told, steady))
+            away_if_right_m.append(
+                apart_m(planner.refine(refine_request(scene, steady, right, controls)), steady)
+            )
     assert len(before) > 2
     assert np.mean(after) > np.mean(before) + 0.1
+    assert np.mean(away_m) > np.mean(away_if_right_m) + 0.5
+
+
+def apart_m(told: RefineResponse, draft: FloatArray) -> float:
+    """The mean distance between where refinements end and where their draft does."""
+    ends = np.array([draw.trajectory[-1][:2] for draw in told.draws])
+    return float(np.hypot(*(ends - draft[-1, :2]).T).mean())
 
 
 def test_commands_take_it_by_its_name() -> None:
