@@ -88,6 +88,10 @@ export const feedback = (sceneId, trajectories, said, signal) => post("/v1/feedb
   said,
 }, signal).then((body) => body.feedback);
 
+// A draft that is planned again by feedback on it: a text, or five sections with the plan that they are of.
+export const refine = (scene, draft, feedback, controls, signal) =>
+  post("/v1/refine", { scene, draft, feedback, controls }, signal);
+
 // A labelled scene per scene in the file. Parquet is read by the service, JSON here.
 export async function scenesOfFile(file) {
   if (!file.name.toLowerCase().endsWith(".json")) {

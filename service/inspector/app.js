@@ -4,12 +4,12 @@ import * as api from "./api.js";
 import { drawBirdseye } from "./birdseye.js";
 import { showCameras } from "./cameras.js";
 import { byId, element } from "./dom.js";
-import { asked, canBeJudged, forgetFeedback, showFeedback } from "./feedback.js";
+import { asked, canBeJudged, feedbackOf, forgetFeedback, showFeedback } from "./feedback.js";
 import { allowImagining, imagine, showImaginable } from "./imagination.js";
 import { showDraw } from "./timeline.js";
 import { averageError } from "./times.js";
 
-const state = { view: null, draws: [], chosen: 0, judged: null, running: null, opened: new Map(), inputs: [] };
+const state = { view: null, draws: [], chosen: 0, judged: null, running: null, opened: new Map(), inputs: [], refines: false };
 
 const say = (text) => { byId("status").textContent = text; };
 
@@ -50,6 +50,7 @@ function forgetDraws() {
 function forgetJudgement() {
   state.judged = null;
   forgetFeedback();
+  byId("refine").hidden = true;
   byId("why").hidden = state.opened.has(byId("scene").value) || !canBeJudged(state.draws[state.chosen]);
 }
 
@@ -57,9 +58,36 @@ async function judge() {
   const draw = state.draws[state.chosen];
   const answer = await api.feedback(byId("scene").value, ...asked(draw), state.running?.signal);
   if (state.draws[state.chosen] !== draw) return; // another one was chosen meanwhile
-  state.judged = { draft: answer[0], chosen: answer.at(-1) };
-  showFeedback(state.judged);
+  showJudgement({ draft: answer[0], chosen: answer.at(-1) });
+}
+
+function showJudgement(judged) {
+  state.judged = judged;
+  byId("refine").hidden = !state.refines;
+  showFeedback(judged);
   redraw();
+}
+
+// Plans the chosen draw again by the feedback that is shown; what comes of it is judged as the draw was.
+async function refine() {
+  const draw = state.draws[state.chosen];
+  const { draft, chosen } = state.judged;
+  const signal = state.running?.signal;
+  byId("refine").disabled = true;
+  say("Refining …");
+  try {
+    const body = await api.refine(given(), draw.trajectory, feedbackOf(chosen), { ...controls(), n: 1 }, signal);
+    const [refinement] = body.draws;
+    const [refined] = await api.feedback(byId("scene").value, ...asked(refinement), signal);
+    if (state.draws[state.chosen] !== draw) return; // another one was chosen meanwhile
+    showJudgement({ draft, chosen, refined, refinement });
+    say(`Refined in ${body.timing.total_ms.toFixed(0)} ms, request ${body.request_id}`);
+  } catch (error) {
+    if (!signal?.aborted) say("No refinement.");
+    throw error;
+  } finally {
+    byId("refine").disabled = false;
+  }
 }
 
 function showView(view) {
@@ -291,6 +319,7 @@ function listen() {
   });
   byId("imagine").addEventListener("click", () => attempt(() => imagine(given(), controls().seed)));
   byId("why").addEventListener("click", () => attempt(judge));
+  byId("refine").addEventListener("click", () => attempt(refine));
   byId("thinking").addEventListener("change", showThreshold);
   byId("with-threshold").addEventListener("change", replan);
   byId("threshold").addEventListener("input", replan);
@@ -328,6 +357,7 @@ async function begin() {
 async function showModel() {
   const [card] = await api.models();
   state.inputs = card.inputs;
+  state.refines = card.refines.length > 0;
   allowImagining(card);
   byId("model").textContent = `${card.name} ${card.revision} · ${card.engine} · ${card.cameras.length} cameras`;
 }

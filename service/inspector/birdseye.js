@@ -9,8 +9,10 @@ const BESIDE_M = 15; // at least, to either side; farther where somebody turns
 const AROUND_M = 4; // what lies beside the outermost point of a trajectory
 const NOW = 15; // row of the present in an agent's track
 const SECOND = 10; // rows
+const THICKNESS = { expert: 10, draft: 7, refinement: 4 }; // px: where they are the same way, all three show
 
-// Of a draw that was judged, what is wrong is red, what was driven green, and what a second look made of it blue.
+// Of a draw that was judged, what is wrong is red, what was driven green, and what a second look or a refinement made of
+// it blue. A refinement stays blue where it is wrong itself: feedback tells that, and red it would hide the draft.
 export function drawBirdseye(view, draws, chosen, judged = null) {
   const canvas = byId("birdseye");
   const ratio = window.devicePixelRatio || 1;
@@ -22,7 +24,9 @@ export function drawBirdseye(view, draws, chosen, judged = null) {
   const style = getComputedStyle(document.documentElement);
   const color = (name) => style.getPropertyValue(`--${name}`).trim();
 
-  const ways = [view.future, ...draws.flatMap((draw) => [draw.trajectory, draw.draft_trajectory])].filter(Boolean).flat();
+  const refinement = judged?.refinement;
+  const ways = [view.future, refinement?.trajectory, ...draws.flatMap((draw) => [draw.trajectory, draw.draft_trajectory])]
+    .filter(Boolean).flat();
   const ahead = Math.max(35, ...ways.map(([x]) => x)) + 10;
   const left = Math.max(BESIDE_M, ...ways.map(([, y]) => y + AROUND_M));
   const right = Math.max(BESIDE_M, ...ways.map(([, y]) => AROUND_M - y));
@@ -38,10 +42,15 @@ export function drawBirdseye(view, draws, chosen, judged = null) {
   for (const agent of view.agents) agentFuture(map, agent);
   for (const agent of view.agents) if (agent.poses[NOW]) box(map, agent.poses[NOW], agent, tint(agent), 1);
   draws.forEach((draw, index) => index !== chosen && line(map, start(draw.trajectory), "draw", 2, [], 0.5));
-  if (view.future) line(map, start(view.future), "expert", judged ? 3.5 : 2.5, judged ? [] : [7, 5]);
+  const thickness = refinement ? THICKNESS.expert : judged ? 3.5 : 2.5;
+  if (view.future) line(map, start(view.future), "expert", thickness, judged ? [] : [7, 5]);
   const draft = draws[chosen]?.draft_trajectory;
   if (draft) line(map, start(draft), judged && !judged.draft.correct ? "wrong" : "draft", 3, judged ? [] : [9, 5]);
-  if (draws[chosen]) chosenDraw(map, draws[chosen], judged && !judged.chosen.correct ? "wrong" : draft ? "refined" : "chosen");
+  const isWrong = judged && !judged.chosen.correct;
+  if (refinement) {
+    line(map, start(draws[chosen].trajectory), isWrong ? "wrong" : "draft", THICKNESS.draft);
+    dotted(map, refinement, "refined", THICKNESS.refinement);
+  } else if (draws[chosen]) dotted(map, draws[chosen], isWrong ? "wrong" : draft ? "refined" : "chosen");
   box(map, [0, 0, 0], EGO, "ego", 1);
   canvas.setAttribute("aria-label", describe(view, draws, chosen, judged));
 }
@@ -114,9 +123,9 @@ function agentFuture(map, agent) {
 }
 
 // With a dot at every whole second at which it has a pose.
-function chosenDraw(map, draw, name) {
+function dotted(map, draw, name, thickness = 3.5) {
   const { pen, at, color } = map;
-  line(map, start(draw.trajectory), name, 3.5);
+  line(map, start(draw.trajectory), name, thickness);
   timesOf(draw).forEach((seconds, row) => {
     if (Math.abs(seconds - Math.round(seconds)) > 1e-6) return;
     pen.beginPath();
@@ -139,6 +148,11 @@ function describe(view, draws, chosen, judged) {
       parts.push(`its draft ended ${Math.hypot(dx - x, dy - y).toFixed(1)} m from there`);
     }
   }
-  if (judged) parts.push(`by its score the chosen one is ${judged.chosen.correct ? "correct" : "wrong"}`);
+  const verdict = (plan) => (plan.correct ? "correct" : "wrong");
+  if (judged) parts.push(`by its score the chosen one is ${verdict(judged.chosen)}`);
+  if (judged?.refinement) {
+    const [x] = judged.refinement.trajectory.at(-1);
+    parts.push(`its refinement ends ${x.toFixed(0)} m ahead and is ${verdict(judged.refined)}`);
+  }
   return parts.join("; ");
 }

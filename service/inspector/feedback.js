@@ -10,8 +10,13 @@ const SECTIONS = {
   correction: "Actionable correction",
 };
 
-// Only trajectories as they are scored: 64 poses at 10 Hz, which have no times of their own.
-export const canBeJudged = (draw) => Boolean(draw) && !draw.times_s && draw.trajectory.length === 64;
+// Only trajectories as they are scored, and refined: 64 poses at 10 Hz, which have no times of their own, or 8 half a
+// second apart.
+export function canBeJudged(draw) {
+  const times = draw?.times_s;
+  if (times) return times.length === 8 && times.every((seconds, row) => seconds === (row + 1) / 2);
+  return Boolean(draw) && draw.trajectory.length === 64;
+}
 
 // What to judge of a draw: where its first plan led, where that is known, and where it leads.
 export function asked(draw) {
@@ -25,13 +30,15 @@ export function asked(draw) {
   return [trajectories, said];
 }
 
-export function showFeedback(judged) {
-  const { draft, chosen } = judged;
-  const before = draft === chosen ? null : draft;
-  const parts = [bars(before, chosen)];
-  if (before) parts.push(...told(before, "First plan"), ...told(chosen, "After the second look"));
-  else parts.push(...told(chosen, "The plan"));
-  byId("feedback").replaceChildren(...parts);
+// Feedback as a refinement takes it; sections name the plan that they were written for.
+export const feedbackOf = (plan) => (plan.sections ? { ...plan.sections, plan_id: plan.plan_id } : plan.text);
+
+export function showFeedback({ draft, chosen, refined = null, refinement = null }) {
+  const steps = draft === chosen ? [[chosen, "The plan"]] : [[draft, "First plan"], [chosen, "After the second look"]];
+  if (refined) steps.push([refined, "The refinement", refinement.thinking]);
+  const compared = steps.slice(-2).map(([plan]) => plan);
+  const parts = steps.flatMap(([plan, whose, thinking], place) => told(plan, whose, thinking, place > 0));
+  byId("feedback").replaceChildren(bars(compared), ...parts);
 }
 
 export const forgetFeedback = () => byId("feedback").replaceChildren();
@@ -40,27 +47,25 @@ const scoreOf = (plan) => (plan.score === null ? `partial score ${number(plan.pa
 const number = (value) => (value === null ? "not known" : value.toFixed(2));
 const look = (plan, isRefined) => (plan.correct ? (isRefined ? "refined" : "") : "wrong");
 
-function told(plan, whose) {
+// A verdict, the thoughts that led to the plan where they are shown nowhere else, and what is said of it.
+function told(plan, whose, thinking, isRefined) {
   const heading = element("h3", {
-    className: plan.correct ? "" : "wrong",
+    className: look(plan, isRefined),
     textContent: `${whose} is ${plan.correct ? "correct" : "wrong"}: ${scoreOf(plan)}`,
   });
-  if (!plan.sections) return [heading, element("p", { textContent: plan.text })];
-  return [heading, ...Object.entries(SECTIONS).map(([field, title]) =>
+  const parts = thinking ? [heading, element("blockquote", { textContent: thinking })] : [heading];
+  if (!plan.sections) return [...parts, element("p", { textContent: plan.text })];
+  return [...parts, ...Object.entries(SECTIONS).map(([field, title]) =>
     element("p", {}, element("strong", { textContent: `${title}: ` }), plan.sections[field]))];
 }
 
-// A row for each sub-score: before the second look above, after it below.
-function bars(before, chosen) {
-  const rows = Object.entries(chosen.sub_scores).flatMap(([name, value]) => {
-    const both = before ? [[before, before.sub_scores[name], false], [chosen, value, true]] : [[chosen, value, false]];
-    const label = both.map(([, each]) => number(each)).join(" \u2192 ");
-    return [
-      element("dt", { textContent: name.replaceAll("_", " ") }),
-      element("dd", { className: "bars" }, ...both.map(([plan, each, isRefined]) => bar(plan, each, isRefined))),
-      element("dd", { textContent: label }),
-    ];
-  });
+// A row for each sub-score: before a second look or refinement above, after it below.
+function bars(compared) {
+  const rows = Object.keys(compared.at(-1).sub_scores).flatMap((name) => [
+    element("dt", { textContent: name.replaceAll("_", " ") }),
+    element("dd", { className: "bars" }, ...compared.map((plan, place) => bar(plan, plan.sub_scores[name], place > 0))),
+    element("dd", { textContent: compared.map((plan) => number(plan.sub_scores[name])).join(" \u2192 ") }),
+  ]);
   return element("dl", { className: "scores" }, ...rows);
 }
 
