@@ -24,6 +24,8 @@ from looktwice.service.cli.options import (
 )
 
 if TYPE_CHECKING:
+    import httpx
+
     from looktwice.model.bench.bench_report import Roofline
     from looktwice.model.bench.bench_run import BenchRow
 
@@ -148,17 +150,27 @@ def score(
         Path | None, typer.Option(help="Interpreter that has what NAVSIM needs; this one without it.")
     ] = None,
     repeats: Annotated[int, typer.Option(help="Measured rounds.", min=1)] = 5,
+    service: Annotated[
+        str | None, typer.Option(help="URL of a running service, asked for the same 6 plans. None: no HTTP.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Our scorer of plans, and NAVSIM's own beside it, in seconds of one core."""
+    """Our scorer of plans, and NAVSIM's own beside it, in seconds of one core; and scores over HTTP."""
     with reported_errors():
-        from looktwice.model.bench.scoring_speed import measure
+        from looktwice.loadtests.score_trips import score_ms, score_request
+        from looktwice.model.bench.scoring_speed import FEW, measure, scene
 
+        http_ms = None
+        if service is not None:
+            with _client_of(service) as client:
+                http_ms = score_ms(client, score_request(*scene(FEW)), 20 * repeats)
         found = measure(repeats, navsim or [], navsim_python and navsim_python.absolute())
         if as_json:
-            typer.echo(json.dumps(found.to_json()))
+            typer.echo(json.dumps(found.to_json() | {"http_6_ms": http_ms}))
             return
         typer.echo(f"6 plans {1000 * found.seconds_6:.1f} ms, 4,096 plans {found.seconds_4096:.2f} s")
+        if http_ms is not None:
+            typer.echo(f"6 plans over HTTP {http_ms:.1f} ms")
         if found.navsim_seconds_a_plan is not None:
             theirs_ms = 1000 * found.navsim_seconds_a_plan
             typer.echo(f"NAVSIM {theirs_ms:.1f} ms a plan, {found.times_navsim:.0f} times ours")
@@ -210,20 +222,12 @@ def http(
 ) -> None:
     """What HTTP adds to planning, by kind of body, on a service that is otherwise idle."""
     with reported_errors():
-        import httpx
-
-        from looktwice.clients.planner import Access
         from looktwice.loadtests.overhead import measure
         from looktwice.model.driving.scene_store import read_scenes
 
-        key = Access.from_environment().api_key
-        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
         labelled = tuple(read_scenes(scenes, dense=False))
-        try:
-            with httpx.Client(base_url=service, timeout=120, headers=headers) as client:
-                rows = list(measure(client, labelled, n=n, requests=requests, seed=seed))
-        except httpx.HTTPError as error:
-            raise RuntimeError(f"no service answers at {service}: {error}") from error
+        with _client_of(service) as client:
+            rows = list(measure(client, labelled, n=n, requests=requests, seed=seed))
     if as_json:
         typer.echo(json.dumps({"n": n, "rows": [vars(row) | {"share": row.share} for row in rows]}))
         return
@@ -232,6 +236,21 @@ def http(
             f"{row.payload:9} {row.body_bytes / 1000:6.1f} kB   engine {row.engine_ms:7.1f} ms   "
             f"HTTP {row.overhead_ms:5.1f} ms ({row.share:.1%}), {row.before_ms:.1f} ms of it in the service"
         )
+
+
+@contextmanager
+def _client_of(service: str) -> Iterator[httpx.Client]:
+    """A client with the key of the environment; raises `RuntimeError` where the service is not there."""
+    import httpx
+
+    from looktwice.clients.calling import Access, headers_of
+
+    headers = headers_of(Access.from_environment())
+    try:
+        with httpx.Client(base_url=service, timeout=120, headers=headers) as client:
+            yield client
+    except httpx.HTTPError as error:
+        raise RuntimeError(f"no service answers at {service}: {error}") from error
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Locator, Page, Request, expect
@@ -66,6 +67,12 @@ def score_in(panel: Locator, heading: str) -> float:
     return float(title.inner_text().rpartition(" ")[2])
 
 
+def sent_to(path: str, asked: list[Request]) -> Any:
+    """The body of the one request that went there."""
+    (request,) = (each for each in asked if each.url.endswith(path))
+    return request.post_data_json
+
+
 def test_a_wrong_draw_is_refined_by_the_feedback_that_is_shown(
     page: Page, served: Served[TorchEngine]
 ) -> None:
@@ -101,12 +108,12 @@ def test_a_wrong_draw_is_refined_by_the_feedback_that_is_shown(
     for colour in (WRONG_RGB, EXPERT_RGB, CHOSEN_RGB):
         assert near(shown, colour).sum() > 20
 
-    sent = next(each.post_data_json for each in asked if each.url.endswith("/v1/refine"))
+    sent = sent_to("/v1/refine", asked)
     assert len(sent["draft"]) == 8
     assert sent["feedback"]["correction"] in said
     assert re.fullmatch("[0-9a-f]{12}", sent["feedback"]["plan_id"])
-    # The draft and its refinement are judged by the same request but for the trajectory.
-    again = next(each.post_data_json for each in asked if each.url.endswith("/v1/feedback"))
+    # The refinement is judged as its draft was, by the labels of the scene.
+    again = sent_to("/v1/feedback", asked)
     assert again["scene_id"] == CUT_IN
     assert len(again["trajectories"]) == 1
 
