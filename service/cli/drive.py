@@ -10,7 +10,7 @@ from typing import Annotated, Final, cast
 
 import typer
 
-from looktwice.service.cli.options import Json, SmallBy, reported_errors
+from looktwice.service.cli.options import Json, SmallBy, SmallPlanners, reported_errors
 
 SERVICE_DRIVERS: Final = ("adaptive", "never", "always")
 DRIVERS: Final = ("expert", "constant-velocity", *SERVICE_DRIVERS)
@@ -34,13 +34,7 @@ def drive(
     route: Annotated[bool, typer.Option(help="Tell the model the route.")] = True,
     tracks: Annotated[bool, typer.Option(help="Tell the model the tracks of the objects around.")] = False,
     format: Annotated[str | None, typer.Option(help="Response format; the model's first by default.")] = None,
-    small: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Folder of a small planner (`train blind`, `train teacher`), or of a checkpoint whose "
-            "reader of tracks writes sketches, that drives too."
-        ),
-    ] = None,
+    small: SmallPlanners = None,
     by: SmallBy = "tracks",
     keep: Annotated[
         Path | None, typer.Option(help="File that keeps every drive: started again, it goes on behind them.")

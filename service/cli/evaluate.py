@@ -18,6 +18,7 @@ from looktwice.service.cli.options import (
     Checkpoint,
     Json,
     ScenePath,
+    SmallPlanners,
     reported_errors,
     small_names,
 )
@@ -102,13 +103,7 @@ def evaluate(
         Path | None,
         typer.Option(help="SQLite file that keeps all draws: started again, it goes on where it was."),
     ] = None,
-    small: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Folder of a small planner (`train blind`, `train teacher`), or of a checkpoint whose "
-            "reader of tracks writes sketches, that gets a row too."
-        ),
-    ] = None,
+    small: SmallPlanners = None,
     perception: Annotated[
         bool, typer.Option("--perception", help="How well pictures are read, fact by fact, and nothing else.")
     ] = False,

@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from looktwice.service.cli.options import folder_along
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
 def stages_named(given: Sequence[str]) -> dict[str, Path]:
     """Checkpoints by the names of their stages, of ``NAME=FOLDER`` or ``FOLDER``, whose name is then its own.
 
+    A folder may be the name of a checkpoint that comes along.
+
     Raises:
         ValueError: two have one name.
     """
@@ -28,7 +32,7 @@ def stages_named(given: Sequence[str]) -> dict[str, Path]:
         name = before if equals else folder.name
         if name in stages:
             raise ValueError(f"two stages are called {name!r}: name them as in --stage NAME=FOLDER")
-        stages[name] = folder
+        stages[name] = folder_along(folder)
     return stages
 
 

@@ -23,11 +23,14 @@ def reported_errors() -> Iterator[None]:
         raise typer.Exit(2) from error
 
 
+def folder_along(named: Path) -> Path:
+    """The folder of a checkpoint that comes along, by its name; any other folder as it is."""
+    return named if named.exists() else CHECKPOINTS.get(str(named), named)
+
+
 def _found(checkpoint: Path) -> Path:
-    if checkpoint.exists():
-        return checkpoint
-    if str(checkpoint) in CHECKPOINTS:
-        return CHECKPOINTS[str(checkpoint)]
+    if (folder := folder_along(checkpoint)).exists():
+        return folder
     from looktwice.model.network.hub import checkpoint_folder
 
     with reported_errors():
@@ -64,6 +67,15 @@ DEFAULT_CHECKPOINT = CHECKPOINT
 DEFAULT_SCENES = SCENES
 
 
+SmallPlanners = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--small",
+        help="Folder of a small planner (`train blind`, `train teacher`) that plans too, or of a checkpoint "
+        f"whose reader of tracks writes sketches; or one that comes along ({', '.join(CHECKPOINTS)}).",
+        callback=lambda folders: folders and [folder_along(folder) for folder in folders],
+    ),
+]
 SmallInput = Literal["tracks", "pictures", "facts"]
 """What a small planner plans from."""
 SmallBy = Annotated[

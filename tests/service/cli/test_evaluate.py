@@ -98,13 +98,13 @@ def test_json_has_the_keys_that_scripts_rely_on_and_a_row_for_each_small_planner
         write_blind(folder, seed)
     asked = ["evaluate", "--checkpoint", str(brief_checkpoint), "--limit", "2", "--n", "1", "--json"]
     one, other, another = (["--small", str(folder)] for folder in folders)
-    result = CliRunner().invoke(app, [*asked, *one, *other])
+    result = CliRunner().invoke(app, [*asked, *one, *other, "--small", "looktwice-nano"])
     assert result.exit_code == 0, result.output
     told = json.loads(result.stdout.splitlines()[-1])
     assert set(told) == {"scenes", "episodes", "rows", "comparisons", "speed_response"}
     assert all(set(row) >= CONTRACT for row in told["rows"])
     rows = {row["name"]: row for row in told["rows"] if row["subgroup"] is None}
-    assert {"blind a", "blind b"} < rows.keys()
+    assert {"blind a", "blind b", "teacher"} < rows.keys(), "a checkpoint that comes along has a name"
     assert rows["blind a"]["agreed_ade_m"] != rows["blind b"]["agreed_ade_m"]
     free = rows["meta-act + route"]
     for measure in ("agreed_ade_m", "greedy_ade_m", "agreement_plan_trajectory"):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from looktwice.model.bundled import SCENES
+from looktwice.model.bundled import CHECKPOINTS, SCENES
 from looktwice.service.cli.commands import app
 from looktwice.service.cli.evaluate_failures import stages_named
 
@@ -50,5 +50,6 @@ def test_what_writes_no_such_answers_is_refused_by_name(untrained_checkpoint: Pa
 
 def test_stages_have_names_of_their_own() -> None:
     assert stages_named(["runs/elf", "rl=runs/rl"]) == {"elf": Path("runs/elf"), "rl": Path("runs/rl")}
+    assert stages_named(["refining=elf-nano"]) == {"refining": CHECKPOINTS["elf-nano"]}
     with pytest.raises(ValueError, match="two stages are called 'rl'"):
         stages_named(["runs/rl", "rl=runs/other"])
