@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from looktwice.model.bundled import CHECKPOINTS
 from looktwice.model.driving.labeller import expert_plan
@@ -19,7 +20,7 @@ from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.engines.engine import Controls, DrawFinished, PlanRequest
 from looktwice.model.engines.torch.engine import TorchEngine
 from looktwice.model.network.checkpoint import load, save, with_second_sketches
-from looktwice.model.network.second_sketch import LOOK_GAIN, SecondSketch
+from looktwice.model.network.second_sketch import LOOK_GAIN, CurveSpace, Known, SecondSketch, SecondSketcher
 from looktwice.model.training.branch import train_branch
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.own_plans import OwnPlans
@@ -102,8 +103,20 @@ def test_behind_a_critic_it_is_learned_without_reflections(
     source, target, settings = tmp_path / "from", tmp_path / "to", RunSettings(tmp_path / "cache", bf16=False)
     critical = with_second_sketches(load(resampling_checkpoint))
     save(source, critical.model, critical.vocabulary, critical.codec, dtype=torch.bfloat16, details={})
-    # Untrained, a critic has hardly an opinion.
-    monkeypatch.setattr(SecondSketch, "gains", property(lambda found: (found.vectors[:, 0] > 0).float()))
+    # Untrained, a critic has hardly an opinion. This one has another way out wherever it knows the tracks.
+    judged_by_nobody = SecondSketcher.forward
+
+    def judged_by_tracks(
+        self: SecondSketcher, sketch: Tensor, space: CurveSpace, known: Known
+    ) -> SecondSketch:
+        found = judged_by_nobody(self, sketch, space, known)
+        verdicts = found.verdicts.clone()
+        verdicts[..., 0] = -20.0
+        if known.tracks is not None:
+            verdicts[:, 1:, 0] = 0.0
+        return found._replace(verdicts=verdicts)
+
+    monkeypatch.setattr(SecondSketcher, "forward", judged_by_tracks)
     examples = Examples.from_scenes(SCENES, critical.settings.cameras)
     own_plans = OwnPlans(
         critical.model, examples, open_vision(critical, examples, settings.cache, mirrored=True)
