@@ -92,6 +92,25 @@ def _worker() -> Worker:
     return worker
 
 
+class _Listener:
+    """Who waits for the events of a request, which another thread tells.
+
+    Attributes:
+        events: that were told, for the loop that this was made in.
+        left: whether nobody waits any more.
+    """
+
+    def __init__(self) -> None:
+        self.events: asyncio.Queue[Event | Failed] = asyncio.Queue()
+        self.left = False
+        self._loop = asyncio.get_running_loop()
+
+    def tell(self, event: Event | Failed) -> None:
+        """Pass an event on, from any thread."""
+        if not self.left:
+            self._loop.call_soon_threadsafe(self.events.put_nowait, event)
+
+
 class TorchEngine:
     """`looktwice.model.engines.engine.Engine` over a checkpoint folder; see there for the contract."""
 
@@ -110,7 +129,10 @@ class TorchEngine:
         self._counts, self._rows_used = Counts(), 0
         self._broke: EngineError | None = None
         self._commands: queue.SimpleQueue[Callable[[Decoder], None] | None] = queue.SimpleQueue()
-        self._listeners: dict[str, tuple[asyncio.AbstractEventLoop, asyncio.Queue[Event | Failed]]] = {}
+        self._listeners: dict[str, _Listener] = {}
+        # The decoding thread's own. Who left early may ask again under the same name during the step that
+        # decodes the first request: its events must not become answers of the second.
+        self._decoded_for: dict[str, _Listener] = {}
 
     @property
     def card(self) -> ModelCard:
@@ -134,7 +156,7 @@ class TorchEngine:
         self._worker = self._worker or _worker()
         self._broke = None
         # What was asked of a thread that broke is answered already.
-        self._commands = queue.SimpleQueue()
+        self._commands, self._decoded_for = queue.SimpleQueue(), {}
         self._decoding = self._worker.submit(self._run)
         await warm_up(self)
 
@@ -176,26 +198,28 @@ class TorchEngine:
             raise EngineError("the engine is not running")
         if request.request_id in self._listeners:
             raise RequestError(f"request id {request.request_id} is in use")
-        events: asyncio.Queue[Event | Failed] = asyncio.Queue()
-        self._listeners[request.request_id] = (asyncio.get_running_loop(), events)
+        listener = self._listeners[request.request_id] = _Listener()
         # Now and not when the thread gets to it, which may be a long step later.
         submitted_s = time.monotonic()
         try:
             async with self._gate.request():
-                if events.empty():  # else it was cancelled before the gate
+                if listener.events.empty():  # else it was cancelled before the gate
                     binding = await self._pictures.run(
                         lambda: self._prepared(request), request.scene.pictures
                     )
-                    self._commands.put(lambda decoder: self._add(decoder, request, submitted_s, binding))
+                    self._commands.put(
+                        lambda decoder: self._add(decoder, request, submitted_s, binding, listener)
+                    )
                 remaining = request.controls.n
                 while remaining:
-                    event = await events.get()
+                    event = await listener.events.get()
                     if isinstance(event, Failed):
                         raise event.error
                     remaining -= isinstance(event, DrawFinished)
                     yield event
         finally:
             if self._listeners.pop(request.request_id, None):
+                listener.left = True
                 self.cancel(request.request_id)
 
     def prompt_tokens(self, request: PlanRequest) -> int:
@@ -208,8 +232,9 @@ class TorchEngine:
 
     def cancel(self, request_id: str) -> None:
         """Drop a request; unknown ids are ignored."""
-        self._tell(request_id, Failed(EngineError("the request was cancelled")))
-        self._commands.put(lambda decoder: decoder.cancel(request_id))
+        if listener := self._listeners.get(request_id):
+            listener.tell(Failed(EngineError("the request was cancelled")))
+        self._commands.put(lambda decoder: self._drop(decoder, request_id))
 
     def _prepared(self, request: PlanRequest) -> Binding | None:
         """Do what would hold up the decoding thread."""
@@ -240,19 +265,20 @@ class TorchEngine:
         request: PlanRequest,
         submitted_s: float,
         binding: Binding | None,
+        listener: _Listener,
     ) -> None:
         try:
             decoder.add(request, submitted_s, binding)
         except RequestError as error:
-            self._tell(request.request_id, Failed(error))
+            listener.tell(Failed(error))
         except Exception as error:  # one request that cannot be read must not end the others
-            failure = EngineError.because("the request could not be begun", error)
-            self._tell(request.request_id, Failed(failure))
+            listener.tell(Failed(EngineError.because("the request could not be begun", error)))
+        else:
+            self._decoded_for[request.request_id] = listener
 
-    def _tell(self, request_id: str, event: Event | Failed) -> None:
-        if listener := self._listeners.get(request_id):
-            loop, events = listener
-            loop.call_soon_threadsafe(events.put_nowait, event)
+    def _drop(self, decoder: Decoder, request_id: str) -> None:
+        decoder.cancel(request_id)
+        self._decoded_for.pop(request_id, None)
 
     def _run(self) -> None:
         settings = self._settings
@@ -282,12 +308,12 @@ class TorchEngine:
                     # Before anybody hears of an end: who asks then must not find its rows in use.
                     self._rows_used = decoder.rows_used
                     for request_id, event in events:
-                        self._tell(request_id, event)
+                        self._decoded_for[request_id].tell(event)
         except Exception as error:  # the thread's last word: everyone who waits must hear of it
             reason = self._broke = EngineError.because("decoding failed", error)
         self._rows_used = 0
-        for request_id in list(self._listeners):
-            self._tell(request_id, Failed(reason))
+        for listener in list(self._listeners.values()):
+            listener.tell(Failed(reason))
 
     def _prompts(self) -> int:
         settings = self._settings

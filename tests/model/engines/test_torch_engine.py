@@ -21,6 +21,7 @@ from looktwice.model.engines.engine import (
     EngineError,
     PlanRequest,
     RequestError,
+    Started,
 )
 from looktwice.model.engines.torch.decoder import Decoder, StepEvent
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
@@ -28,6 +29,7 @@ from looktwice.model.engines.torch.runner import Runner
 from looktwice.model.evaluation.ladder import at_threshold
 from looktwice.model.network.card import CheckpointError
 from tests.checkpoints import noisy_scene
+from tests.sockets import PATIENCE_S
 
 
 def run(test: Callable[[], Awaitable[None]]) -> None:
@@ -106,6 +108,37 @@ def test_leaving_early_frees_the_rows(untrained_checkpoint: Path) -> None:
             assert engine.counts.passes - passes <= 2
             assert engine.load.rows_used == 0
             assert len(await plan(engine, direct("next", n=2))) == 2
+
+    run(test)
+
+
+def test_a_request_never_gets_the_draws_of_one_that_had_its_name(
+    untrained_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded, asked_again, plain = threading.Event(), threading.Event(), Decoder.step
+
+    def held_up(self: Decoder) -> list[StepEvent]:
+        events = plain(self)
+        if any(name == "name" and isinstance(event, DrawFinished) for name, event in events):
+            decoded.set()
+            asked_again.wait(PATIENCE_S)
+        return events
+
+    async def test() -> None:
+        async with running(untrained_checkpoint, rows=4) as engine:
+            monkeypatch.setattr(Decoder, "step", held_up)
+            slow = PlanRequest("name", noisy_scene(), "cf_vla", Controls(n=1, thinking="always"))
+            events = engine.submit(slow)
+            assert isinstance(await anext(events), Started)
+            while not decoded.is_set():
+                await asyncio.sleep(0.001)
+            await events.aclose()
+            again = asyncio.create_task(plan(engine, direct("name", n=1, seed=1)))
+            await asyncio.sleep(0.05)
+            asked_again.set()
+            [draw] = await again
+            [expected] = await plan(engine, direct("other", n=1, seed=1))
+            assert draw.ids == expected.ids
 
     run(test)
 
