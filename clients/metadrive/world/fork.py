@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Container
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -89,11 +90,11 @@ def fork_expert(
     if isinstance(forked.ego, FreeVehicle):
         forked.ego = on_rails(forked.ego, forked.live.road_map)
 
-    def drive(bodies: list[Body]) -> None:
+    def drive(_: float, bodies: list[Body]) -> None:
         known_of = bodies if known is None else [body for body in bodies if body.actor_id in known]
         forked.drive_as_expert(known_of)
 
-    return _run(forked, steps, lambda _: drive)
+    return _run(forked, steps, drive)
 
 
 def fork_along(world: EpisodeWorld, trajectory: FloatArray, steps: int = FUTURE_STEPS) -> Forked:
@@ -103,10 +104,11 @@ def fork_along(world: EpisodeWorld, trajectory: FloatArray, steps: int = FUTURE_
         ForkError: the episode has ended.
     """
     forked = _copied(world, steps)
-    if not isinstance(forked.ego, FreeVehicle):
-        forked.ego = FreeVehicle.from_rails(forked.ego)
+    ego = forked.ego
+    if not isinstance(ego, FreeVehicle):
+        ego = forked.ego = FreeVehicle.from_rails(ego)
     way = world_trajectory(forked.live.ego[forked.now], trajectory)
-    return _run(forked, steps, lambda age_s: _follower(forked, way, age_s))
+    return _run(forked, steps, lambda age_s, _: ego.follow(way, age_s, forked.live.road_map))
 
 
 def on_rails(car: Vehicle, road_map: RoadMap) -> Vehicle:
@@ -148,14 +150,14 @@ def _copied(world: EpisodeWorld, steps: int) -> EpisodeWorld:
     return world.copied(steps)
 
 
-def _run(world: EpisodeWorld, steps: int, driver: Callable[[float], Callable[[list[Body]], None]]) -> Forked:
-    """What happens while ``driver``, told how many seconds have passed, says who drives the next step."""
+def _run(world: EpisodeWorld, steps: int, drive: Callable[[float, list[Body]], None]) -> Forked:
+    """What happens while ``drive`` moves the ego, told how many seconds have passed and who is near."""
     start, began_m = world.now, world.ego.progress
     near = world.nearby()
     off_road_s: float | None = None
     off_route_s: float | None = None
     for step in range(steps):
-        world.move(near, driver(step * STEP_S))
+        world.move(near, partial(drive, step * STEP_S))
         near = world.remember()
         if off_road_s is None and world.is_off_road:
             off_road_s = (step + 1) * STEP_S
@@ -178,12 +180,6 @@ def _run(world: EpisodeWorld, steps: int, driver: Callable[[float], Callable[[li
 
 def _is_off_route(ego: Vehicle) -> bool:
     return isinstance(ego, FreeVehicle) and abs(ego.offset_m) > OFF_ROUTE_M
-
-
-def _follower(world: EpisodeWorld, way: Array, age_s: float) -> Callable[[list[Body]], None]:
-    ego = world.ego
-    assert isinstance(ego, FreeVehicle)
-    return lambda _: ego.follow(way, age_s, world.live.road_map)
 
 
 def _seen_from(ego: Array) -> FloatArray:
