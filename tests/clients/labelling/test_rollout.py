@@ -118,9 +118,12 @@ def test_a_service_that_restarts_in_the_middle_is_waited_for(tmp_path: Path) -> 
     with serve(engine, settings) as served:
         port = int(served.url.rsplit(":", 1)[1])
     slow = ScriptedEngine()
+    # A connection that the first server accepted as it ended stays open while this process lives, and
+    # nobody answers there.
+    policy, limits = replace(RETRY_POLICY, timeout_s=3.0), replace(LIMITS, give_up_after_s=90.0)
 
     async def go() -> Tally:
-        async with AsyncPlannerClient(f"http://127.0.0.1:{port}", RETRY_POLICY) as planner:
+        async with AsyncPlannerClient(f"http://127.0.0.1:{port}", policy) as planner:
             with Ledger(folder) as ledger:
                 run = ledger.run("rollout", config_of(MODEL, Sampling(n=2)))
                 work = asyncio.create_task(
@@ -129,7 +132,7 @@ def test_a_service_that_restarts_in_the_middle_is_waited_for(tmp_path: Path) -> 
                         run,
                         jobs(run, file, lambda _: None),
                         lambda job: roll_out(planner, job.subject, MODEL, Sampling(n=2)),
-                        LIMITS,
+                        limits,
                     )
                 )
                 await asyncio.sleep(0.3)  # nobody is there yet
