@@ -54,7 +54,7 @@ class LearnerTrainer(Trainer):
             adam_beta1=0.9,
             adam_beta2=0.95,
             adam_epsilon=1e-8,
-            weight_decay=0.01,
+            weight_decay=recipe.weight_decay,
             max_grad_norm=1.0,
             logging_steps=50,
             save_steps=save_every,

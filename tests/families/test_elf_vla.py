@@ -33,7 +33,7 @@ from looktwice.model.evaluation.variants import standard_variants
 from looktwice.model.families.elf_vla import ELF_VLA, ELF_VLA_REFINE
 from looktwice.model.families.elf_vla.format import TIMES_S, pose_values, read_poses
 from looktwice.model.families.elf_vla.inputs import command_of
-from looktwice.model.families.elf_vla.targets import WEIGHTS
+from looktwice.model.families.elf_vla.targets import QUESTION_WEIGHTS, WEIGHTS
 from looktwice.model.families.family import Attempt, FamilyError, Lesson
 from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import CompiledFormat
@@ -244,6 +244,14 @@ def test_a_real_response_in_digits(elf: Loaded) -> None:
         "[20.0, 0.9, 0.10], [23.7, 1.4, 0.12], [26.9, 1.8, 0.16], [29.6, 2.2, 0.18], [31.8, 2.7, 0.20]"
         "</answer><|im_end|>"
     )
+
+
+def test_questions_are_answered_before_poses_are_learned(elf: Loaded) -> None:
+    compiled = CompiledFormat(ELF_VLA.format, elf.vocabulary)
+    taught = make_target(ELF_VLA, compiled, lesson(labelled_scene(9.0), SOME), QUESTION_WEIGHTS)
+    learned = [id for id, weight in zip(taught.ids, taught.weights, strict=True) if weight]
+    assert str(SOME) in elf.vocabulary.decode(learned)
+    assert "[" not in elf.vocabulary.decode(learned)
 
 
 def test_free_text_may_think_anything(elf: Loaded) -> None:

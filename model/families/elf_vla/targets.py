@@ -13,6 +13,9 @@ from looktwice.model.formats.pieces import Values
 
 WEIGHTS: Final[Mapping[str, float]] = MappingProxyType({THINK: 1.0, ANSWER: 1.0})
 """The paper weighs all tokens of a response alike."""
+QUESTION_WEIGHTS: Final[Mapping[str, float]] = MappingProxyType({THINK: 1.0, ANSWER: 0.0})
+"""Of pre-training on questions and answers (section 7.1): each sentence of the thoughts asks one question,
+such as who is ahead in the own lane, and answers it from the labels."""
 
 
 def teach(lesson: Lesson) -> Values:

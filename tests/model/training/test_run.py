@@ -70,7 +70,10 @@ def test_the_stages_lead_to_a_checkpoint_that_tells_its_history(
     assert all(0 < row["plan_iou_first/cf_vla"] < 1 for row in validated)
 
 
-@pytest.mark.parametrize(("recipe", "format"), [("elf-sft", "elf_vla"), ("world-sft", "vla_world")])
+@pytest.mark.parametrize(
+    ("recipe", "format"),
+    [("elf-pretrain", "elf_vla"), ("elf-sft", "elf_vla"), ("world-sft", "vla_world")],
+)
 def test_a_checkpoint_learns_a_format_that_it_did_not_write(
     recipe: str, format: str, resampling_checkpoint: Path, scenes: Path, tmp_path: Path
 ) -> None:
