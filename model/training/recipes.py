@@ -381,5 +381,5 @@ PAPER: Final[Mapping[str, Recipe]] = {
         ),
     )
 }
-"""The papers' stages for a pretrained backbone; the batch is per device: 64 of them for CF-VLA, 16 and in the
-end 32 for ELF-VLA. ELF-VLA accumulates gradients, and its batches here are as large as what it accumulates."""
+"""The stages of both papers for a pretrained backbone. The batch is per device, of which there are 64 for CF-VLA,
+16 for ELF-VLA, and 32 for its `elf-rl`. It is as large as what ELF-VLA accumulates."""
