@@ -17,6 +17,10 @@ class ModelCard(ResponseModel):
     revision: str = Field(description="Changes with the weights, the codec and the codes of pictures.")
     engine: str = Field(description="torch or vllm.")
     formats: list[str] = Field(description="Response formats it writes.")
+    reflects: list[str] = Field(
+        default_factory=list,
+        description="Of these, the ones that may look twice at a plan, as POST /v1/reflect asks.",
+    )
     refines: list[str] = Field(
         default_factory=list, description="Of these, the ones that refine an attempt, which they need."
     )

@@ -381,5 +381,5 @@ PAPER: Final[Mapping[str, Recipe]] = {
         ),
     )
 }
-"""The stages of both papers for a pretrained backbone. The batch is per device, of which there are 64 for CF-VLA,
-16 for ELF-VLA, and 32 for its `elf-rl`. It is as large as what ELF-VLA accumulates."""
+"""The stages of both papers for a pretrained backbone. The batch is per device: CF-VLA has 64, ELF-VLA
+16, and its `elf-rl` 32. It is as large as what ELF-VLA accumulates."""

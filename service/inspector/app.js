@@ -358,6 +358,7 @@ async function showModel() {
   const [card] = await api.models();
   state.inputs = card.inputs;
   state.refines = card.refines.length > 0;
+  byId("look").hidden = card.reflects.length === 0;
   allowImagining(card);
   byId("model").textContent = `${card.name} ${card.revision} · ${card.engine} · ${card.cameras.length} cameras`;
 }

@@ -16,7 +16,8 @@ export function showDraw(draw) {
   const parts = [];
   if (draw.plan) parts.push(element("h3", { textContent: "First plan" }), tracks(draw.plan, null));
   if (draw.thinking !== null) {
-    parts.push(element("h3", { textContent: "Second look" }), element("blockquote", { textContent: draw.thinking }));
+    const title = draw.branch === null ? "Thoughts" : "Second look";
+    parts.push(element("h3", { textContent: title }), element("blockquote", { textContent: draw.thinking }));
   }
   if (draw.revised_plan) {
     parts.push(element("h3", { textContent: "Revised plan" }), tracks(draw.revised_plan, draw.plan));

@@ -61,6 +61,7 @@ def model_card(card: ModelCard) -> wire.ModelCard:
         revision=card.revision,
         engine=card.engine,
         formats=list(card.formats),
+        reflects=[name for name in card.formats if family_named(name).looks_twice],
         refines=[name for name in card.formats if family_named(name).refines],
         imagines=[name for name in card.formats if family_named(name).imagination is not None],
         paints=card.paints,

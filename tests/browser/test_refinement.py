@@ -77,6 +77,8 @@ def test_a_wrong_draw_is_refined_by_the_feedback_that_is_shown(
     page: Page, served: Served[TorchEngine]
 ) -> None:
     panel = judged(page, served.url, CUT_IN)
+    expect(page.locator('#timeline h3:text-is("Thoughts") + blockquote')).to_contain_text("Road edges: ")
+    expect(page.get_by_role("button", name="Look twice")).to_be_hidden()
     before = score_in(panel, "^The plan is wrong: score")
     assert before < 0.8
     expect(panel.locator(".scores .bars i")).to_have_count(6)

@@ -26,7 +26,7 @@ CHECKPOINT = CHECKPOINTS["elf-nano"]
 def test_it_is_small_and_tells_how_it_was_made(served: Served[TorchEngine]) -> None:
     assert sum(file.stat().st_size for file in CHECKPOINT.rglob("*")) < 40_000_000
     [card] = served.http.get("/v1/models").json()["models"]
-    assert (card["name"], card["refines"]) == ("elf-nano", ["elf_vla_refine"])
+    assert (card["name"], card["reflects"], card["refines"]) == ("elf-nano", [], ["elf_vla_refine"])
     assert [stage["name"] for stage in card["details"]["stages"]][-2:] == ["elf-sft", "elf-sft"]
 
 
