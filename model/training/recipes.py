@@ -58,6 +58,7 @@ class OutcomeSettings:
     Attributes:
         draws: of each scene, compared with each other.
         temperature: that they are drawn at.
+        updates: that the draws of a batch of scenes serve before new ones are made.
         clip: see `policy_loss`.
         numbers: how numbers that are one token each are chosen; digits are drawn as words are.
         codes: how codes are chosen. Numbers and codes of least expected error are no draws, and nothing is
@@ -74,6 +75,7 @@ class OutcomeSettings:
     temperature: float = 1.0
     numbers: Decision = "drawn"
     codes: Decision = "least_error"
+    updates: int = 1
     clip: float = 0.2
     imitation: float = 0.01
     rewards: RewardWeights | Mapping[str, float] = field(default_factory=RewardWeights)
@@ -283,6 +285,7 @@ NANO: Final[Mapping[str, Recipe]] = (
             error_weight=0.0,
             outcome=OutcomeSettings(
                 temperature=1.2,
+                updates=2,  # "2 iterations", as implementations of GRPO call them
                 rewards=RewardWeights(
                     outcome=1.0, imitation=0.0, words=0.0, thinking=0.0, goal=1.0, form=1.0
                 ),

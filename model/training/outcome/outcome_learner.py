@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -39,7 +40,7 @@ from looktwice.model.network.vocabulary import Vocabulary
 from looktwice.model.training.batches import ResponseSample, collate
 from looktwice.model.training.learner import ResponseLearner
 from looktwice.model.training.outcome.draw_rewards import Rewards, RewardWeights, family_rewards, rewards
-from looktwice.model.training.outcome.policy import advantages, divergence, policy_loss
+from looktwice.model.training.outcome.policy import PolicyLoss, advantages, divergence, policy_loss
 from looktwice.model.training.outcome.rollouts import with_draws
 from looktwice.model.training.recipes import FeedbackWriter, OutcomeSettings
 from looktwice.model.training.responses import ResponseDataset
@@ -66,8 +67,27 @@ def collate_places(places: list[int]) -> dict[str, Tensor]:
     return {"places": torch.tensor(places)}
 
 
+class _Answers(NamedTuple):
+    """What a batch of scenes was answered.
+
+    Attributes:
+        items: the scenes, and what they were given.
+        draws, refined: answers to them, and those that were led to and are learned as answers.
+        worth: advantages [draws + refined] of each scene.
+        parts: means of what they were judged by, to be logged.
+    """
+
+    items: list[Item]
+    draws: list[list[Draw]]
+    refined: list[list[Draw]]
+    worth: list[Tensor]
+    parts: dict[str, float]
+
+
 class OutcomeLearner(nn.Module):
     """A step of outcome training; a batch is places of scenes, the output the loss and what is worth logging.
+
+    Answers serve as many steps as the settings say. Steps that go on with them leave their own scenes out.
 
     Args:
         learner: holds the network, and learns the expert's responses beside its own draws.
@@ -103,11 +123,35 @@ class OutcomeLearner(nn.Module):
         self._route_share, self._tracks_share = route_share, tracks_share
         self._chosen = _chosen_alphabets(loaded.vocabulary, settings)
         self._runner: Runner | None = None
+        self._answers: _Answers | None = None
+        self._updates_left = 0
         # In a tuple, so that it is none of this module's own: it is neither trained nor saved.
         self._first = (deepcopy(learner).requires_grad_(False),) if settings.divergence else ()
 
     def forward(self, places: Tensor) -> dict[str, Tensor]:
         """The loss of one step from scenes int64 [b], and its parts without gradients."""
+        if self._answers is None or not self._updates_left:
+            self._answers, self._updates_left = self._answered(places), self._settings.updates
+        self._updates_left -= 1
+        answers = self._answers
+        samples = [self._data[item] for item in answers.items]
+        imitated = self.learner(**collate(samples))
+        policy, apart = self._policy(samples, answers)
+        loss = policy.loss + self._settings.imitation * imitated["loss"]
+        parts = answers.parts
+        if self._first:
+            loss = loss + self._settings.divergence * apart
+            parts = parts | {"divergence": float(apart.detach())}
+        return {
+            "loss": loss,
+            "policy_ratio": policy.ratio,
+            "policy_clipped": policy.clipped,
+            "imitation_loss": imitated["loss"].detach(),
+            **{name: torch.tensor(value) for name, value in parts.items()},
+        }
+
+    def _answered(self, places: Tensor) -> _Answers:
+        """Draws of the network as it stands, refined and judged."""
         if self._runner is not None:
             # The last step has changed the weights.
             with torch.inference_mode():
@@ -125,10 +169,6 @@ class OutcomeLearner(nn.Module):
         for own, other in zip(judged, again, strict=True):
             group = own.total if other is None else np.concatenate([own.total, other.total])
             worth.append(advantages(torch.from_numpy(group)[None], normalised=self._settings.normalised)[0])
-        samples = [self._data[item] for item in items]
-        imitated = self.learner(**collate(samples))
-        policy, ratio, apart = self._policy(samples, draws, refined, worth)
-        loss = policy + self._settings.imitation * imitated["loss"]
         reward = np.stack([each.total for each in judged])
         parts = {name: float(np.mean([told.parts[name] for told in judged])) for name in judged[0].parts}
         parts |= {"reward": float(reward.mean()), "reward_spread": float(reward.std(axis=1).mean())}
@@ -140,14 +180,7 @@ class OutcomeLearner(nn.Module):
             # Over all scenes of the step: those that are not refined gain nothing.
             refined_rate = float(np.mean([other is not None for other in again]))
             parts |= {"refined_rate": refined_rate, "refined_gain": float(np.mean(gains))}
-        if self._first:
-            parts["divergence"] = float(apart)
-        return {
-            "loss": loss,
-            "policy_ratio": ratio,
-            "imitation_loss": imitated["loss"].detach(),
-            **{name: torch.tensor(value) for name, value in parts.items()},
-        }
+        return _Answers(items, draws, refined, worth, parts)
 
     def _item(self, place: int) -> Item:
         chance = torch.rand(2).tolist()
@@ -235,26 +268,19 @@ class OutcomeLearner(nn.Module):
         feedback = str(rule_sections(judged)) if writer == "teacher" else verdict_with_truth(judged)
         return Attempt(draft.trajectory, feedback)
 
-    def _policy(
-        self,
-        samples: Sequence[ResponseSample],
-        draws: Sequence[Sequence[Draw]],
-        refined: Sequence[Sequence[Draw]],
-        worth: Sequence[Tensor],
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """The policy's loss, its mean ratio, and its divergence from where it began, which the loss counts.
+    def _policy(self, samples: Sequence[ResponseSample], answers: _Answers) -> tuple[PolicyLoss, Tensor]:
+        """The policy's loss, and its divergence from where it began.
 
         Scenes whose draws are worth the same cost nothing.
 
         Args:
             samples: the prompts that were answered.
-            draws, refined: answers to them, and those that were led to and are learned as answers.
-            worth: advantages [draws + refined] of each scene.
+            answers: to them.
         """
-        settings = self._settings
+        settings, draws, refined, worth = self._settings, answers.draws, answers.refined, answers.worth
         told = [place for place, each in enumerate(worth) if bool(each.any())]
         if not told:
-            return torch.zeros(()), torch.ones(()), torch.zeros(())
+            return PolicyLoss(torch.zeros(()), torch.ones(()), torch.zeros(())), torch.zeros(())
         rows = [with_draws(samples[place], [*draws[place], *refined[place]]) for place in told]
         batch = collate(list(chain.from_iterable(rows)))
         made, before = list[list[Decision]](), list[Tensor | None]()
@@ -271,14 +297,13 @@ class OutcomeLearner(nn.Module):
         found = policy_loss(
             now, before, torch.cat([worth[place] for place in told]), clip=settings.clip, **gamma
         )
-        loss, apart = found.loss, torch.zeros(())
+        apart = torch.zeros(())
         for first in self._first:
             with torch.no_grad():
-                here = first.to(loss.device)
+                here = first.to(found.loss.device)
                 then = here.log_probabilities(batch, made, settings.temperature)
             apart = divergence(now, then)
-            loss = loss + settings.divergence * apart
-        return loss, found.ratio, apart.detach()
+        return found, apart
 
     def _drawn(self, draw: Draw) -> list[Decision]:
         """The decisions of a draw that were drawn: all but numbers and codes of least expected error."""

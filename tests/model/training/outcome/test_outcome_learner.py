@@ -117,6 +117,31 @@ def test_a_run_draws_as_the_learner_reckons_and_is_logged(
     assert last["step"] == 2
 
 
+def test_draws_serve_several_updates(resampling_checkpoint: Path, two_scenes: Path, tmp_path: Path) -> None:
+    recipe = replace(
+        NANO["cf-rl"],
+        steps=4,
+        batch_size=2,
+        warmup_steps=0,
+        learning_rate=1e-3,
+        outcome=OutcomeSettings(draws=8, updates=2),
+    )
+    drawn: list[int] = []
+    plain = OutcomeLearner._drawn_by
+
+    def drawing(self: OutcomeLearner, requests: list[PlanRequest]) -> list[list[Draw]]:
+        drawn.append(len(requests))
+        return plain(self, requests)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OutcomeLearner, "_drawn_by", drawing)
+        ratios = noted("policy_ratio", recipe, two_scenes, resampling_checkpoint, tmp_path)
+    assert drawn == [2, 2]
+    # Of draws that were made before the last update the network thinks otherwise by now.
+    assert ratios[::2] == pytest.approx([1.0, 1.0], abs=1e-4)
+    assert all(ratio != pytest.approx(1.0, abs=1e-4) for ratio in ratios[1::2]), ratios
+
+
 def test_draws_are_not_judged_where_nobody_knows_the_road(
     resampling_checkpoint: Path, tmp_path: Path
 ) -> None:
@@ -185,7 +210,7 @@ ELF = ("elf_vla", "elf_vla_refine")
 def elf_recipe(**outcome: Any) -> Recipe:
     recipe = NANO["elf-rl"]
     assert recipe.outcome is not None
-    settings = replace(recipe.outcome, draws=3, **outcome)
+    settings = replace(recipe.outcome, **{"draws": 3, "updates": 1} | outcome)
     return replace(recipe, steps=2, batch_size=2, warmup_steps=1, outcome=settings)
 
 
@@ -207,11 +232,11 @@ def test_failed_drafts_are_refined_by_feedback_and_learned_as_first_answers(
         calls.append((requests, found))
         return found
 
-    def learning(self: OutcomeLearner, samples: Any, draws: Any, refined: Any, worth: Any) -> Any:
+    def learning(self: OutcomeLearner, samples: Any, answers: Any) -> Any:
         prompts.extend(len(sample.prompt) for sample in samples)
-        assert [len(each) for each in worth] == [4, 4]
-        assert [each.sum().item() for each in worth] == pytest.approx([0, 0], abs=1e-5)
-        return plain_policy(self, samples, draws, refined, worth)
+        assert [len(each) for each in answers.worth] == [4, 4]
+        assert [each.sum().item() for each in answers.worth] == pytest.approx([0, 0], abs=1e-5)
+        return plain_policy(self, samples, answers)
 
     monkeypatch.setattr(OutcomeLearner, "_drawn_by", drawing)
     monkeypatch.setattr(OutcomeLearner, "_policy", learning)
