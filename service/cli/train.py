@@ -95,7 +95,7 @@ def train(
     refine_below: Annotated[
         float | None,
         typer.Option(
-            help="elf-rl: refine the best draw of a scene where it scores less, instead of 0.8; 0: nothing.",
+            help="elf-rl: refine the worst draw of a scene where it scores less, instead of 0.8; 0: nothing.",
             min=0,
             max=1,
         ),
