@@ -65,12 +65,14 @@ def reflections(ledger: Ledger, label: StageRun, *, by_outcome: bool = False) ->
 def right_plans(ledger: Ledger, label: StageRun, plan_iou: float) -> Iterator[LabelledReflection]:
     """The model's own plans that agree with the expert's, at least so much: nothing is to be corrected there.
 
-    They come from all scenes of the labels' rollout, whatever the filter kept.
+    They come from all scenes of the labels' rollout, whatever the filter kept; plans that were labelled are
+    left out, since their reflections say to correct them.
     """
     rollout = _rollout_of(ledger, label)
+    labelled = {(entry.record["rollout"], entry.record["predicted_plan"]) for entry in ledger.entries(label)}
     for entry in ledger.entries(rollout):
-        right = (draw["plan"] for draw in entry.record["free"] if draw["plan_iou"] >= plan_iou)
-        yield from _to_act_on(rollout, entry, dict.fromkeys(right))
+        right = dict.fromkeys(draw["plan"] for draw in entry.record["free"] if draw["plan_iou"] >= plan_iou)
+        yield from _to_act_on(rollout, entry, (plan for plan in right if (entry.key, plan) not in labelled))
 
 
 def held_plans(ledger: Ledger, label: StageRun) -> Iterator[LabelledReflection]:

@@ -34,10 +34,13 @@ class Thresholds:
     everything: bool = False
 
     def keep(self, free: Sequence[Mapping[str, Any]], prefilled_m: float) -> tuple[int, ...]:
-        """Which of the free draws of a scene are kept; of those with the same plan the first."""
+        """Which of the free draws of a scene are kept; of those with the same plan the first.
+
+        Nothing is to be corrected in the expert's own plan, so that is never kept.
+        """
         first: dict[str, int] = {}
         for place, draw in enumerate(free):
-            if self._keeps(draw, free, prefilled_m):
+            if draw["plan_iou"] < 1 and self._keeps(draw, free, prefilled_m):
                 first.setdefault(draw["plan"], place)
         return tuple(first.values())
 

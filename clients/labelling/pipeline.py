@@ -99,26 +99,40 @@ async def work_through(
     concurrency, tally, began_s = ConcurrencyLimit(limits.at_once), Tally(), time.monotonic()
     under_way: set[asyncio.Task[None]] = set()
     begun: set[str] = set()
-    faults = 0
-
-    async def attempt(job: Job[_Subject]) -> Record:
-        async with concurrency.slot():
-            return await do(job)
+    faults, all_begun = 0, False
 
     async def finish(job: Job[_Subject]) -> None:
         nonlocal faults
-        done_before = tally.done
+        done_before = done_halfway = tally.done
+        halfway_s: float | None = None
+
+        async def attempt() -> Record:
+            nonlocal done_halfway, halfway_s
+            try:
+                async with concurrency.slot():
+                    return await do(job)
+            except TryLater:
+                now_s = time.monotonic()
+                halfway_s = halfway_s or now_s + limits.give_up_after_s / 2
+                if now_s <= halfway_s:
+                    done_halfway = tally.done
+                raise
+
         try:
-            record = await with_retries(lambda: attempt(job), limits.give_up_after_s)
+            record = await with_retries(attempt, limits.give_up_after_s)
         except CannotBeDone as error:
             ledger.dead_letter(run, job.key, job.scene_id, str(error), **error.more)
             tally.dead += 1
             faults += error.fault
         except TryLater as error:
             told = f"nothing came for {limits.give_up_after_s:g} s: {error}"
-            if tally.done == done_before:
+            # Whoever goes away still answers some that it had begun with, so only later ones show that it is
+            # there; behind the last piece of all there are none.
+            is_last = all_begun and len(under_way) == 1
+            others_were_served = tally.done > (done_before if is_last else done_halfway)
+            everybody_is_to_wait = error.wait_s is not None and error.wait_s > limits.give_up_after_s
+            if everybody_is_to_wait or not others_were_served:
                 raise StageStopped(told) from error
-            # Others were served meanwhile: it is this one.
             ledger.dead_letter(run, job.key, job.scene_id, told)
             tally.dead += 1
             faults += 1
@@ -145,6 +159,7 @@ async def work_through(
         while limits.at_most is None or len(begun) < limits.at_most:
             job = await asyncio.to_thread(next, jobs, None)
             if job is None:
+                all_begun = True
                 break
             if ledger.has(job.key) or job.key in begun:
                 tally.earlier += 1

@@ -76,8 +76,8 @@ def scored(
     return answer(found.world, found.scores, request_id)
 
 
-def scores_of(asked: wire_scores.ScoreRequest, bundled: BundledScenes) -> Scored:
-    """The scores of one request; raises as `scored` does."""
+def scores_of(asked: wire_scores.ScoreRequest, bundled: BundledScenes, *, careful: bool = False) -> Scored:
+    """The scores of one request, in a ``careful`` world or not; raises as `scored` does."""
     centre = asked.point == "centre"
     against = asked.against
     expert = None
@@ -90,6 +90,7 @@ def scores_of(asked: wire_scores.ScoreRequest, bundled: BundledScenes) -> Scored
         expert = plans_of(labelled.future)
         if reference is None:
             reference, against = expert, EXPERT
+    world = replace(world, careful=careful)
     plans = _trajectories(asked.trajectories)
     others = Others(
         reference,

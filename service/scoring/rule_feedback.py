@@ -70,7 +70,8 @@ def answer_feedback(
     if truth is not None and asked.reference is None:
         # What the human drove is what progress is measured against, where nothing else is given.
         asked = asked.model_copy(update={"reference": asked.ground_truth, "against": GROUND_TRUTH})
-    found = scores_of(asked, bundled)
+    # A teacher needs a verdict where a score may be left open.
+    found = scores_of(asked, bundled, careful=True)
     truth = found.expert if truth is None else truth
     said = [each or wire_feedback.PlanSaid() for each in asked.said or [None] * len(asked.trajectories)]
     try:

@@ -139,11 +139,16 @@ class SceneJudge:
         threshold: float = THRESHOLD,
         said: Sequence[PlanExplanation] | None = None,
     ) -> list[JudgedPlan]:
-        """The same plans with what a teacher is told of each; raises as `judged_plans` does, too."""
+        """The same plans with what a teacher is told of each, in a careful world.
+
+        Raises:
+            ScoreError, SolveError: see `score` and `judged_plans`.
+        """
+        world = replace(self._world, careful=True)
         return judged_plans(
-            self._world,
+            world,
             plans,
-            self.scores(plans, version),
+            score(world, plans, version, self._others, centre=True),
             self._others,
             threshold=threshold,
             truth=self._expert,

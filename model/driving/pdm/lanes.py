@@ -26,8 +26,8 @@ class Areas:
     """Where plans are, bool [n, 41] each; None where the layer is not known.
 
     Attributes:
-        several_lanes: no lane holds all corners, and more than one holds some; of careful worlds without
-            lanes it is taken for granted.
+        several_lanes: no lane holds all corners, and more than one holds some; taken for granted in careful
+            worlds where lanes or the drivable area are not known.
         off_road: a corner lies nowhere where a car may be.
         off_route: the centre lies in no lane of the route.
         crossing: the centre lies in an intersection.
@@ -75,7 +75,7 @@ def areas_of(ego: Boxes, axles: Array, world: World) -> Areas:
         several_lanes = ((held > 0).sum(axis=0) > 1) & ~_any(held == 4)
         on_route = [lane.on_route for lane in world.lanes]
         off_route = ~_any(lanes[on_route, ..., _CENTRE])
-    elif world.careful:
+    if world.careful and (world.lanes is None or world.drivable is None):
         several_lanes = np.ones(ego.x.shape, dtype=np.bool_)
     if world.drivable is not None:
         off_road = _any(np.moveaxis(~(_any(drivable) | _any(crossings))[..., :_CENTRE], -1, 0))

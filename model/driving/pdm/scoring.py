@@ -189,7 +189,7 @@ def score_states(world: World, states: Array, version: Version, others: Others =
     if others.reference is not None and gained is not None:
         best = float(gained[0] * product[0])
         subs[PROGRESS] = progress_scores(gained[besides:], product[besides:], best, version)
-        against = others.against
+        against, best = (None, None) if np.isnan(best) else (others.against, best)
     if version == "v2.2" and others.previous is not None:
         subs[EXTENDED_COMFORT] = extended_comfort(own, others.previous, others.previous_age_s).astype(float)
     if version == "v2.2" and others.human is not None:
@@ -275,7 +275,7 @@ def progress_scores(gained_m: Array, product: Array, reference: float, version: 
     Args:
         gained_m: [n], metres along the centre line.
         product: [n], of the sub-scores that are multiplied.
-        reference: the reference's metres times its product.
+        reference: the reference's metres times its product; NaN where that is undecided, and so are all.
         version: in v1.1 a plan that fails makes no progress; in v2.2 it keeps its own.
     """
     earned = gained_m * product
@@ -286,7 +286,7 @@ def progress_scores(gained_m: Array, product: Array, reference: float, version: 
         scores = np.where(far, earned / scale, np.where(product == 0.0, 0.0, 1.0))
     else:
         scores = np.where(far, np.clip(gained_m / scale, 0.0, 1.0), 1.0)
-    return np.where(np.isnan(product), np.nan, scores)
+    return np.where(np.isnan(most), np.nan, scores)
 
 
 def _since(broken: BoolArray) -> Failures:

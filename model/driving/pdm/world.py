@@ -192,8 +192,8 @@ class World:
         lights: the lanes that are closed by a red light.
         centreline: float64 [k, 2], the middle of the lanes that the reference follows.
         past: float64 [h, 11], states at 10 Hz before now, oldest first; the last one is 0.1 s old.
-        careful: where lanes are not known, whom the ego touches beside it is the ego's fault; otherwise such
-            plans have no score, since lanes would decide.
+        careful: where lanes or the drivable area are not known, whom the ego touches beside it is the ego's
+            fault; otherwise such plans have no score where these would decide.
     """
 
     ego: Array

@@ -132,6 +132,48 @@ def test_one_that_fails_while_others_succeed_is_a_dead_letter(tmp_path: Path) ->
     assert (tally.done, tally.dead) == (19, 1)
 
 
+def test_one_that_fails_in_the_midst_of_others_is_a_dead_letter(tmp_path: Path) -> None:
+    async def one_is_cursed(job: Job[int]) -> Record:
+        await asyncio.sleep(0.02)
+        if job.subject == 3:
+            raise TryLater("the engine failed", 0.01)
+        return await square(job)
+
+    tally = worked(tmp_path, jobs(400), one_is_cursed, StageLimits(at_once=4, give_up_after_s=0.4))
+    assert (tally.done, tally.dead) == (399, 1)
+
+
+def test_who_goes_away_in_the_midst_of_it_makes_no_dead_letters(tmp_path: Path) -> None:
+    served = 0
+
+    async def drained(job: Job[int]) -> Record:
+        """Whatever is under way when it goes is still answered, and nothing after that."""
+        nonlocal served
+        if served > 30:
+            raise TryLater("it is about to stop", 0.01)
+        served += 1
+        await asyncio.sleep(0.001 * (job.subject % 7))
+        return await square(job)
+
+    with pytest.raises(StageStopped, match="about to stop"):
+        worked(tmp_path, jobs(200), drained, StageLimits(at_once=16, give_up_after_s=0.5))
+    assert all("square" in record for record in records(tmp_path).values())
+    served = -200
+    tally = worked(tmp_path, jobs(200), drained)
+    assert (tally.done + tally.earlier, tally.dead) == (200, 0)
+
+
+def test_who_asks_for_a_longer_wait_than_there_is_time_ends_it_at_once(tmp_path: Path) -> None:
+    async def limited(job: Job[int]) -> Record:
+        if job.subject > 9:
+            raise TryLater("come back in an hour", 3600.0)
+        return await square(job)
+
+    with pytest.raises(StageStopped, match="in an hour"):
+        worked(tmp_path, jobs(200), limited)
+    assert all("square" in record for record in records(tmp_path).values())
+
+
 def test_a_defect_is_no_dead_letter(tmp_path: Path) -> None:
     async def broken(job: Job[int]) -> Record:
         raise ZeroDivisionError

@@ -82,6 +82,23 @@ def test_scores_are_those_of_the_scorer(scorer: Served[NoModel]) -> None:
                 assert (fact.other.other_id if fact.other else None) == failure["other_id"]
 
 
+def test_a_collision_that_lanes_would_decide_is_judged_as_the_egos_own(scorer: Served[NoModel]) -> None:
+    times_s = [0.1 * step for step in range(51)]
+    closing_in = [[1.5 + 10 * time, max(3.5 - time, 1.9), 0.0] for time in times_s]
+    agent = {"agent_id": "a", "kind": "vehicle", "length_m": 4.5, "width_m": 1.9, "poses": closing_in}
+    labels = {"ego": {"speed_mps": 10.0}, "agents": [agent], "centreline": [[-20.0, 0.0], [160.0, 0.0]]}
+    plans = [[[speed * 0.5 * step, 0.0, 0.0] for step in range(1, 9)] for speed in (10.0, 2.0)]
+    body = {"labels": labels, "trajectories": plans}
+    opened = scorer.http.post("/v1/score", json={**body, "version": "v1.1"}).json()["scores"]
+    assert opened[0]["partial_score"] is None
+    told = scorer.http.post(PATH, json={**body, "ground_truth": plans[0]})
+    assert told.status_code == 200, told.text
+    found = FeedbackResponse.model_validate(told.json())
+    assert found.feedback[0].sub_scores["no_at_fault_collisions"] == 0.0
+    assert not found.feedback[0].correct
+    assert {fact.other.other_id for fact in found.feedback[0].facts if fact.other} == {"a"}
+
+
 def test_the_threshold_decides_and_mode_rule_gives_verdicts_only(scorer: Served[NoModel]) -> None:
     score = given(scorer).feedback[0].score
     assert score is not None

@@ -124,6 +124,37 @@ def test_what_a_missing_layer_would_decide_is_left_open_for_that_plan_only() -> 
     assert unknown[1] == 1.0
 
 
+@pytest.mark.parametrize("version", ["v1.1", "v2.2"])
+def test_against_a_reference_that_is_left_open_nobody_makes_progress(version: Version) -> None:
+    beside = TrackedBox(
+        "beside", True, 4.5, 1.9, np.stack([np.arange(51) * 0.8, np.full(51, 4.0), np.zeros(51)], -1), 8.0
+    )
+    plans, others = np.stack([straight(8, -0.5), straight(1, -0.5)]), Others(straight(8, 3.5), "expert")
+    found = score(road(tracks=(beside,), lanes=None), plans, version, others)
+    progress = found.sub_scores[PROGRESS]
+    assert progress is not None
+    assert np.isnan(progress).all()
+    assert (found.against, found.reference_m) == (None, None)
+    decided = score(road(tracks=(beside,), lanes=None, careful=True), plans, version, others)
+    assert not np.isnan(decided.partial_score).any()
+
+
+@pytest.mark.parametrize("missing", [{"lanes": None}, {"drivable": None}])
+def test_a_careful_world_leaves_no_collision_open(missing: dict[str, None]) -> None:
+    beside = TrackedBox(
+        "beside", True, 4.5, 1.9, np.stack([np.arange(51) * 0.8, np.full(51, 4.0), np.zeros(51)], -1), 8.0
+    )
+    plan = straight(8, 3.5)[None]
+    open_, careful = (
+        score(road(tracks=(beside,), careful=each, **missing), plan).sub_scores[COLLISIONS]
+        for each in (False, True)
+    )
+    assert open_ is not None
+    assert careful is not None
+    assert careful.tolist() == [0.0]
+    assert np.isnan(open_).all() or open_.tolist() == [0.0]
+
+
 def test_failures_tell_when_and_with_whom() -> None:
     world = road(tracks=(standing("far", 60), standing("near", 25), standing("cone", 18, agent=False)))
     found = score(world, np.stack([straight(8), straight(0.0)]))
