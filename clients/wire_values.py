@@ -94,6 +94,7 @@ def wire_agents(agents: Sequence[Agent], decimals: int | None = None) -> list[wi
             length_m=agent.length_m,
             width_m=agent.width_m,
             poses=[row if np.isfinite(row).all() else None for row in rows(agent.poses, decimals)],
+            lights=sorted(agent.lights),
         )
         for agent in agents
     ]

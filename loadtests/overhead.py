@@ -52,14 +52,17 @@ def measure(
 ) -> Iterator[Overhead]:
     """The overhead of each kind of body, a few requests for warming up apart.
 
+    No two requests have the same pictures, and another ``seed`` brings others.
+
     Raises:
         NoAnswer: an answer is no plan.
         httpx.HTTPError: the service is not there.
     """
-    for payload in PAYLOADS:
+    for place, payload in enumerate(PAYLOADS):
+        own_seed = seed * len(PAYLOADS) + place
         mix = parse_mix("plan", str(n), payload, "none", 0)
         spent: list[tuple[float, float, float]] = []
-        calls = make_calls(scenes, mix.kinds(requests + 3, seed), seed)
+        calls = make_calls(scenes, mix.kinds(requests + 3, own_seed), own_seed)
         for call in calls:
             began_s = time.perf_counter()
             answer = http.post(call.path, content=call.body, headers=dict(call.headers))

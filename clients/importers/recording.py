@@ -101,12 +101,19 @@ class Recording:
         return LabelledScene(scene, self.name, seed=0, future=moved[HISTORY_STEPS:])
 
     def _is_known(self, begin_s: float, end_s: float) -> bool:
-        inside = self.times_s[(self.times_s > begin_s) & (self.times_s < end_s)]
-        return bool(np.diff([begin_s, *inside, end_s]).max() <= _LONGEST_GAP_S)
+        """Whether no two poses that lie next to each other in this time, or just around it, are far apart."""
+        first = max(int(np.searchsorted(self.times_s, begin_s, "right")) - 1, 0)
+        last = int(np.searchsorted(self.times_s, end_s))
+        return bool(np.diff(self.times_s[first : last + 1]).max() <= _LONGEST_GAP_S)
 
     def _way(self, now_s: float) -> FloatArray | None:
-        """Points every 4 m along what was driven from now on, in the ego frame; None where it ends before."""
-        ahead = self.at(np.concatenate([[now_s], self.times_s[self.times_s > now_s]]))
+        """Points every 4 m along what was driven from now on, in the ego frame.
+
+        None where the recording ends before, or does not know how the car moved.
+        """
+        times_s = np.concatenate([[now_s], self.times_s[self.times_s > now_s]])
+        holes = np.flatnonzero(np.diff(times_s) > _LONGEST_GAP_S)
+        ahead = self.at(times_s[: holes[0] + 1] if len(holes) else times_s)
         driven = to_ego_frame(ahead, ahead[0])[:, :2]
         along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(driven, axis=0), axis=1))])
         wanted_m = ROUTE_SPACING_M * np.arange(1, ROUTE_POINTS + 1)

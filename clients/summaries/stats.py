@@ -26,13 +26,13 @@ def scene_stats(path: Path) -> dict[str, Any]:
     """Count what the scenes of a file or folder hold.
 
     ``tags`` and ``meta_actions`` count scenes, shares are of scenes, ``meta_action_time`` is the share of the
-    seconds that plans cover.
+    seconds that plans cover. ``expert_off_road`` is None where no scene tells where the road is.
     """
     tags: Counter[str] = Counter()
     words_in: Counter[str] = Counter()
     word_ticks: Counter[str] = Counter()
     episodes: set[str] = set()
-    collisions = off_road = near = turning = scenes = stationary = 0
+    collisions = off_road = roads = near = turning = scenes = stationary = 0
     speeds, accelerations, jerks = [], [], []
     for labelled in read_scenes(path, dense=False):
         scenes += 1
@@ -45,7 +45,9 @@ def scene_stats(path: Path) -> dict[str, Any]:
         turning += any(word in ticks for word in _TURNS)
         future = labelled.future[None]
         collisions += bool(collides(future, labelled.agents, HORIZON_S)[0])
-        off_road += bool(leaves_road(future, labelled.drivable)[0])
+        if labelled.drivable:
+            roads += 1
+            off_road += bool(leaves_road(future, labelled.drivable)[0])
         near += lead_within(labelled)
         speed = _speeds(labelled)
         speeds.append(speed.mean())
@@ -63,7 +65,7 @@ def scene_stats(path: Path) -> dict[str, Any]:
         "meta_actions": {word: words_in[word] for word in _ALL_WORDS},
         "meta_action_time": {word: word_ticks[word] / (TICKS * scenes) for word in _ALL_WORDS},
         "expert_collisions": collisions,
-        "expert_off_road": off_road,
+        "expert_off_road": off_road if roads else None,
         "turning_share": turning / scenes,
         "mean_speed_ms": float(np.mean(speeds)),
         "stationary_share_of_time": stationary / (len(speeds) * 64),

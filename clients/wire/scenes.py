@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from looktwice.clients.wire.base import Camera, Length, Nearby, Point, ResponseModel, Trajectory
+from looktwice.clients.wire.base import Camera, Length, Light, Nearby, Point, ResponseModel, Trajectory
 from looktwice.clients.wire.scene import Scene, Track
 
 
@@ -22,6 +22,11 @@ class Agent(ResponseModel):
         min_length=80,
         max_length=80,
         description="80 poses (x, y in m, heading in rad) at 10 Hz, row 15 is now; null where absent.",
+    )
+    lights: list[Light] = Field(
+        default_factory=list,
+        max_length=3,
+        description="Those that are on now; left and right together are hazard lights.",
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import secrets
 import subprocess
 import sys
 import tempfile
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 bench = typer.Typer(help="Measure speed, as ratios within one run.", no_args_is_help=True)
 
+_SEEDS = 2**20
 _ENGINES = "torch,transformers,transformers-static,vllm,vllm-grammar"
 
 
@@ -217,7 +219,10 @@ def http(
     scenes: ScenePath = DEFAULT_SCENES,
     n: Annotated[int, typer.Option(help="Draws.", min=1, max=64)] = 6,
     requests: Annotated[int, typer.Option(help="Of each kind of body.", min=1)] = 30,
-    seed: Annotated[int, typer.Option(help="Of pictures and draws.", min=0)] = 0,
+    seed: Annotated[
+        int | None,
+        typer.Option(help="Of pictures and draws; another one each time if not given.", min=0),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """What HTTP adds to planning, by kind of body, on a service that is otherwise idle."""
@@ -226,8 +231,10 @@ def http(
         from looktwice.model.driving.scene_store import read_scenes
 
         labelled = tuple(read_scenes(scenes, dense=False))
+        # The service may remember the pictures of an earlier run.
+        chosen = secrets.randbelow(_SEEDS) if seed is None else seed
         with _client_of(service) as client:
-            rows = list(measure(client, labelled, n=n, requests=requests, seed=seed))
+            rows = list(measure(client, labelled, n=n, requests=requests, seed=chosen))
     if as_json:
         typer.echo(json.dumps({"n": n, "rows": [vars(row) | {"share": row.share} for row in rows]}))
         return

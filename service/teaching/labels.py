@@ -123,7 +123,8 @@ def _agent(asked: wire.Agent, number: int) -> Agent:
         problem = f"unknown kind {asked.kind!r}; known are {', '.join(AGENT_KINDS)}"
         raise at(INVALID_REQUEST, f"/annotations/agents/{number}/kind", problem)
     poses = np.array([[np.nan] * 3 if row is None else row for row in asked.poses], np.float32)
-    agent = Agent(asked.agent_id, kind, asked.length_m, asked.width_m, _UNKNOWN_HEIGHT_M, poses)
+    lights = frozenset(asked.lights)
+    agent = Agent(asked.agent_id, kind, asked.length_m, asked.width_m, _UNKNOWN_HEIGHT_M, poses, lights)
     try:
         track_of(agent)  # teachers look at where it is now
     except SceneError as error:

@@ -96,7 +96,7 @@ def _distances(
         off = _off_road_m((*world.drivable, *(world.intersections or ())), bodies)
         return None if off is None else off.max(axis=1)
     if name == LANE_KEEPING and world.centreline is not None:
-        return on_line(np.stack([bodies.x, bodies.y], axis=-1), world.centreline)[1]
+        return on_line(np.stack([bodies.x, bodies.y], axis=-1), world.centreline).beside_m
     return None if failures.by_m is None else failures.by_m[plans]
 
 
@@ -318,12 +318,13 @@ class _ScoredPlan:
         line = self.world.centreline
         assert line is not None
         centre = np.array([[self.ego.x[step], self.ego.y[step]]])
-        beside_m = float(on_line(centre, line)[1][0])
-        lengths = np.hypot(*np.diff(line, axis=0).T)
-        near = int(np.hypot(*((line[:-1] + line[1:]) / 2 - centre).T)[lengths > 0].argmin())
-        (x, y), (along, up) = line[:-1][lengths > 0][near], np.diff(line, axis=0)[lengths > 0][near]
+        line = line[np.append(True, np.diff(line, axis=0).any(axis=1))]  # points that repeat have no side
+        _, (beside_m,), (near,) = on_line(centre, line)
+        (x, y), (along, up) = line[near], line[near + 1] - line[near]
         side: Side = "left" if along * (centre[0, 1] - y) - up * (centre[0, 0] - x) > 0 else "right"
-        return Fact(name, value, time_s, None, side, (Measure("beside_line_m", beside_m, LANE_OFFSET_M),))
+        return Fact(
+            name, value, time_s, None, side, (Measure("beside_line_m", float(beside_m), LANE_OFFSET_M),)
+        )
 
 
 def _measure(excess: Excess) -> Measure:

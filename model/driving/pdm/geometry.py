@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -220,13 +220,28 @@ def beside_line(points: Array, line: Array, within_m: float) -> BoolArray:
     return result
 
 
-def on_line(points: Array, line: Array) -> tuple[Array, Array]:
-    """How far along the line [k, 2] the nearest place to points [m, 2] is, and its distance; in metres."""
+class OnLine(NamedTuple):
+    """The places of a line that are nearest to points, [m] each.
+
+    Attributes:
+        along_m: how far along the line they are.
+        beside_m: how far the points are from them.
+        segment: the line's segments that hold them.
+    """
+
+    along_m: Array
+    beside_m: Array
+    segment: IndexArray
+
+
+def on_line(points: Array, line: Array) -> OnLine:
+    """The places of the line [k, 2] that are nearest to points [m, 2]."""
     start, way = line[:-1], np.diff(line, axis=0)
     lengths = np.hypot(way[:, 0], way[:, 1])
     until = np.concatenate([[0.0], np.cumsum(lengths)])
     squares = np.where(lengths > 0, lengths**2, 1.0)
     along, beside = np.empty(len(points)), np.empty(len(points))
+    segment = np.empty(len(points), dtype=np.intp)
     for begin in range(0, len(points), 1024):
         off = points[begin : begin + 1024, None] - start
         share = np.clip((off * way).sum(axis=-1) / squares, 0.0, 1.0)
@@ -236,7 +251,8 @@ def on_line(points: Array, line: Array) -> tuple[Array, Array]:
         rows = np.arange(len(nearest))
         along[begin : begin + 1024] = until[nearest] + share[rows, nearest] * lengths[nearest]
         beside[begin : begin + 1024] = np.sqrt(square[rows, nearest])
-    return along, beside
+        segment[begin : begin + 1024] = nearest
+    return OnLine(along, beside, segment)
 
 
 def to_edges(points: Array, edges: Array) -> Array:

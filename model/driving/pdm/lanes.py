@@ -125,7 +125,7 @@ def lane_losses(ego: Boxes, crossing: BoolArray, centreline: Array) -> IndexArra
 def progress_m(ego: Boxes, centreline: Array) -> Array:
     """Metres that plans get along the centre line, never less than 0, [n]."""
     ends = np.stack([ego.x[:, [0, -1]], ego.y[:, [0, -1]]], axis=-1).reshape(-1, 2)
-    along = on_line(ends, centreline)[0].reshape(-1, 2)
+    along = on_line(ends, centreline).along_m.reshape(-1, 2)
     result: Array = np.clip(along[:, 1] - along[:, 0], 0.0, None)
     return result
 

@@ -38,6 +38,13 @@ def test_plans_can_be_kept_one_by_one() -> None:
     assert summary([scene])["plans"] == 1
 
 
+def test_the_expert_s_own_plan_is_never_to_be_corrected() -> None:
+    one = entry(2.0, 0.5)
+    one.record["free"][0] |= {"plan_iou": 1.0}
+    for thresholds in (Thresholds(), Thresholds(everything=True), Thresholds(plan_iou=1.1)):
+        assert filtered([one], thresholds)[0].draws == (1,)
+
+
 def test_the_same_plan_twice_is_kept_once() -> None:
     one = entry(2.0, 0.5)
     one.record["free"].append(one.record["free"][0])

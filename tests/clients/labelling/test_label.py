@@ -230,6 +230,11 @@ def test_right_plans_come_out_of_all_scenes_without_words(ledger: Ledger, file: 
     assert 0 < count == len(read)
     assert all(not each.reflection and not each.teacher and each.model == "scripted" for each in read)
     assert list(right_plans(ledger, run, 1.1)) == []
+    looked_at = {(each.scene_id, str(each.predicted_plan)) for each in reflections(ledger, run)}
+    acted_on = {(each.scene_id, str(each.predicted_plan)) for each in right_plans(ledger, run, 0.0)}
+    assert looked_at
+    assert acted_on
+    assert not looked_at & acted_on, "one plan cannot be both"
 
 
 def test_messages_are_what_trainers_read(ledger: Ledger, file: Path, tmp_path: Path) -> None:

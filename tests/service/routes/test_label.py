@@ -57,6 +57,14 @@ def test_a_reflection_is_written_and_checked(served: Served) -> None:
     assert served.metric("looktwice_labels_total", teacher="rules") == 2
 
 
+def test_the_lights_of_others_reach_the_teacher(served: Served) -> None:
+    asked = asking(served)
+    assert "braking" not in served.http.post(PATH, json=asked).json()["reflection"]
+    for agent in asked["annotations"]["agents"]:
+        agent["lights"] = ["brake"]
+    assert "A braking vehicle" in served.http.post(PATH, json=asked).json()["reflection"]
+
+
 def test_without_annotations_the_built_in_teacher_says_what_it_lacks(served: Served) -> None:
     for lacking in (asking(served, annotations=None), {**asking(served)}):
         lacking.pop("annotations")

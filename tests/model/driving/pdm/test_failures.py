@@ -132,6 +132,16 @@ def test_another_plan_than_before_a_red_light_and_the_other_lane_are_facts() -> 
     assert found[LANE_KEEPING].side == "left"
 
 
+@pytest.mark.parametrize("corners_only", [True, False])
+def test_a_line_may_be_told_by_its_corners(corners_only: bool) -> None:
+    """The nearest stretch of it is a long one, and the middle of a short one is nearer than its middle."""
+    along = np.array([-20.0, 45.0]) if corners_only else np.arange(-20.0, 46.0)
+    up = np.array([10.0, 20.0]) if corners_only else np.arange(1.0, 21.0)
+    line = np.concatenate([np.stack([along, 0 * along], 1), np.stack([0 * up + 45.0, up], 1)])
+    found = facts(road(centreline=line, lanes=None), straight(11, left=-2.0))
+    assert found[LANE_KEEPING].side == "right"
+
+
 def test_what_the_human_fails_at_too_is_no_fact() -> None:
     out = straight(8, left=7.0)
     assert DRIVABLE not in facts(road(), out, others=Others(human=out))

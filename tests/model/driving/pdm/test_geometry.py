@@ -71,7 +71,7 @@ def test_lines_are_as_far_as_shapely_says(seed: int) -> None:
     dice = np.random.default_rng(seed)
     line = np.cumsum(dice.uniform(-1, 3, (40, 2)), axis=0)
     points = dice.uniform(-5, 40, (300, 2))
-    along, apart = on_line(points, line)
+    along, apart, _ = on_line(points, line)
     theirs, dots = shapely.LineString(line), shapely.points(points)
     assert apart == pytest.approx(shapely.distance(dots, theirs))
     assert along == pytest.approx(shapely.line_locate_point(theirs, dots))
