@@ -86,9 +86,9 @@ def decode_image(encoded: bytes) -> npt.NDArray[np.uint8]:
     with _open(encoded) as image:
         try:
             return np.asarray(image.convert("RGB"), dtype=np.uint8)
-        except ImageError:
+        except (ImageError, MemoryError):
             raise
-        except (OSError, SyntaxError, ValueError) as error:
+        except Exception as error:  # whatever a reader ends with, such as an IndexError behind the pixels
             raise ImageError(f"the picture is damaged: {error}") from error
 
 

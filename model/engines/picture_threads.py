@@ -39,7 +39,8 @@ class PictureThreads:
         Of large ones only the one that is worked on counts: that others wait behind it says nothing about the
         rest of the service.
         """
-        return time.monotonic() - min(self._since_s.values()) if self._since_s else 0.0
+        since_s = list(self._since_s.values())  # at once: a thread may end its piece meanwhile
+        return time.monotonic() - min(since_s) if since_s else 0.0
 
     async def run(self, work: Callable[[], _Result], pictures: Sequence[bytes] = ()) -> _Result:
         """What ``work`` on ``pictures`` gives; it ends at its next picture once nobody waits for it any more.

@@ -238,10 +238,10 @@ class CompiledFormat:
 
     def codes(self, piece: Codes, place: int) -> npt.NDArray[np.int64]:
         """Ids of the codes that may stand at a place."""
-        key = (piece.alphabet, place)
+        books = self.codebooks(piece.alphabet)
+        key = (piece.alphabet, place % len(books))
         if key not in self._codes:
-            books = self.codebooks(piece.alphabet)
-            self._codes[key] = np.arange(books[place % len(books)].start, books[place % len(books)].stop)
+            self._codes[key] = np.arange(books[key[1]].start, books[key[1]].stop)
         known, only = self._codes[key], None if piece.only is None else piece.only[place]
         return known if only is None else known[only : only + 1]
 

@@ -68,7 +68,7 @@ class BodyLimit:
             nonlocal received, complete, goes_on_s
             if complete:
                 return await receive()  # which tells when the caller leaves
-            if announced.isdigit() and int(announced) > self._max_bytes:
+            if announced.isdigit() and _more(announced, self._max_bytes):
                 # A caller that asks first has not begun to send.
                 if headers.get("expect", "").lower() != "100-continue":
                     await self._drain(receive, ends_s)
@@ -131,6 +131,12 @@ class BodyLimit:
 
     def _too_large(self) -> HTTPException:
         return HTTPException(413, f"at most {self._max_bytes} bytes are accepted")
+
+
+def _more(announced: str, most: int) -> bool:
+    """Whether a number in digits is larger; its length alone may tell, and Python reads no endless ones."""
+    digits = announced.lstrip("0")
+    return len(digits) > len(str(most)) or int(digits or "0") > most
 
 
 async def _until(time_s: float) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import hashlib
+import json
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -14,7 +16,6 @@ from starlette.responses import Response
 
 from looktwice.clients.wire import IDEMPOTENCY_KEY_HEADER
 from looktwice.service.http.callers import while_connected
-from looktwice.service.http.payloads import packed
 from looktwice.service.problems import IDEMPOTENCY_KEY_REUSED, INVALID_REQUEST, ProblemError
 
 REPLAYED_HEADER: Final = "Idempotency-Replayed"
@@ -142,6 +143,12 @@ def refuse_key(idempotency_key: str | None) -> None:
         raise ProblemError(INVALID_REQUEST, f"{IDEMPOTENCY_KEY_HEADER} cannot go with stream: true")
 
 
+def _content(asked: BaseModel) -> bytes:
+    """What is asked, to be compared. Scenes of a batch are not checked yet, and may hold any JSON."""
+    told = asked.model_dump(warnings=False)
+    return json.dumps(told, default=lambda picture: base64.b64encode(picture).decode()).encode()
+
+
 async def once(
     request: Request,
     idempotency: Idempotency,
@@ -156,7 +163,7 @@ async def once(
     """
     try:
         if idempotency_key is not None:
-            same = request.url.path.encode() + packed(asked.model_dump(warnings=False))
+            same = request.url.path.encode() + _content(asked)
             return await idempotency.once(request.state.owner, idempotency_key, same, work)
         return await while_connected(request, work())
     except NotCached as given:

@@ -10,6 +10,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 
 from looktwice.clients.wire import PROBLEM_MEDIA_TYPE, Fault, Problem
@@ -96,7 +97,8 @@ def install_error_handlers(app: FastAPI, metrics: Metrics) -> None:
         return answer(request, from_validation(error))
 
     @app.exception_handler(CallerLeft)
-    async def _left(request: Request, error: CallerLeft) -> Response:
+    @app.exception_handler(ClientDisconnect)
+    async def _left(request: Request, error: CallerLeft | ClientDisconnect) -> Response:
         return Response(status_code=CALLER_LEFT_STATUS)
 
     @app.exception_handler(HTTPException)

@@ -76,7 +76,7 @@ def chat_router(deps: Dependencies) -> APIRouter:
             return await streamed(
                 request,
                 events,
-                PlanTeller(format_of(asked, card)),
+                lambda: PlanTeller(format_of(asked, card)),
                 lambda told: _chunks(told, completion, places),
                 deps.metrics,
             )

@@ -68,7 +68,7 @@ def imagine_router(deps: Dependencies) -> APIRouter:
             return await streamed(
                 request,
                 events,
-                ImagineTeller(imagining.imagination),
+                lambda: ImagineTeller(imagining.imagination),
                 lambda told: server_sent(told, answer, arrival.request_id),
                 deps.metrics,
             )

@@ -167,7 +167,7 @@ async def _one(
         return await streamed(
             request,
             deps.planning.events(asked, arrival),
-            PlanTeller(format_of(asked, deps.lifecycle.card)),
+            lambda: PlanTeller(format_of(asked, deps.lifecycle.card)),
             lambda told: server_sent(told, done, arrival.request_id),
             deps.metrics,
         )

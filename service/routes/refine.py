@@ -75,7 +75,7 @@ def refine_router(deps: Dependencies) -> APIRouter:
         return await streamed(
             request,
             deps.planning.events(refining.planning, arrival, refining.geometry),
-            RefineTeller(refining),
+            lambda: RefineTeller(refining),
             lambda told: server_sent(told, lambda planned: answer(refining, planned), arrival.request_id),
             deps.metrics,
         )

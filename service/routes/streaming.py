@@ -83,13 +83,14 @@ async def server_sent(
 async def streamed(
     request: Request,
     events: AsyncGenerator[SceneEvent],
-    tell: Tell[Data],
+    teller: Callable[[], Tell[Data]],
     sent: Callable[[AsyncGenerator[tuple[str, Data] | PlannedScene]], AsyncGenerator[bytes]],
     metrics: Metrics,
 ) -> StreamingResponse:
-    """A scene's events as they come, in the words of ``tell`` and the bytes that ``sent`` makes of these.
+    """A scene's events as they come, in the words of a ``teller`` and the bytes that ``sent`` makes of these.
 
-    Waits for the first event: so a scene that is not let in gets a status of its own.
+    Waits for the first event: so a scene that is not let in gets a status of its own. Only then is there a
+    format that the teller can know.
 
     Raises:
         CallerLeft: before there was anything to send.
@@ -99,7 +100,7 @@ async def streamed(
     except CallerLeft:
         await events.aclose()
         raise
-    told = wire_events(first, events, tell, metrics)
+    told = wire_events(first, events, teller(), metrics)
     return StreamingResponse(sent(told), media_type=wire.SSE_MEDIA_TYPE, headers=_NO_BUFFERING)
 
 

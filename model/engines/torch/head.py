@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import torch
+from cachetools import LRUCache
 from torch import Tensor
 from torch.nn import functional
 
@@ -20,6 +21,8 @@ _WHOLE_SHARE: Final = 0.5
 _ALIKE: Final = 16
 """Products have a multiple of so many rows and columns, so that each of their numbers is added up in the
 same order, whatever else is asked for."""
+_PARTS: Final = 1024
+"""Sets of ids whose weights are kept; a format has some tens of them."""
 
 Ids = npt.NDArray[np.int64]
 
@@ -33,18 +36,17 @@ class AllowedHead:
 
     def __init__(self, weight: Tensor) -> None:
         self._weight = weight.detach().t()
-        # Sets of ids are told apart by identity (formats make each of them once); kept, so that none is
-        # freed and its identity given to another.
-        self._parts: dict[int, tuple[Ids, Tensor | None]] = {}
+        # By what is in them: a fork makes its set anew each time.
+        self._parts: LRUCache[bytes, Tensor | None] = LRUCache(_PARTS)
 
     def logits(self, hidden: Tensor, wanted: Sequence[Ids]) -> list[npt.NDArray[np.float64]]:
         """For each row of ``hidden`` [n, hidden] the logits of its wanted ids, float64 [k]."""
-        rows_of: dict[int, list[int]] = {}
+        rows_of: dict[bytes, list[int]] = {}
         for row, ids in enumerate(wanted):
-            rows_of.setdefault(id(ids), []).append(row)
+            rows_of.setdefault(ids.tobytes(), []).append(row)
+        parts = [self._part(key, wanted[rows[0]]) for key, rows in rows_of.items()]
         products = []
-        for rows in rows_of.values():
-            part = self._part(wanted[rows[0]])
+        for part, rows in zip(parts, rows_of.values(), strict=True):
             chosen = hidden if len(rows) == len(hidden) else hidden[rows]
             chosen = functional.pad(chosen, (0, 0, 0, -len(rows) % _ALIKE))
             product = torch.mm(chosen, self._weight if part is None else part)
@@ -53,22 +55,23 @@ class AllowedHead:
         every = torch.cat([product.flatten() for product in products]).double().cpu().numpy()
         ends = np.cumsum([product.numel() for product in products])
         found: list[npt.NDArray[np.float64]] = [np.empty(0)] * len(wanted)
-        for rows, flat in zip(rows_of.values(), np.split(every, ends[:-1]), strict=True):
-            ids = wanted[rows[0]]
+        flats = np.split(every, ends[:-1])
+        for part, rows, flat in zip(parts, rows_of.values(), flats, strict=True):
             logits = flat.reshape(len(rows), -1)
-            if self._part(ids) is None:
-                logits = logits[:, ids]
+            if part is None:
+                logits = logits[:, wanted[rows[0]]]
             for row, values in zip(rows, logits, strict=True):
                 found[row] = values
         return found
 
-    def _part(self, ids: Ids) -> Tensor | None:
-        """The weights of some ids, [hidden, k]; None for the whole."""
-        if id(ids) not in self._parts:
+    def _part(self, key: bytes, ids: Ids) -> Tensor | None:
+        """The weights of some ids, [hidden, k], kept by ``key``; None for the whole."""
+        if key not in self._parts:
             part = None
             if len(ids) <= _WHOLE_SHARE * self._weight.shape[1]:
                 wanted = torch.from_numpy(ids).to(self._weight.device)
                 # Turned over in memory too: products of few rows read that faster.
                 part = functional.pad(self._weight.index_select(1, wanted), (0, -len(ids) % _ALIKE))
-            self._parts[id(ids)] = (ids, part)
-        return self._parts[id(ids)][1]
+            self._parts[key] = part
+        found: Tensor | None = self._parts[key]
+        return found

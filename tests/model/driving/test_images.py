@@ -108,6 +108,13 @@ def test_damaged_bytes_are_decoded_or_refused_and_nothing_else(
         assert decode_image(bytes(encoded)).ndim == 3
 
 
+def test_a_damaged_chunk_behind_the_pixels_is_refused() -> None:
+    png = saved("PNG")
+    end = png.index(b"IEND") - 4
+    with pytest.raises(ImageError, match="damaged"):
+        decode_image(png[:end] + chunk(b"iCCP") + png[end:])
+
+
 def progressive(scans: int) -> bytes:
     """A progressive JPEG whose last scan comes so many times more."""
     buffer = io.BytesIO()

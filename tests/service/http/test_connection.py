@@ -55,6 +55,19 @@ def test_headers_that_trickle_are_not_waited_for(served: Served) -> None:
         assert ended(connection) == b""
 
 
+def test_a_length_of_thousands_of_digits_is_read(served: Served) -> None:
+    with connect(served) as connection:
+        connection.sendall(HEAD + b"Connection: close\r\nContent-Length: " + b"0" * 5000 + b"2\r\n\r\n{}")
+        assert ended(connection).startswith(b"HTTP/1.1 422")
+
+
+def test_who_leaves_while_sending_is_no_failure_of_the_service(served: Served) -> None:
+    with connect(served) as connection:
+        connection.sendall(HEAD + b"Content-Length: 1000\r\n\r\n{")
+    served.until(lambda: served.metric("looktwice_requests_total", endpoint="/v1/plan", status="499") == 1)
+    assert served.metric("looktwice_requests_total", endpoint="/v1/plan", status="500") == 0
+
+
 def test_the_next_request_has_its_time_too(served: Served) -> None:
     with connect(served) as connection:
         for _ in range(2):

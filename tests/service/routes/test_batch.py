@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import threading
 from typing import Any
 
@@ -139,6 +140,16 @@ def test_a_defect_in_one_scene_leaves_the_others_and_is_counted(
     assert results[1].problem is not None
     assert results[1].problem.type.endswith("internal")
     assert served.metric("looktwice_failures_told_total", reason="internal") == 1
+
+
+@pytest.mark.parametrize("seed", [2**127, "\ud800"])
+def test_with_a_key_a_scene_that_cannot_be_packed_fails_alone_too(served: Served, seed: Any) -> None:
+    broken = body(n=1) | {"controls": {"n": 1, "seed": seed}}
+    content = json.dumps({"requests": [body(n=1), broken]})
+    headers = {"Idempotency-Key": "unpackable", "Content-Type": "application/json"}
+    for _ in range(2):
+        answer = served.http.post("/v1/plan/batch", content=content, headers=headers)
+        assert [result["status"] for result in answer.json()["results"]] == [200, 422]
 
 
 def test_with_a_key_only_what_is_final_is_kept(served: Served, engine: ScriptedEngine) -> None:

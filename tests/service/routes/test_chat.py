@@ -115,6 +115,14 @@ def test_a_stream_adds_up_to_the_message(client: openai.OpenAI) -> None:
     assert usage == whole.usage
 
 
+def test_an_unknown_format_is_refused_before_the_stream_begins(client: openai.OpenAI) -> None:
+    with pytest.raises(openai.BadRequestError) as error:
+        client.chat.completions.create(
+            model="scripted", messages=messages(), stream=True, extra_body=extra(format="haiku")
+        )
+    assert error.value.code == "unknown-format"
+
+
 def test_the_streaming_helper_puts_the_message_together(client: openai.OpenAI) -> None:
     whole = client.chat.completions.create(model="scripted", messages=messages(), n=2, seed=3)
     with client.chat.completions.stream(model="scripted", messages=messages(), n=2, seed=3) as stream:

@@ -90,6 +90,15 @@ def test_what_fails_on_the_way_is_an_event(served: Served, engine: ScriptedEngin
     assert served.metric("looktwice_failures_told_total", reason="internal") == 1
 
 
+@pytest.mark.parametrize(("path", "more"), [("/v1/plan", {}), ("/v1/reflect", {"plan": str(SLOW_DOWN)})])
+def test_an_unknown_format_is_refused_as_without_streaming(
+    served: Served, path: str, more: dict[str, Any]
+) -> None:
+    asked = body(n=1) | {"format": "haiku"} | more
+    for streams in (False, True):
+        problem(served.http.post(path, json=asked | {"stream": streams}), "unknown-format")
+
+
 def test_leaving_a_stream_cancels_it(served: Served, engine: ScriptedEngine) -> None:
     served.in_loop(engine.may_finish.clear)
     content = json.dumps(streaming()).encode()
