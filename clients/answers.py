@@ -15,11 +15,10 @@ from pydantic import BaseModel, JsonValue, ValidationError
 
 from looktwice.clients import wire, wire_scores
 from looktwice.clients.wire_values import plan_of_tracks
-from looktwice.model.driving.plan import Plan, PlanError
+from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.trajectory import (
     TEN_HZ_S,
     FloatArray,
-    GeometryError,
     at_10_hz,
     check_times,
     check_trajectory,
@@ -312,7 +311,7 @@ def reflected(answered: wire.ReflectResponse, response: httpx.Response) -> Refle
 def _contract(response: httpx.Response) -> Iterator[None]:
     try:
         yield
-    except (PlanError, GeometryError) as error:
+    except ValueError as error:  # `PlanError` and `GeometryError` among them
         raise BadAnswer(f"{response.url} answered with something else than a plan: {error}") from error
 
 

@@ -30,6 +30,7 @@ class ModelCard(ResponseModel):
     paints: bool = Field(
         default=False, description="Whether it can paint what it imagines, as POST /v1/imagine asks."
     )
+    deadlines: bool = Field(default=True, description="Whether it keeps deadlines (`deadline_ms`).")
     cameras: list[str] = Field(description="Cameras it needs; a scene must have a clip of each.")
     image_size: Annotated[list[int], Field(min_length=2, max_length=2)] = Field(
         description="Width and height in pixels that pictures are resized to."

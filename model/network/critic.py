@@ -159,12 +159,14 @@ class Critic(nn.Module):
         common = torch.cat([2 * bends, now[:, :, 0] / 10, past.flatten(1)], dim=1)
         parts = [left / 2, 3 * askew, speeds[:, :, steps] / 10, (turning * speeds)[:, :, steps] / 2]
         parts += [(along - now * times) / 20, common[:, None].expand(-1, each, -1)]
-        way: Tensor = self.way(torch.cat(parts, dim=2).clamp(-_OUTLIER, _OUTLIER))  # [b, k, width]
-        seen = self.each(_met(objects.float(), along, left, times, now))  # [b, k, n, width]
+        # Geometry is worked out in single precision, whatever the weights are held in.
+        dtype = next(self.trunk.parameters()).dtype
+        way: Tensor = self.way(torch.cat(parts, dim=2).clamp(-_OUTLIER, _OUTLIER).to(dtype))  # [b, k, width]
+        seen = self.each(_met(objects.float(), along, left, times, now).to(dtype))  # [b, k, n, width]
         there = objects[:, None, :, :1].float()
         most = (seen * there - _NOBODY * (1 - there)).amax(dim=2)
-        logits: Tensor = self.trunk(torch.cat([way, most, (seen * there).sum(dim=2) / 4], dim=2))
-        return logits
+        logits: Tensor = self.trunk(torch.cat([way, most, (seen * there).sum(dim=2) / 4], dim=2).to(dtype))
+        return logits.float()
 
 
 def _met(objects: Tensor, along: Tensor, left: Tensor, times: Tensor, now: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ class ModelCard:
         parameters: how many weights.
         inputs: what it takes of a scene beside pictures and history: ``route``, ``tracks``.
         paints: whether it can paint the pictures that it imagines.
+        deadlines: whether its engine keeps them.
         details: anything else worth showing, JSON-like.
     """
 
@@ -33,6 +34,7 @@ class ModelCard:
     parameters: int
     inputs: tuple[str, ...] = ("route",)
     paints: bool = False
+    deadlines: bool = True
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @property

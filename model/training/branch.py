@@ -178,8 +178,10 @@ def _judged_plans(
     loaded.model.set_attn_implementation(MATMUL_ATTENTION)
     learner = ResponseLearner(loaded.model, loaded.vocabulary, loaded.codec).eval()
     states, looks, episodes = [], list[bool](), list[int]()
-    for start in range(0, len(items), _BATCH):
-        some = items[start : start + _BATCH]
+    # Prompts with pictures and those without share no batch.
+    sorts = [[item for item in items if item.pictures == pictures] for pictures in (True, False)]
+    batches = [sort[start : start + _BATCH] for sort in sorts for start in range(0, len(sort), _BATCH)]
+    for some in batches:
         samples = [responses[item] for item in some]
         branches = [
             (examples.episode[item.index], *_branch(response, options.tolist()))
@@ -198,13 +200,28 @@ def _items(examples: Examples, placed: PlacedReflections | None, task: str) -> l
     """The prompts behind which plans are judged; without reflections, all that the model may be given."""
     if placed is not None:
         return [
-            Item(int(index), task, bool(route), (place,), tracks=bool(tracks), mirror=mirror)
+            Item(
+                int(index),
+                task,
+                bool(route),
+                (place,),
+                tracks=bool(tracks or not examples.pictured[index]),
+                mirror=mirror,
+                pictures=bool(examples.pictured[index]),
+            )
             for mirror in (False, True)
             for place, (index, (route, tracks)) in enumerate(zip(placed.examples, placed.told, strict=True))
             if placed.reflections[place].judged
         ]
     return [
-        Item(index, task, bool(examples.has_route[index]), tracks=tracks, mirror=mirror)
+        Item(
+            index,
+            task,
+            bool(examples.has_route[index]),
+            tracks=tracks,
+            mirror=mirror,
+            pictures=bool(examples.pictured[index]),
+        )
         for mirror in (False, True)
         for tracks in (False, True)
         for index in range(len(examples))

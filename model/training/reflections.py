@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final, NamedTuple
@@ -67,13 +68,19 @@ def places_of(examples: Examples, scene_ids: Iterable[str], what: str) -> npt.ND
         what: is on the scenes, in the message.
 
     Raises:
-        ValueError: a scene is missing.
+        ValueError: a scene is missing, or there are several of its id.
     """
     place_of = {str(scene_id): place for place, scene_id in enumerate(examples.scene_id)}
+    times = Counter(map(str, examples.scene_id))
     places = []
     for scene_id in scene_ids:
         if scene_id not in place_of:
             raise ValueError(f"there is {what} on scene {scene_id}, which is not among the scenes")
+        if times[scene_id] > 1:
+            raise ValueError(
+                f"there is {what} on scene {scene_id}, and {times[scene_id]} scenes have that id: leave out "
+                "the folder whose scenes are of the same seeds, made in another way"
+            )
         places.append(place_of[scene_id])
     return np.array(places, np.int64)
 

@@ -143,11 +143,16 @@ class TaskSampler(BatchSampler):
         self._epoch = epoch
 
     def __len__(self) -> int:
-        plain = len(self._taught) + len(self._again)
-        return (
-            plain // self._batch_size
-            + len(self._reflections) // self._scenes_a_batch
-            + len(self._attempted) // self._attempts_a_batch
+        kinds = (
+            (np.concatenate([self._taught, self._again]), self._batch_size),
+            (np.array([index for index, _, _ in self._reflections], np.int64), self._scenes_a_batch),
+            (self._attempted, self._attempts_a_batch),
+        )
+        # Prompts with pictures and those without share no batch: each sort leaves a rest of its own.
+        return sum(
+            int((self._pictured[examples] == pictures).sum()) // size
+            for examples, size in kinds
+            for pictures in (False, True)
         )
 
     def __iter__(self) -> Iterator[list[Item]]:  # type: ignore[override]  # items instead of positions

@@ -73,7 +73,11 @@ class LearnerTrainer(Trainer):
             args=arguments,
             train_dataset=dataset,
             data_collator=collate,
-            callbacks=[_Log(folder / LOG_FILE, stage, validate, validate_every), _Frugal()],
+            callbacks=[
+                _Log(folder / LOG_FILE, stage, validate, validate_every),
+                _Frugal(),
+                *([] if sampler is None else [_Epochs(sampler)]),
+            ],
         )
         self._recipe, self._sampler, self._dataset, self._learner = recipe, sampler, dataset, learner
         self._parts: dict[str, list[torch.Tensor]] = {}
@@ -150,6 +154,16 @@ def draw_apart(worker: int) -> None:
     while isinstance(dataset, Subset):
         dataset = dataset.dataset
     dataset.random = np.random.default_rng(info.seed)
+
+
+class _Epochs(TrainerCallback):
+    """Tells the sampler which epoch begins; where a run on several processes goes on, nobody else does."""
+
+    def __init__(self, sampler: TaskSampler) -> None:
+        self._sampler = sampler
+
+    def on_epoch_begin(self, args: Any, state: Any, control: Any, **_: Any) -> None:
+        self._sampler.set_epoch(int((state.epoch or 0) + 1e-6))
 
 
 class _Frugal(TrainerCallback):

@@ -288,6 +288,8 @@ def _ladder(
     entries = (
         {} if folder is None else {entry: folder / entry for entry in LADDER if (folder / entry).is_dir()}
     )
+    if folder is not None and not entries:
+        raise ValueError(f"{folder} holds no ladder: none of {', '.join(LADDER)} is there")
     entries.setdefault(COUNTERFACTUAL, checkpoint)
     shown = ROUND_2 if ROUND_2 in entries else COUNTERFACTUAL
     results: dict[Variant, list[SceneResult]] = {}

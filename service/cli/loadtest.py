@@ -64,7 +64,7 @@ def loadtest(
         typer.Option(envvar="LOOKTWICE_API_KEY", help="Of a service that asks for one.", show_default=False),
     ] = "",
     planners: Annotated[int, typer.Option(help="fleet: how many.", min=1)] = 4,
-    hz: Annotated[float, typer.Option(help="fleet: plans a second of each; 10, 5, 2 or 1.")] = 10.0,
+    hz: Annotated[float, typer.Option(help="fleet: plans a second of each; 10, 5, 2 or 1.", min=0.1)] = 10.0,
     knee: Annotated[float | None, typer.Option(help="soak: what a sweep found.", min=0.05)] = None,
     share: Annotated[float, typer.Option(help="soak: of the knee.", min=0.01, max=1)] = 0.8,
     growth_limit: Annotated[

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from looktwice.model.engines.engine import Draw, PlanRequest
     from looktwice.model.network.model_card import ModelCard
 
+_MOST_NUMBERS: Final = 20
 _BESIDE_REQUESTS: Final = ("scenes", "checkpoint", "limit", "skip", "out", "as_json")
 """What a request does not say itself."""
 
@@ -177,20 +178,32 @@ def _told(scene_id: str, draws: list[Draw], chosen: int) -> list[str]:
         end = f"in {draw.times_s[-1]:g} s at x {x_m:.1f} m, y {y_m:.1f} m"
         lines.append(f"{mark} draw {draw.index} {branch} {end}{share}")
     draw = draws[chosen]
-    lines += ["", f"Draw {chosen} (*) lies nearest to the others: the one to drive by. It says:", ""]
+    lines += ["", f"Draw {chosen} (*) lies nearest to the others: the one to drive by. It says:"]
     if draw.plan is not None:
-        lines += ["Meta actions:", str(draw.plan).rstrip()]
+        lines += ["", "Meta actions:", str(draw.plan).rstrip()]
     if draw.thinking is not None:
-        lines += [
-            "",
-            f"Second look: {draw.thinking}",
-            "",
-            "Revised meta actions:",
-            str(draw.revised_plan).rstrip(),
-        ]
+        lines += ["", f"{'Thoughts' if draw.branch is None else 'Second look'}: {draw.thinking}"]
+    if draw.revised_plan is not None:
+        lines += ["", "Revised meta actions:", str(draw.revised_plan).rstrip()]
     for name, values in draw.sections.items():
-        lines += ["", f"{name.replace('_', ' ').capitalize()}: {' '.join(map(str, values))}"]
+        if said := _said(values).strip():
+            lines += ["", f"{name.replace('_', ' ').capitalize()}: {said}"]
     return lines
+
+
+def _said(value: Any) -> str:
+    """A value by its kind, as the inspector says it: records in a line each, long rows of numbers counted."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name.replace('_', ' ')} {_said(inner)}" for name, inner in value.items())
+    if not isinstance(value, list):
+        return f"{value:g}" if isinstance(value, float) else str(value)
+    if len(value) > _MOST_NUMBERS and all(isinstance(each, int | float) for each in value):
+        return f"{len(value)} numbers"
+    return "".join(_said(each) + ("\n" if _of_records(each) else " ") for each in value).rstrip()
+
+
+def _of_records(value: Any) -> bool:
+    return isinstance(value, dict) or (isinstance(value, list) and any(map(_of_records, value)))
 
 
 def _as_json(scene_id: str, draws: list[Any], chosen: int, picture: Path) -> dict[str, Any]:

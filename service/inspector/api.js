@@ -123,6 +123,7 @@ function labelled(content, name) {
     drivable: known.drivable || [],
     lane_lines: known.lane_lines || [],
     tags: known.tags || [],
+    tracks: scene.tracks || known.tracks || null,
     next_images: known.next_images || [],
   };
 }

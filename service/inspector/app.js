@@ -34,6 +34,7 @@ function redraw() {
 }
 
 function forgetDraws() {
+  clearTimeout(planSoon);
   state.running?.abort();
   state.running = null;
   state.draws = [];
@@ -97,7 +98,7 @@ function showView(view) {
   showImaginable(view);
   byId("tags").replaceChildren(...view.tags.map((tag) => element("li", { textContent: tag.replaceAll("_", " ") })));
   byId("with-route").disabled = !view.scene.route;
-  byId("with-tracks").disabled = !state.inputs.includes("tracks");
+  byId("with-tracks").disabled = !state.inputs.includes("tracks") || !view.tracks;
   redraw();
   say(`Scene ${view.scene.scene_id || "without a name"}: press Plan.`);
 }
@@ -144,7 +145,7 @@ function replan() {
   showThreshold();
   if (!state.draws.length) return;
   clearTimeout(planSoon);
-  planSoon = setTimeout(() => attempt(plan), 150); // while the slider moves, only its last place counts
+  planSoon = setTimeout(() => attempt(state.again), 150); // while the slider moves, only its last place counts
 }
 
 function controls() {
@@ -152,7 +153,7 @@ function controls() {
   return {
     thinking: byId("thinking").value,
     think_threshold: usesThreshold() ? byId("threshold").valueAsNumber : null,
-    deadline_ms: Number.isNaN(deadline) ? null : deadline,
+    deadline_ms: Number.isNaN(deadline) || byId("deadline").disabled ? null : deadline,
     n: byId("n").valueAsNumber,
     temperature: byId("temperature").valueAsNumber,
     seed: byId("seed").valueAsNumber,
@@ -165,12 +166,13 @@ const given = () => ({
   tracks: byId("with-tracks").checked && !byId("with-tracks").disabled ? state.view.tracks : null,
 });
 
-const plan = () => ask("Planning …", linkTo(LINKED), (signal) => api.plan(given(), controls(), signal));
-const lookTwice = () => ask("Looking twice …", linkTo([...LINKED, "proposal"]), (signal) =>
+const plan = () => ask(plan, "Planning …", linkTo(LINKED), (signal) => api.plan(given(), controls(), signal));
+const lookTwice = () => ask(lookTwice, "Looking twice …", linkTo([...LINKED, "proposal"]), (signal) =>
   api.reflect(given(), byId("proposal").value, controls(), signal));
 
-async function ask(doing, link, request) {
+async function ask(again, doing, link, request) {
   if (!state.view) return;
+  state.again = again;
   state.running?.abort();
   const running = state.running = new AbortController();
   const buttons = [byId("plan"), byId("look-twice")];
@@ -358,6 +360,8 @@ async function showModel() {
   const [card] = await api.models();
   state.inputs = card.inputs;
   state.refines = card.refines.length > 0;
+  byId("deadline").disabled = !card.deadlines;
+  if (!card.deadlines) byId("deadline").value = "";
   byId("look").hidden = card.reflects.length === 0;
   allowImagining(card);
   byId("model").textContent = `${card.name} ${card.revision} · ${card.engine} · ${card.cameras.length} cameras`;

@@ -127,6 +127,9 @@ class Metrics:
             ["outcome"],
             registry=registry,
         )
+        # The first failure is the one to be told of, and nothing rises that begins at 1.
+        for outcome in ("done", "failed"):
+            self._swaps.labels(outcome)
         self._model = Gauge(
             "looktwice_model_info", "What is loaded.", ["name", "revision", "engine"], registry=registry
         )

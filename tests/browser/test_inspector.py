@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -312,15 +313,7 @@ def test_opens_a_parquet_scene_file(inspector: Page, engine: ScriptedEngine, tmp
 
 
 def test_opens_a_json_scene_that_is_dropped(inspector: Page, engine: ScriptedEngine) -> None:
-    document = body()["scene"] | {"scene_id": "dropped"}
-    inspector.locator("body").evaluate(
-        """(target, text) => {
-            const dataTransfer = new DataTransfer();
-            dataTransfer.items.add(new File([text], "scene.json", {type: "application/json"}));
-            target.dispatchEvent(new DragEvent("drop", {dataTransfer, bubbles: true, cancelable: true}));
-        }""",
-        json.dumps(document),
-    )
+    dropped(inspector, body()["scene"] | {"scene_id": "dropped"})
     expect(inspector.get_by_role("status")).to_contain_text("Scene dropped")
     plan(inspector)
     expect(inspector.locator("#draws tbody tr")).to_have_count(6)
@@ -328,6 +321,72 @@ def test_opens_a_json_scene_that_is_dropped(inspector: Page, engine: ScriptedEng
         "\N{EN DASH}"
     )  # no expert to compare with
     assert engine.submitted[-1].scene.scene_id == "dropped"
+
+
+def dropped(page: Page, document: dict[str, Any]) -> None:
+    page.locator("body").evaluate(
+        """(target, text) => {
+            const dataTransfer = new DataTransfer();
+            dataTransfer.items.add(new File([text], "scene.json", {type: "application/json"}));
+            target.dispatchEvent(new DragEvent("drop", {dataTransfer, bubbles: true, cancelable: true}));
+        }""",
+        json.dumps(document),
+    )
+
+
+def test_tracks_of_a_json_scene_are_given(page: Page, served: Served, engine: ScriptedEngine) -> None:
+    shown = served.http.get("/v1/scenes/slow-leader").json()
+    plain = engine.card_shown
+    engine.card_shown = replace(plain, inputs=("route", "tracks"))
+    try:
+        page.goto(served.url)
+        page.get_by_label("give the tracks").check()
+        request = {"scene": shown["scene"] | {"scene_id": "asked", "tracks": shown["tracks"][:2]}}
+        for document, count in ((shown, 3), (request, 2)):
+            dropped(page, document)
+            expect(page.locator("#scene option:checked")).to_contain_text("scene.json")
+            engine.submitted.clear()
+            plan(page)
+            expect(page.locator("#draws tbody tr")).to_have_count(6)
+            assert len(engine.submitted[0].scene.tracks or ()) == count
+        dropped(page, shown["scene"] | {"scene_id": "bare"})
+        expect(page.get_by_role("status")).to_contain_text("Scene bare")
+        expect(page.get_by_label("give the tracks")).to_be_disabled()
+    finally:
+        engine.card_shown = plain
+
+
+def test_no_deadline_is_asked_of_an_engine_that_keeps_none(
+    page: Page, served: Served, engine: ScriptedEngine
+) -> None:
+    plain = engine.card_shown
+    engine.card_shown = replace(plain, deadlines=False)
+    try:
+        page.goto(served.url)
+        expect(page.get_by_label("Deadline, ms")).to_be_disabled()
+        expect(page.locator("#clips img")).to_have_count(2)
+        engine.submitted.clear()
+        plan(page)
+        expect(page.locator("#draws tbody tr")).to_have_count(6)
+        assert engine.submitted[0].controls.deadline_ms is None
+    finally:
+        engine.card_shown = plain
+
+
+def test_the_threshold_slider_looks_again_where_a_look_is_shown(
+    inspector: Page, engine: ScriptedEngine
+) -> None:
+    proposal = inspector.get_by_label("A plan to look at twice")
+    proposal.fill(str(SLOW_DOWN))
+    inspector.get_by_role("button", name="Look twice").click()
+    expect(inspector.get_by_role("status")).to_contain_text("6 draws in")
+    engine.submitted.clear()
+    inspector.get_by_label("Use a think threshold").check()
+    inspector.get_by_role("slider", name="Think threshold").focus()
+    inspector.keyboard.press("End")
+    expect(inspector.locator("#draws .branch")).to_have_text(["direct"] * 6)
+    assert {str(asked.controls.prefill) for asked in engine.submitted} == {str(SLOW_DOWN)}
+    assert proposal.input_value() == str(SLOW_DOWN)
 
 
 @pytest.mark.parametrize(

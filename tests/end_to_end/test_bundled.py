@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from looktwice.clients import wire
@@ -19,7 +20,7 @@ from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import split_of_seed
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.engines.engine import Controls, Draw, DrawFinished, PlanRequest
-from looktwice.model.engines.torch.engine import TorchEngine
+from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.evaluation.open_loop import BASELINES, evaluate_baselines, evaluate_trajectories
 from looktwice.model.families.cf_vla import CF_VLA
 from looktwice.model.formats.cursor import CompiledFormat
@@ -61,6 +62,25 @@ def test_the_page_opens_on_a_scene_where_a_second_look_happens(served: Served[To
     controls = {"n": 6, "temperature": 1, "seed": 0}
     answer = served.http.post("/v1/plan", json={"scene": scene, "controls": controls}, timeout=120).json()
     assert any(draw["thinking"] for draw in answer["draws"])
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_it_plans_in_the_types_of_gpus_and_of_checks(dtype: torch.dtype) -> None:
+    settings = TorchSettings(rows=6, dtype=dtype, products=None)
+
+    async def planned() -> list[Draw]:
+        engine = TorchEngine(CHECKPOINT, settings)
+        await engine.start()
+        try:
+            request = PlanRequest("one", BUNDLED[0].scene, "cf_vla", Controls(n=6, thinking="always"))
+            return [event.draw async for event in engine.submit(request) if isinstance(event, DrawFinished)]
+        finally:
+            await engine.stop()
+
+    draws = asyncio.run(planned())
+    assert len(draws) == 6
+    assert all(draw.thinking for draw in draws)
+    assert np.isfinite(np.stack([draw.trajectory for draw in draws])).all()
 
 
 def test_it_plans_better_than_keeping_on(planner: PlannerClient) -> None:

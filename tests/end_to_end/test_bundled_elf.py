@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 
 from looktwice.clients import wire
@@ -83,7 +81,8 @@ def apart_m(told: RefineResponse, draft: FloatArray) -> float:
 
 
 def test_commands_take_it_by_its_name() -> None:
-    done = looktwice("plan", "--checkpoint", "elf-nano", "--json")
+    done = looktwice("plan", "--checkpoint", "elf-nano")
     assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
-    assert report["draws"][0]["text"].startswith("<think>Road edges: ")
+    assert "\nThoughts: Road edges: " in done.stdout
+    assert "Meta actions" not in done.stdout, "it writes none"
+    assert "None" not in done.stdout

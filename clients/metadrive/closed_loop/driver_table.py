@@ -104,7 +104,7 @@ def driver_rows(drives: Mapping[str, Sequence[Drive]]) -> list[DriverRow]:
 
 
 def _row(name: str, drives: Sequence[Drive], experts_m: Mapping[int, float]) -> DriverRow:
-    rates = [drive.thought for drive in drives if drive.thought is not None]
+    rates = [(drive.thought, drive.plans) for drive in drives if drive.thought is not None]
     times = [drive.milliseconds for drive in drives if drive.milliseconds is not None]
     km, collided, left = _amounts(drives)
     whole_km = np.array([experts_m.get(drive.seed, 0.0) / 1000 for drive in drives])
@@ -125,12 +125,18 @@ def _row(name: str, drives: Sequence[Drive], experts_m: Mapping[int, float]) -> 
         off_road_per_km=told.get("off_road_per_km"),
         jerk_ms3=float(np.mean([drive.jerk_ms3 for drive in drives])),
         lateral_ms2=float(np.mean([drive.lateral_ms2 for drive in drives])),
-        think_rate=float(np.mean(rates)) if rates else None,
+        think_rate=_mean_of_plans(rates),
         plans=sum(drive.plans for drive in drives),
         deadline_misses=sum(drive.late for drive in drives),
         plan_ms=float(np.median(times)) if times else None,
         intervals={name: ratio_interval(*ratios[name]) for name in told},
     )
+
+
+def _mean_of_plans(rates: Sequence[tuple[float, int]]) -> float | None:
+    """The mean of rates, each with the plans that it is of; None where there are none."""
+    plans = sum(count for _, count in rates)
+    return sum(rate * count for rate, count in rates) / plans if plans else None
 
 
 def _amounts(drives: Sequence[Drive]) -> tuple[Array, Array, Array]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import multiprocessing.connection
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
@@ -38,6 +39,7 @@ from looktwice.model.driving.scene_store import MANIFEST, SCENE_VERSION, write_s
 from looktwice.model.driving.whole_files import written_whole
 
 GENERATOR_VERSION: Final = "1"
+_BLOCK: Final = re.compile(r"scenes-(\d+)-(\d+)\.parquet")
 _EPISODES_KEY: Final = "looktwice.episodes"
 _TRIES_PER_BLOCK: Final = 3
 
@@ -170,12 +172,14 @@ def generate(
     out_dir.mkdir(parents=True, exist_ok=True)
     _check_config(out_dir, config)
     report, started = GenerateReport(), time.monotonic()
-    blocks = [seeds[i : i + config.block] for i in range(0, len(seeds), config.block)]
-    missing = [block for block in blocks if not block_file(out_dir, block).exists()]
-    report.blocks_resumed = len(blocks) - len(missing)
+    done = [block for block in blocks_of(out_dir) if block[0] <= seeds[-1] and block[-1] >= seeds[0]]
+    missing = _blocks(seeds, done, config.block)
+    report.blocks_resumed = len(done)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
-        task = progress.add_task(out_dir.name, total=len(blocks), completed=report.blocks_resumed)
+        task = progress.add_task(
+            out_dir.name, total=len(done) + len(missing), completed=report.blocks_resumed
+        )
         for _ in _run_blocks(out_dir, missing, workers, config, pilot, teacher):
             report.blocks_written += 1
             progress.advance(task)
@@ -185,6 +189,25 @@ def generate(
     report.outcomes = manifest["outcomes"]
     report.seconds = time.monotonic() - started
     return report
+
+
+def blocks_of(out_dir: Path) -> list[range]:
+    """The seeds of each file that is there."""
+    names = (_BLOCK.fullmatch(file.name) for file in sorted(out_dir.glob("scenes-*.parquet")))
+    return [range(int(name[1]), int(name[2]) + 1) for name in names if name is not None]
+
+
+def _blocks(seeds: range, done: Sequence[range], size: int) -> list[range]:
+    """Seeds that are in no file yet, in blocks of at most ``size`` that follow each other."""
+    covered, found = {seed for block in done for seed in block}, list[range]()
+    for seed in seeds:
+        if seed in covered:
+            continue
+        if found and found[-1][-1] == seed - 1 and len(found[-1]) < size:
+            found[-1] = range(found[-1][0], seed + 1)
+        else:
+            found.append(range(seed, seed + 1))
+    return found
 
 
 def block_file(out_dir: Path, seeds: range) -> Path:

@@ -62,7 +62,7 @@ class TransformersEngine:
 
     def __init__(self, checkpoint: Path, rows: int = 24, dtype: torch.dtype = torch.float32) -> None:
         self._loaded, self._rows = load(checkpoint, dtype), rows
-        self._card = replace(self._loaded.card, engine="transformers")
+        self._card = replace(self._loaded.card, engine="transformers", deadlines=False)
         self._families = families_of(self._card.formats, self._loaded.settings.reflection)
         self._formats = {
             name: CompiledFormat(family.format, self._loaded.vocabulary)
@@ -115,7 +115,7 @@ class TransformersEngine:
             if self._thread is None:
                 raise EngineError("the engine is not running")
             taking = self._thread.submit(load_weights, self._loaded, checkpoint)
-            self._card = replace(await asyncio.wrap_future(taking), engine="transformers")
+            self._card = replace(await asyncio.wrap_future(taking), engine="transformers", deadlines=False)
 
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """Queue a request and iterate over its events; see `Engine.submit`."""

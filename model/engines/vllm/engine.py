@@ -70,7 +70,7 @@ class VllmEngine:
     def __init__(self, checkpoint: Path, settings: VllmSettings = VllmSettings()) -> None:
         self._checkpoint, self._settings = checkpoint, settings
         self._parts = read_parts(checkpoint)
-        self._card = replace(self._parts.card, engine="vllm")
+        self._card = replace(self._parts.card, engine="vllm", deadlines=False)
         self._families = families_of(self._card.formats, self._parts.settings.reflection)
         self._formats = {
             name: CompiledFormat(family.format, self._parts.vocabulary)

@@ -245,6 +245,8 @@ def test_drivers_are_compared_over_the_same_episodes() -> None:
     assert (expert.route_completion, mine.route_completion) == pytest.approx((1.0, 0.75))
     assert (mine.collisions, mine.off_road, mine.deadline_misses, mine.think_rate) == (1, 1, 1, 0.2)
     assert "adaptive" in format_driver_rows([expert, mine])
+    longer = Drive(2, "time", 200.0, False, 3.0, 1.0, 30, 0.0, 0, 250.0)
+    assert driver_rows({"adaptive": [half, longer]})[0].think_rate == pytest.approx(0.05), "2 of 40 plans"
     told = drives_to_json({EXPERT: [whole], "adaptive": [half]})["drivers"]
     assert {"name", "episodes", "route_completion", "collisions", "off_road", "think_rate"} <= set(told[1])
     assert told[1]["drives"][0]["ended"] == "collision"

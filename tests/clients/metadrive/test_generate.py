@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import time
 from dataclasses import replace
@@ -75,6 +76,20 @@ def test_a_second_run_leaves_what_is_there_alone(folder: Path) -> None:
     assert report.blocks_resumed == 2
     assert report.blocks_written == 0
     assert file.stat().st_mtime_ns == before
+
+
+def test_more_seeds_are_added_to_those_that_are_there(tmp_path: Path) -> None:
+    """Blocks of the larger range end elsewhere; what they share with files that are there is left alone."""
+    config = replace(CONFIG, duration_s=9.0, block=2)
+    generate(tmp_path, range(4, 5), workers=1, config=config)
+    shutil.copy(block_file(tmp_path, range(4, 5)), tmp_path / "mine.parquet")
+    report = generate(tmp_path, range(4, 7), workers=1, config=config)
+    (tmp_path / "mine.parquet").unlink()
+    assert (report.blocks_resumed, report.blocks_written) == (1, 1)
+    assert block_file(tmp_path, range(5, 7)).exists()
+    names = [labelled.scene.scene_id for labelled in read_scenes(tmp_path)]
+    assert len(names) == len(set(names))
+    assert json.loads((tmp_path / MANIFEST).read_text())["seeds"] == [4, 5, 6]
 
 
 def test_the_manifest_counts_what_the_files_hold(folder: Path) -> None:

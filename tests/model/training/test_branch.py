@@ -15,7 +15,7 @@ from looktwice.model.bundled import CHECKPOINTS
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.plan import Plan, parse_plan
 from looktwice.model.driving.reflection_store import LabelledReflection, write_reflections
-from looktwice.model.driving.scene import LabelledScene
+from looktwice.model.driving.scene import NO_PICTURE, LabelledScene
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.engines.engine import Controls, DrawFinished, PlanRequest
 from looktwice.model.engines.torch.engine import TorchEngine
@@ -33,6 +33,11 @@ WAIT = parse_plan("- longitudinal\n  - 0.0s-6.4s: Wait\n")
 KEEP = parse_plan("- longitudinal\n  - 0.0s-6.4s: Keep Speed\n")
 TEXT = "My lane is clear. Going on like this would be needlessly cautious, so I should pick up speed."
 SCENES = [each for each in map(training_scene, range(40)) if each.scene.route is not None]
+
+
+def without_pictures(labelled: LabelledScene) -> LabelledScene:
+    clips = tuple(replace(clip, images=(NO_PICTURE,) * len(clip.images)) for clip in labelled.scene.clips)
+    return replace(labelled, scene=replace(labelled.scene, clips=clips), dense=())
 
 
 def judged(labelled: LabelledScene, plan: Plan, text: str) -> LabelledReflection:
@@ -117,7 +122,10 @@ def test_behind_a_critic_it_is_learned_without_reflections(
         return found._replace(verdicts=verdicts)
 
     monkeypatch.setattr(SecondSketcher, "forward", judged_by_tracks)
-    examples = Examples.from_scenes(SCENES, critical.settings.cameras)
+    # Scenes without pictures are always given their tracks.
+    mixed = [*SCENES[:-4], *map(without_pictures, SCENES[-4:])]
+    write_scenes(scenes / "a.parquet", mixed)
+    examples = Examples.from_scenes(mixed, critical.settings.cameras)
     own_plans = OwnPlans(
         critical.model, examples, open_vision(critical, examples, settings.cache, mirrored=True)
     )
@@ -132,7 +140,7 @@ def test_behind_a_critic_it_is_learned_without_reflections(
     figures = train_branch(scenes, source, target, None, settings)
     assert figures["auc"] > 0.9, "its states tell whether a look pays"
     [stage] = load(target).card.details["stages"]
-    assert stage["plans_count"] == 4 * len(SCENES), "with and without tracks, mirrored too"
+    assert stage["plans_count"] == 4 * len(SCENES) - 2 * 4, "with and without tracks, mirrored too"
     assert 0 < stage["looks_count"] <= pays, "where standing still is nothing new, there is no look"
 
 

@@ -63,6 +63,12 @@ def test_a_mirrored_reflection_says_the_other_side() -> None:
         mirrored(Counterfactual(PLAN, "I should slow down."))
 
 
+def test_scenes_that_share_an_id_are_not_taken_for_each_other() -> None:
+    twice = Examples.concatenate([EXAMPLES, EXAMPLES])
+    with pytest.raises(ValueError, match="2 scenes have that id"):
+        place_reflections(twice, [reflection(str(EXAMPLES.scene_id[2]), "")])
+
+
 def test_a_reflection_on_an_unknown_scene_is_refused() -> None:
     with pytest.raises(ValueError, match="scene nowhere, which is not among"):
         place_reflections(EXAMPLES, [reflection("nowhere", "")])

@@ -109,6 +109,34 @@ def test_every_batch_reaches_a_process() -> None:
 
 
 @pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize("examples", [70, 100, 333])
+def test_its_length_is_that_of_an_epoch_where_some_have_no_pictures(examples: int, processes: int) -> None:
+    """A trainer ends after as many epochs as its steps make by this length."""
+    pictured = np.arange(examples) % 3 > 0
+    reflected = np.arange(0, examples, 2)
+    sampler = TaskSampler(
+        np.ones(examples, np.bool_),
+        16,
+        {"traj_only": 0.3, "cf_vla": 0.7},
+        0.8,
+        seed=0,
+        processes=processes,
+        reflected=reflected,
+        told=told(len(reflected)),
+        reflecting="cf_vla",
+        tracks_share=0.5,
+        pictured=pictured,
+        attempted=np.arange(0, examples, 5),
+        attempting="elf_vla_refine",
+    )
+    for epoch in range(3):
+        sampler.set_epoch(epoch)
+        batches = list(sampler)
+        assert len(batches) == len(sampler)
+        assert all(len({item.pictures for item in batch}) == 1 for batch in batches)
+
+
+@pytest.mark.parametrize("processes", [1, 2])
 def test_batches_of_reflections_lie_among_the_others(processes: int) -> None:
     reflected = np.repeat(np.arange(0, 4000, 4), 3)
     sampler = TaskSampler(

@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from torch.utils.data import DataLoader, Dataset, Subset
+from transformers import TrainerState
 
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.training.recipes import NANO
 from looktwice.model.training.run import RunSettings, run
-from looktwice.model.training.trainer import draw_apart
+from looktwice.model.training.sampler import TaskSampler
+from looktwice.model.training.trainer import _Epochs, draw_apart
 from tests.model.training.scenes import training_scene
 
 # torch warns where there are fewer cores than workers.
@@ -33,6 +35,15 @@ def test_workers_draw_numbers_of_their_own() -> None:
     loader = DataLoader(Subset(_Chances(), range(8)), batch_size=1, num_workers=2, worker_init_fn=draw_apart)
     drawn = [float(value) for value in loader]
     assert len(set(drawn)) == len(drawn)
+
+
+def test_a_run_that_goes_on_takes_the_order_of_its_epoch() -> None:
+    going_on, afresh = (TaskSampler(np.ones(64, np.bool_), 8, {"cf_vla": 1.0}, 0.5, seed=3) for _ in "ab")
+    epochs = _Epochs(going_on)
+    for told, epoch in ((0.0, 0), (2.37, 2), (3.0, 3), (3.9999999, 4)):
+        epochs.on_epoch_begin(None, TrainerState(epoch=told), None)
+        afresh.set_epoch(epoch)
+        assert list(going_on) == list(afresh)
 
 
 @pytest.mark.parametrize("recipe", ["ground", "read-tracks", "meta-act"])

@@ -70,6 +70,13 @@ def test_a_ladder_is_climbed_once_and_told_again(
     assert not planned & {each.scene.scene_id for each in read_scenes(SCENES)}, "all draws are kept"
 
 
+def test_a_ladder_that_is_not_there_is_refused(brief_checkpoint: Path, tmp_path: Path) -> None:
+    asked = ("evaluate", "--preset", "ladder", "--checkpoint", str(brief_checkpoint), "--limit", "2")
+    refused = CliRunner().invoke(app, [*asked, "--ladder", str(tmp_path / "none")])
+    assert refused.exit_code == 2
+    assert "holds no ladder" in refused.output
+
+
 def test_scenes_that_a_row_does_not_allow_are_refused_before_the_engine_starts(
     untrained_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
