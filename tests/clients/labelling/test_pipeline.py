@@ -156,7 +156,7 @@ def test_who_goes_away_in_the_midst_of_it_makes_no_dead_letters(tmp_path: Path) 
         return await square(job)
 
     with pytest.raises(StageStopped, match="about to stop"):
-        worked(tmp_path, jobs(200), drained, StageLimits(at_once=16, give_up_after_s=0.5))
+        worked(tmp_path, jobs(200), drained, StageLimits(at_once=16, give_up_after_s=3.0))
     assert all("square" in record for record in records(tmp_path).values())
     served = -200
     tally = worked(tmp_path, jobs(200), drained)
