@@ -172,8 +172,8 @@ def generate(
     out_dir.mkdir(parents=True, exist_ok=True)
     _check_config(out_dir, config)
     report, started = GenerateReport(), time.monotonic()
-    done = [block for block in blocks_of(out_dir) if block[0] <= seeds[-1] and block[-1] >= seeds[0]]
-    missing = _blocks(seeds, done, config.block)
+    done = [block for block in _blocks_there(out_dir) if block[0] <= seeds[-1] and block[-1] >= seeds[0]]
+    missing = _blocks_missing(seeds, done, config.block)
     report.blocks_resumed = len(done)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
@@ -191,13 +191,13 @@ def generate(
     return report
 
 
-def blocks_of(out_dir: Path) -> list[range]:
+def _blocks_there(out_dir: Path) -> list[range]:
     """The seeds of each file that is there."""
     names = (_BLOCK.fullmatch(file.name) for file in sorted(out_dir.glob("scenes-*.parquet")))
     return [range(int(name[1]), int(name[2]) + 1) for name in names if name is not None]
 
 
-def _blocks(seeds: range, done: Sequence[range], size: int) -> list[range]:
+def _blocks_missing(seeds: range, done: Sequence[range], size: int) -> list[range]:
     """Seeds that are in no file yet, in blocks of at most ``size`` that follow each other."""
     covered, found = {seed for block in done for seed in block}, list[range]()
     for seed in seeds:

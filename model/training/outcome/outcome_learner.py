@@ -71,13 +71,13 @@ class _Answers(NamedTuple):
     """What a batch of scenes was answered.
 
     Attributes:
-        items: the scenes, and what they were given.
+        samples: the prompts that were answered, with the expert's responses.
         draws, refined: answers to them, and those that were led to and are learned as answers.
         worth: advantages [draws + refined] of each scene.
         parts: means of what they were judged by, to be logged.
     """
 
-    items: list[Item]
+    samples: list[ResponseSample]
     draws: list[list[Draw]]
     refined: list[list[Draw]]
     worth: list[Tensor]
@@ -134,9 +134,8 @@ class OutcomeLearner(nn.Module):
             self._answers, self._updates_left = self._answered(places), self._settings.updates
         self._updates_left -= 1
         answers = self._answers
-        samples = [self._data[item] for item in answers.items]
-        imitated = self.learner(**collate(samples))
-        policy, apart = self._policy(samples, answers)
+        imitated = self.learner(**collate(answers.samples))
+        policy, apart = self._policy(answers)
         loss = policy.loss + self._settings.imitation * imitated["loss"]
         parts = answers.parts
         if self._first:
@@ -180,7 +179,7 @@ class OutcomeLearner(nn.Module):
             # Over all scenes of the step: those that are not refined gain nothing.
             refined_rate = float(np.mean([other is not None for other in again]))
             parts |= {"refined_rate": refined_rate, "refined_gain": float(np.mean(gains))}
-        return _Answers(items, draws, refined, worth, parts)
+        return _Answers([self._data[item] for item in items], draws, refined, worth, parts)
 
     def _item(self, place: int) -> Item:
         chance = torch.rand(2).tolist()
@@ -268,20 +267,16 @@ class OutcomeLearner(nn.Module):
         feedback = str(rule_sections(judged)) if writer == "teacher" else verdict_with_truth(judged)
         return Attempt(draft.trajectory, feedback)
 
-    def _policy(self, samples: Sequence[ResponseSample], answers: _Answers) -> tuple[PolicyLoss, Tensor]:
+    def _policy(self, answers: _Answers) -> tuple[PolicyLoss, Tensor]:
         """The policy's loss, and its divergence from where it began.
 
         Scenes whose draws are worth the same cost nothing.
-
-        Args:
-            samples: the prompts that were answered.
-            answers: to them.
         """
         settings, draws, refined, worth = self._settings, answers.draws, answers.refined, answers.worth
         told = [place for place, each in enumerate(worth) if bool(each.any())]
         if not told:
             return PolicyLoss(torch.zeros(()), torch.ones(()), torch.zeros(())), torch.zeros(())
-        rows = [with_draws(samples[place], [*draws[place], *refined[place]]) for place in told]
+        rows = [with_draws(answers.samples[place], [*draws[place], *refined[place]]) for place in told]
         batch = collate(list(chain.from_iterable(rows)))
         made, before = list[list[Decision]](), list[Tensor | None]()
         for place in told:

@@ -232,11 +232,11 @@ def test_failed_drafts_are_refined_by_feedback_and_learned_as_first_answers(
         calls.append((requests, found))
         return found
 
-    def learning(self: OutcomeLearner, samples: Any, answers: Any) -> Any:
-        prompts.extend(len(sample.prompt) for sample in samples)
+    def learning(self: OutcomeLearner, answers: Any) -> Any:
+        prompts.extend(len(sample.prompt) for sample in answers.samples)
         assert [len(each) for each in answers.worth] == [4, 4]
         assert [each.sum().item() for each in answers.worth] == pytest.approx([0, 0], abs=1e-5)
-        return plain_policy(self, samples, answers)
+        return plain_policy(self, answers)
 
     monkeypatch.setattr(OutcomeLearner, "_drawn_by", drawing)
     monkeypatch.setattr(OutcomeLearner, "_policy", learning)
