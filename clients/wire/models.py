@@ -15,7 +15,7 @@ class ModelCard(ResponseModel):
 
     name: str
     revision: str = Field(description="Changes with the weights, the codec and the codes of pictures.")
-    engine: str = Field(description="torch or vllm.")
+    engine: str = Field(description="torch, vllm or transformers.")
     formats: list[str] = Field(description="Response formats it writes.")
     reflects: list[str] = Field(
         default_factory=list,

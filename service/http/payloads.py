@@ -89,12 +89,6 @@ def _is_json(media_type: str) -> bool:
     return main == "application" and (kind == "json" or kind.endswith("+json"))
 
 
-def packed(value: Any) -> bytes:
-    """A JSON-like value as msgpack."""
-    content: bytes = msgpack.packb(value)
-    return content
-
-
 class _LargeBodies:
     """Reads large bodies beside the answers of others: several at once would leave planning no processor."""
 
@@ -166,5 +160,5 @@ def _part(image: Any, parts: dict[str, bytes]) -> Any:
 def respond(request: Request, answer: BaseModel) -> Response:
     """An answer in msgpack where the caller accepts it, else in JSON."""
     if MSGPACK_MEDIA_TYPE in request.headers.get("accept", ""):
-        return Response(packed(answer.model_dump()), media_type=MSGPACK_MEDIA_TYPE)
+        return Response(msgpack.packb(answer.model_dump()), media_type=MSGPACK_MEDIA_TYPE)
     return Response(answer.model_dump_json(), media_type="application/json")
