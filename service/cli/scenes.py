@@ -68,7 +68,9 @@ def generate(
     tracks: Annotated[bool, typer.Option(help="Tell that model the tracks of the objects around.")] = False,
     careless: Annotated[
         bool,
-        typer.Option(help="--small overlooks everybody for up to two seconds now and then."),
+        typer.Option(
+            help="--small overlooks everybody for up to two seconds now and then, and sees late who stands."
+        ),
     ] = False,
     teacher: Annotated[
         Path | None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 import random
 import time
 from dataclasses import dataclass, replace
@@ -14,12 +15,17 @@ from looktwice.clients import wire
 from looktwice.clients.planner import PlannerClient, imagine_request
 from looktwice.clients.wire_imagine import ImagineControls
 from looktwice.model.driving.scene import Scene
+from looktwice.model.driving.tracks import Track
 from looktwice.model.driving.trajectory import FloatArray, constant_velocity
 
 _OVERLOOKED_SHARES: Final = (0.0, 0.0, 0.04, 0.08)
 """Shares of plans at which carelessness begins; an episode has one of them."""
 _OVERLOOKED_PLANS: Final = 4
 """Plans in a row that overlook everybody, at most."""
+_SEES_STANDING_M: Final = (math.inf, 14.0, 22.0, 32.0)
+"""How far off those who stand are seen; an episode has one of them."""
+_STANDING_MS: Final = 2.0
+"""Who moves more slowly is taken to stand: people walk, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +83,20 @@ class ConstantVelocity:
 
 
 class Careless:
-    """A pilot that overlooks everybody around for up to two seconds now and then.
+    """A pilot that overlooks everybody around for up to two seconds now and then, and sees late who stands.
 
     So it meets what reading pictures wrongly leads to, without any pictures.
 
     Args:
         pilot: who drives; it has to plan from tracks.
-        seed: of the episode: it decides how often, and when. In half of the episodes nobody is overlooked.
+        seed: of the episode: it decides how often, and when. In half of the episodes nobody is overlooked;
+            in a quarter those who stand are seen from afar.
     """
 
     def __init__(self, pilot: Pilot, seed: int) -> None:
         self._pilot, self._random = pilot, random.Random(seed)
         self._share = self._random.choice(_OVERLOOKED_SHARES)
+        self._sees_standing_m = self._random.choice(_SEES_STANDING_M)
         self._plans_left = 0
         self.name, self.needs_pictures = pilot.name, pilot.needs_pictures
 
@@ -99,7 +107,13 @@ class Careless:
         if self._plans_left:
             self._plans_left -= 1
             scene = replace(scene, tracks=())
-        return self._pilot.plan(scene)
+        assert scene.tracks is not None, "only who plans from tracks can be careless"
+        return self._pilot.plan(replace(scene, tracks=tuple(filter(self._sees, scene.tracks))))
+
+    def _sees(self, track: Track) -> bool:
+        if abs(track.speed_ms) > _STANDING_MS:
+            return True
+        return math.hypot(track.x_m, track.y_m) - track.length_m / 2 < self._sees_standing_m
 
 
 class ServicePilot:

@@ -314,14 +314,14 @@ class EpisodeWorld:
     def copied(self, steps: int) -> EpisodeWorld:
         """This world once more, with ``steps`` more to go from now on; the map is shared.
 
-        What happens in the copy does not happen here. Its expert begins with a fresh memory where somebody
-        else has driven: it was not there when what it would remember happened.
+        What happens in the copy does not happen here. Where somebody else has driven, its expert takes
+        over: it was not there when what it would remember happened.
         """
         world = copy.deepcopy(self, {id(self._map): self._map})
         world._steps = world._recorder.steps + steps
         world._recorder.make_room(world._steps)
         if isinstance(world.ego, FreeVehicle):
-            world._expert.forget()
+            world._expert.take_over()
         return world
 
 

@@ -25,6 +25,8 @@ from looktwice.clients.metadrive.world.roads import RoadMap
 
 _ROUND_M: Final = 11.0
 """Room needed ahead to steer round an obstacle from standstill."""
+_SWERVE_S: Final = 2.2
+"""Into the next lane in less than this, a car would corner at more than 4.2 m/s²."""
 _REVERSE_SPEED: Final = 1.4
 _TURN_PREPARATION_M: Final = 140.0
 _SLOW_LEADER: Final = 2.0
@@ -60,15 +62,20 @@ class Expert:
         self._eager = eager
         self._lapses = lapses
         self._memory = _Memory()
+        self._swerves = True
 
     @property
     def reversing(self) -> bool:
         """Whether it is backing out."""
         return self._memory.reversing
 
-    def forget(self) -> None:
-        """Begin anew: what it has in mind is of another time."""
+    def take_over(self) -> None:
+        """Begin anew, where somebody else has driven: what it has in mind is of another time.
+
+        It has not chosen to be so near to what blocks its lane, and brakes where it would have to swerve.
+        """
         self._memory = _Memory()
+        self._swerves = False
 
     def step(self, me: Vehicle, bodies: list[Body]) -> None:
         """Decide and move one step."""
@@ -127,6 +134,8 @@ class Expert:
             memory.reversing = False
         for rail in sorted(options, key=lambda r: self._blocked_on(me, r, bodies)):
             if self._blocked_on(me, rail, bodies) < blocked + 30:
+                continue
+            if not self._swerves and blocked < _SWERVE_S * me.speed:
                 continue
             if has_room(me, self._map, self._map.rails, rail, bodies):
                 length = min(max(3.6 * me.speed, _ROUND_M), blocked + 0.5)

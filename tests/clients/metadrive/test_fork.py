@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from looktwice.clients.metadrive.world.actors import Vehicle
+from looktwice.clients.metadrive.world.car_following import SpeedLimits, Style, neighbours
 from looktwice.clients.metadrive.world.episode import EpisodeWorld, make_world
+from looktwice.clients.metadrive.world.expert import Expert
 from looktwice.clients.metadrive.world.fork import ForkError, fork_along, fork_expert, on_rails
 from looktwice.clients.metadrive.world.tracking import FreeVehicle
 from looktwice.model.driving.trajectory import FUTURE_STEPS, constant_velocity, to_ego_frame
@@ -80,6 +84,34 @@ def test_a_car_that_was_driven_astray_comes_back_to_its_lane() -> None:
     start = np.hypot(*forked.trajectory[0, :2])
     assert start == pytest.approx(ego.speed * 0.1, abs=0.15), "it goes on as fast as it was"
     assert isinstance(world.ego, FreeVehicle)
+
+
+@pytest.mark.parametrize("taken_over", [False, True])
+def test_who_takes_over_brakes_where_the_expert_would_swerve(taken_over: bool) -> None:
+    """At 12 m/s, a car has broken down 20 m ahead, and the lane beside is free."""
+    road_map = driven(0).live.road_map
+    rails, style = road_map.rails, Style(15.0)
+    expert = Expert(road_map, style, SpeedLimits(rails, style.lateral), ambition=True, eager=False)
+    if taken_over:
+        expert.take_over()
+    me, car = (Vehicle(number, "vehicle", "130", 0, 0, 0, 12.0, 40.0) for number in range(2))
+    me.rail, me.s = next(
+        (number, rail.s_at(me.progress))
+        for number, rail in enumerate(rails)
+        if rail.covers(me.progress, 0.0) and neighbours(replace(me, rail=number, s=rail.s_at(40.0)), road_map)
+    )
+    car.rail, car.s, car.progress = me.rail, me.s + 20.0 + me.size[0], me.progress + 20.0 + me.size[0]
+    car.speed, car.hold, car.hazard_lights = 0.0, True, True
+    for vehicle in (me, car):
+        vehicle.place(rails)
+    for _ in range(40):
+        expert.step(me, [me, car])
+    if taken_over:
+        assert me.shift is None
+        assert me.speed < 0.5
+        assert me.s < car.s - me.size[0], "it stands behind the car"
+    else:
+        assert me.s > car.s, "it has gone round the car"
 
 
 def test_following_the_expert_s_trajectory_is_safe_and_leaving_the_road_is_not() -> None:

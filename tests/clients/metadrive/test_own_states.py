@@ -247,6 +247,24 @@ def test_a_careless_pilot_overlooks_everybody_for_a_while(tmp_path: Path) -> Non
         GenerateConfig(dense=False, careless=True)
 
 
+def test_a_careless_pilot_sees_late_who_stands_and_who_walks() -> None:
+    scene = own_states(SEED, ConstantVelocity(), config=CONFIG)[0][0].scene
+    standing = [Track(5.0 * n, 0.0, 0.0, 0.0, 4.0, 1.8, "vehicle") for n in range(1, 13)]
+    walking = Track(70.0, 3.0, 1.5, 1.4, 0.6, 0.6, "pedestrian")
+    moving = Track(70.0, 0.0, 0.0, 9.0, 4.0, 1.8, "vehicle")
+    seen_m: list[float] = []
+    for seed in range(40):
+        pilot = Remembering()
+        Careless(pilot, seed).plan(replace(scene, tracks=(*standing, walking, moving)))
+        shown = pilot.shown[scene.scene_id].tracks
+        if not shown:
+            continue  # it overlooks everybody just now
+        assert moving in shown
+        seen_m.append(max(track.x_m for track in shown if track is not moving))
+    assert 5 < sum(each == 70.0 for each in seen_m) < 20, "a quarter of the episodes see everybody"
+    assert {each for each in seen_m if each != 70.0} == {15.0, 20.0, 30.0}
+
+
 def test_carelessness_is_refused_where_nobody_plans_from_tracks(tmp_path: Path) -> None:
     command = ["scenes", "generate", str(tmp_path / "new"), "--first-seed", "4", "--episodes", "1"]
     told = CliRunner().invoke(app, [*command, "--no-dense", "--service", "http://127.0.0.1:9", "--careless"])
