@@ -124,15 +124,20 @@ def save(
     Args:
         folder: made when missing; files of an earlier save are replaced.
         model, vocabulary, codec: its parts.
-        dtype: of the stored weights; None keeps the model's. bfloat16 halves the file.
+        dtype: of the stored weights but for the books of sketches; None keeps the model's. bfloat16 halves
+            the file.
         details: anything worth showing on the card, JSON-like (recipe, steps, figures).
         visual_codes: of pictures, for models that imagine.
     """
     folder.mkdir(parents=True, exist_ok=True)
     state = model.state_dict()
     if dtype is not None:
+        # Sketches are told by the nearest code: rounded books would change a token in one of nine.
         state = {
-            name: value.to(dtype) if value.is_floating_point() else value for name, value in state.items()
+            name: value.to(dtype)
+            if value.is_floating_point() and not name.startswith("sketch_books.")
+            else value
+            for name, value in state.items()
         }
     before = model.config.dtype
     model.config.dtype = dtype or before

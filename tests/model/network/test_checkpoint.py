@@ -15,6 +15,7 @@ from transformers import (
     Qwen2_5_VLForConditionalGeneration,
 )
 
+from looktwice.model.bundled import CHECKPOINT
 from looktwice.model.families.family import Situation
 from looktwice.model.families.picture_codes import levels_of
 from looktwice.model.network.card import CARD_FILE, CheckpointError, read_card, weights_revision
@@ -122,6 +123,19 @@ def test_saved_in_half_and_loaded(nano: Loaded, tmp_path: Path) -> None:
     assert weights_revision(tmp_path) == weights_revision(tmp_path / "again")
     torch.testing.assert_close(logits_of(load(tmp_path / "again")), logits_of(again))
     torch.testing.assert_close(logits_of(again), logits_of(nano), atol=0.05, rtol=0.05)
+
+
+def test_books_of_sketches_are_stored_as_they_are(tmp_path: Path) -> None:
+    """A sketch is told by the nearest code: in rounded books, one in nine has another nearest one."""
+    loaded = load(CHECKPOINT)
+    books = loaded.model.sketch_books
+    assert books is not None
+    books.fill(loaded.codec)
+    save(tmp_path, loaded.model, loaded.vocabulary, loaded.codec, dtype=torch.bfloat16)
+    again = load(tmp_path).model.sketch_books
+    assert again is not None
+    for name, exact in books.named_parameters():
+        assert torch.equal(dict(again.named_parameters())[name], exact)
 
 
 def test_near_codes_begin_near(nano: Loaded) -> None:
