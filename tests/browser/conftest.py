@@ -5,6 +5,11 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
+from looktwice.model.driving.scene_store import write_scenes
+from looktwice.service.operations.settings import Settings
+from tests.service.scenes import labelled
+from tests.service.scripted_engine import ScriptedEngine
+from tests.service.serving import Served, serve
 from tests.sockets import PATIENCE_S
 
 CHROMIUM = "/usr/bin/chromium"
@@ -52,3 +57,24 @@ def page(context: BrowserContext) -> Iterator[Page]:
     )
     yield opened
     assert faults == []
+
+
+@pytest.fixture(scope="module")
+def engine() -> ScriptedEngine:
+    return ScriptedEngine()
+
+
+@pytest.fixture(scope="module")
+def served(engine: ScriptedEngine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    path = tmp_path_factory.mktemp("scenes") / "scenes.parquet"
+    write_scenes(path, [labelled("slow-leader"), labelled("second/scene")])
+    with serve(engine, Settings(bundled_scenes=path)) as running:
+        yield running
+
+
+@pytest.fixture
+def inspector(page: Page, served: Served, engine: ScriptedEngine) -> Page:
+    engine.submitted.clear()
+    page.goto(served.url)
+    expect(page.locator("#clips img")).to_have_count(2)
+    return page

@@ -12,7 +12,7 @@ from playwright.sync_api import Page, expect
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.driving.trajectory import TEN_HZ_S
 from looktwice.service.operations.settings import Settings
-from tests.browser.test_inspector import (
+from tests.browser.pages import (
     EXPERT_RGB,
     INSIDE_OF_DOTS_RGB,
     colours_drawn_and_named,

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import io
-import json
 import re
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,37 +17,20 @@ from looktwice.model.driving.trajectory import TEN_HZ_S
 from looktwice.model.engines.engine import EngineError
 from looktwice.service.operations.keys import new_line
 from looktwice.service.operations.settings import Settings
+from tests.browser.pages import (
+    CHOSEN_RGB,
+    DARK_PAGE_RGB,
+    DRAFT_RGB,
+    EXPERT_RGB,
+    INSIDE_OF_DOTS_RGB,
+    colours_drawn_and_named,
+    near,
+    pixels,
+    plan,
+)
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
-from tests.service.serving import Served, body, serve
-
-CHOSEN_RGB = (29, 95, 209)  # --chosen of the light theme
-EXPERT_RGB = (22, 128, 60)  # --expert of the light theme
-DRAFT_RGB = (194, 24, 127)  # --draft of the light theme
-DARK_PAGE_RGB = (18, 22, 28)  # --page of the dark theme
-INSIDE_OF_DOTS_RGB = (255, 255, 255)  # --panel of the light theme
-RGB = tuple[int, int, int]
-
-
-@pytest.fixture(scope="module")
-def engine() -> ScriptedEngine:
-    return ScriptedEngine()
-
-
-@pytest.fixture(scope="module")
-def served(engine: ScriptedEngine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    path = tmp_path_factory.mktemp("scenes") / "scenes.parquet"
-    write_scenes(path, [labelled("slow-leader"), labelled("second/scene")])
-    with serve(engine, Settings(bundled_scenes=path)) as running:
-        yield running
-
-
-@pytest.fixture
-def inspector(page: Page, served: Served, engine: ScriptedEngine) -> Page:
-    engine.submitted.clear()
-    page.goto(served.url)
-    expect(page.locator("#clips img")).to_have_count(2)
-    return page
+from tests.service.serving import Served, serve
 
 
 def test_a_service_with_keys_asks_the_browser_for_one(
@@ -69,20 +49,6 @@ def test_a_service_with_keys_asks_the_browser_for_one(
         plan(page)
         expect(page.locator("#draws tbody tr")).to_have_count(6)
         context.close()
-
-
-def plan(page: Page) -> None:
-    page.get_by_role("button", name="Plan", exact=True).click()
-
-
-def pixels(page: Page, selector: str) -> np.ndarray:
-    encoded = page.locator(selector).screenshot()
-    return np.asarray(Image.open(io.BytesIO(encoded)).convert("RGB"))
-
-
-def near(image: np.ndarray, rgb: tuple[int, int, int]) -> np.ndarray:
-    found: np.ndarray = np.abs(image.astype(int) - rgb).max(axis=-1) < 12
-    return found
 
 
 def test_shows_a_scene_before_anything_is_asked(inspector: Page, engine: ScriptedEngine) -> None:
@@ -302,60 +268,6 @@ def test_another_scene_clears_the_draws(inspector: Page, engine: ScriptedEngine)
     assert engine.submitted[-1].scene.scene_id == "second/scene"
 
 
-def test_opens_a_parquet_scene_file(inspector: Page, engine: ScriptedEngine, tmp_path: Path) -> None:
-    path = tmp_path / "mine.parquet"
-    write_scenes(path, [labelled("from-a-file")])
-    inspector.get_by_label("Open a scene file").set_input_files(path)
-    expect(inspector.get_by_role("status")).to_contain_text("Scene from-a-file")
-    plan(inspector)
-    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
-    assert engine.submitted[-1].scene.scene_id == "from-a-file"
-
-
-def test_opens_a_json_scene_that_is_dropped(inspector: Page, engine: ScriptedEngine) -> None:
-    dropped(inspector, body()["scene"] | {"scene_id": "dropped"})
-    expect(inspector.get_by_role("status")).to_contain_text("Scene dropped")
-    plan(inspector)
-    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
-    expect(inspector.locator("#draws tbody tr").first).to_contain_text(
-        "\N{EN DASH}"
-    )  # no expert to compare with
-    assert engine.submitted[-1].scene.scene_id == "dropped"
-
-
-def dropped(page: Page, document: dict[str, Any]) -> None:
-    page.locator("body").evaluate(
-        """(target, text) => {
-            const dataTransfer = new DataTransfer();
-            dataTransfer.items.add(new File([text], "scene.json", {type: "application/json"}));
-            target.dispatchEvent(new DragEvent("drop", {dataTransfer, bubbles: true, cancelable: true}));
-        }""",
-        json.dumps(document),
-    )
-
-
-def test_tracks_of_a_json_scene_are_given(page: Page, served: Served, engine: ScriptedEngine) -> None:
-    shown = served.http.get("/v1/scenes/slow-leader").json()
-    plain = engine.card_shown
-    engine.card_shown = replace(plain, inputs=("route", "tracks"))
-    try:
-        page.goto(served.url)
-        page.get_by_label("give the tracks").check()
-        request = {"scene": shown["scene"] | {"scene_id": "asked", "tracks": shown["tracks"][:2]}}
-        for document, count in ((shown, 3), (request, 2)):
-            dropped(page, document)
-            expect(page.locator("#scene option:checked")).to_contain_text("scene.json")
-            engine.submitted.clear()
-            plan(page)
-            expect(page.locator("#draws tbody tr")).to_have_count(6)
-            assert len(engine.submitted[0].scene.tracks or ()) == count
-        dropped(page, shown["scene"] | {"scene_id": "bare"})
-        expect(page.get_by_role("status")).to_contain_text("Scene bare")
-        expect(page.get_by_label("give the tracks")).to_be_disabled()
-    finally:
-        engine.card_shown = plain
-
-
 def test_no_deadline_is_asked_of_an_engine_that_keeps_none(
     page: Page, served: Served, engine: ScriptedEngine
 ) -> None:
@@ -387,24 +299,6 @@ def test_the_threshold_slider_looks_again_where_a_look_is_shown(
     expect(inspector.locator("#draws .branch")).to_have_text(["direct"] * 6)
     assert {str(asked.controls.prefill) for asked in engine.submitted} == {str(SLOW_DOWN)}
     assert proposal.input_value() == str(SLOW_DOWN)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "said"),
-    [
-        ("broken.parquet", b"PAR1 and nothing", "truncated"),
-        ("broken.json", b"{", "broken.json is not JSON"),
-        ("other.json", b'{"hello": 1}', "other.json holds no scene"),
-    ],
-)
-def test_a_bad_file_is_told_and_the_scene_stays(
-    inspector: Page, name: str, content: bytes, said: str
-) -> None:
-    chosen = {"name": name, "mimeType": "application/octet-stream", "buffer": content}
-    inspector.get_by_label("Open a scene file").set_input_files(chosen)  # type: ignore[arg-type]
-    expect(inspector.get_by_role("alert")).to_contain_text(said)
-    expect(inspector.get_by_role("status")).to_have_text(f"{name} was not opened.")
-    expect(inspector.get_by_label("Scene", exact=True)).to_have_value("slow-leader")
 
 
 def test_a_problem_is_told_and_goes_away(inspector: Page, engine: ScriptedEngine) -> None:
@@ -463,121 +357,6 @@ def test_without_a_deadline_the_first_plan_is_followed_too(inspector: Page, engi
     assert second.controls.n == 1
 
 
-def test_a_link_leads_to_the_same_plan(inspector: Page, served: Served, engine: ScriptedEngine) -> None:
-    inspector.get_by_label("Scene", exact=True).select_option("second/scene")
-    expect(inspector.get_by_role("status")).to_contain_text("second/scene")
-    inspector.get_by_label("Seed").fill("77")
-    inspector.get_by_role("spinbutton", name="Draws").fill("2")
-    plan(inspector)
-    link = inspector.get_by_role("link", name="Link to this plan").get_attribute("href")
-    assert link is not None
-    (asked,) = engine.submitted
-    inspector.goto("about:blank")
-    inspector.goto(link)
-    expect(inspector.locator("#draws tbody tr")).to_have_count(2)
-    again = engine.submitted[-1]
-    assert again.scene.scene_id == "second/scene"
-    assert (again.controls.seed, again.controls.n) == (asked.controls.seed, asked.controls.n) == (77, 2)
-    inspector.goto("about:blank")
-    inspector.goto(f"{served.url}/#scene=nowhere")
-    expect(inspector.get_by_role("alert")).to_contain_text("not here")
-
-
-def link_to_this_plan(page: Page) -> str:
-    link = page.get_by_role("link", name="Link to this plan").get_attribute("href")
-    assert link is not None
-    return link
-
-
-def test_a_link_says_whether_route_and_tracks_are_given(
-    page: Page, served: Served, engine: ScriptedEngine
-) -> None:
-    plain = engine.card_shown
-    engine.card_shown = replace(plain, inputs=("route", "tracks"))
-    try:
-        page.goto(served.url)
-        page.get_by_label("give the route").uncheck()
-        page.get_by_label("give the tracks").check()
-        plan(page)
-        expect(page.locator("#draws tbody tr")).to_have_count(6)
-        link = link_to_this_plan(page)
-        page.goto("about:blank")
-        engine.submitted.clear()
-        page.goto(link)
-        expect(page.locator("#draws tbody tr")).to_have_count(6)
-        (again,) = engine.submitted
-        assert again.scene.route is None
-        assert again.scene.tracks
-    finally:
-        engine.card_shown = plain
-
-
-def test_a_link_leads_to_the_second_look_that_is_shown(inspector: Page, engine: ScriptedEngine) -> None:
-    plan(inspector)
-    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
-    first = link_to_this_plan(inspector)
-    inspector.get_by_label("A plan to look at twice").fill(str(SLOW_DOWN))
-    inspector.get_by_label("Thinking", exact=True).select_option("always")
-    inspector.get_by_role("spinbutton", name="Draws").fill("3")
-    inspector.get_by_role("button", name="Look twice").click()
-    expect(inspector.locator("#draws tbody tr")).to_have_count(3)
-    link = link_to_this_plan(inspector)
-    assert inspector.url == link != first
-    engine.submitted.clear()
-    inspector.goto("about:blank")
-    inspector.goto(link)
-    expect(inspector.locator("#draws tbody tr")).to_have_count(3)
-    again = engine.submitted[0].controls
-    assert (again.prefill, again.thinking, again.n) == (SLOW_DOWN, "always", 3)
-    engine.failure = EngineError("broke")
-    plan(inspector)
-    expect(inspector.get_by_role("alert")).to_be_visible()
-    engine.failure = None
-    assert link_to_this_plan(inspector) == inspector.url == link, "the second look is still what is shown"
-
-
-def test_there_is_no_link_where_another_scene_is_shown(
-    inspector: Page, served: Served, tmp_path: Path
-) -> None:
-    plan(inspector)
-    expect(inspector.locator("#link")).to_be_visible()
-    inspector.get_by_label("Scene", exact=True).select_option("second/scene")
-    expect(inspector.get_by_role("status")).to_contain_text("second/scene")
-    expect(inspector.locator("#link")).to_be_hidden()
-    expect(inspector).to_have_url(f"{served.url}/")
-    plan(inspector)
-    expect(inspector.locator("#link")).to_be_visible()
-    write_scenes(tmp_path / "mine.parquet", [labelled("mine")])
-    inspector.get_by_label("Open a scene file").set_input_files(tmp_path / "mine.parquet")
-    expect(inspector.get_by_role("status")).to_contain_text("mine")
-    plan(inspector)
-    expect(inspector.locator("#draws tbody tr")).to_have_count(6)
-    expect(inspector.locator("#link")).to_be_hidden()
-    expect(inspector).to_have_url(f"{served.url}/")
-
-
-def test_a_link_is_followed_on_the_page_that_is_open(inspector: Page, engine: ScriptedEngine) -> None:
-    inspector.get_by_label("Use a think threshold").check()
-    inspector.get_by_label("Scene", exact=True).select_option("second/scene")
-    expect(inspector.get_by_role("status")).to_contain_text("second/scene")
-    inspector.get_by_role("spinbutton", name="Draws").fill("2")
-    plan(inspector)
-    expect(inspector.locator("#draws tbody tr")).to_have_count(2)
-    engine.submitted.clear()
-    other = "scene=slow-leader&thinking=always&n=3&seed=5&with-route=false"
-    inspector.evaluate("link => { location.hash = link; }", other)
-    expect(inspector.locator("#draws tbody tr")).to_have_count(3)
-    (asked,) = engine.submitted
-    assert asked.scene.scene_id == "slow-leader"
-    assert asked.scene.route is None
-    controls = asked.controls
-    assert (controls.thinking, controls.n, controls.seed) == ("always", 3, 5)
-    assert controls.think_threshold is None
-    inspector.evaluate("() => { location.hash = 'scene=nowhere'; }")
-    expect(inspector.get_by_role("alert")).to_contain_text("not here")
-    expect(inspector.get_by_label("Scene", exact=True)).to_have_value("slow-leader")
-
-
 def test_what_became_of_the_deadline_is_shown_beside_every_draw(
     inspector: Page, engine: ScriptedEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -590,36 +369,6 @@ def test_what_became_of_the_deadline_is_shown_beside_every_draw(
     inspector.get_by_label("Deadline, ms").fill("")
     plan(inspector)
     expect(told).to_have_text([re.compile("^.$")] * 6)  # a dash
-
-
-def colours_drawn_and_named(page: Page, redraws: Callable[[], None]) -> tuple[set[RGB], set[RGB]]:
-    """What the bird's-eye view is drawn in when ``redraws`` is called, and what its legend names."""
-    page.evaluate(
-        """() => {
-          window.drawn = new Set();
-          const pens = CanvasRenderingContext2D.prototype;
-          for (const [draw, style] of [["stroke", "strokeStyle"], ["fill", "fillStyle"]]) {
-            const own = pens[draw];
-            pens[draw] = function (...given) {
-              window.drawn.add(this[style]);
-              return own.apply(this, given);
-            };
-          }
-        }"""
-    )
-    redraws()
-    drawn = {
-        (int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16))
-        for text in page.evaluate("[...window.drawn]")
-    }
-    named = page.evaluate(
-        """() => [...document.querySelectorAll(".legend li")].flatMap((item) => {
-          const style = getComputedStyle(item, "::before");
-          return [style.borderTopColor, style.backgroundColor];
-        })"""
-    )
-    numbers = [[int(number) for number in re.findall(r"\d+", text)] for text in named]
-    return drawn, {(red, green, blue) for red, green, blue, *_ in numbers}
 
 
 def test_a_deadline_that_was_missed_is_told_beside_every_draw(

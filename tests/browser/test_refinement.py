@@ -17,8 +17,7 @@ from looktwice.model.driving.trajectory import HALF_SECONDS_S
 from looktwice.model.engines.engine import EngineError
 from looktwice.model.engines.torch.engine import TorchEngine
 from looktwice.service.operations.settings import Settings
-from tests.browser.test_feedback import WHY, WRONG_RGB
-from tests.browser.test_inspector import (
+from tests.browser.pages import (
     CHOSEN_RGB,
     EXPERT_RGB,
     INSIDE_OF_DOTS_RGB,
@@ -27,6 +26,7 @@ from tests.browser.test_inspector import (
     pixels,
     plan,
 )
+from tests.browser.test_feedback import WHY, WRONG_RGB
 from tests.service.scenes import labelled
 from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import Served, serve
