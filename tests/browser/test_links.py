@@ -21,8 +21,7 @@ def test_a_link_leads_to_the_same_plan(inspector: Page, served: Served, engine: 
     inspector.get_by_label("Seed").fill("77")
     inspector.get_by_role("spinbutton", name="Draws").fill("2")
     plan(inspector)
-    link = inspector.get_by_role("link", name="Link to this plan").get_attribute("href")
-    assert link is not None
+    link = link_to_this_plan(inspector)
     (asked,) = engine.submitted
     inspector.goto("about:blank")
     inspector.goto(link)

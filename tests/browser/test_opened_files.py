@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import FilePayload, Page, expect
 
 from looktwice.model.driving.scene_store import write_scenes
 from tests.browser.pages import plan
@@ -82,8 +82,8 @@ def test_tracks_of_a_json_scene_are_given(page: Page, served: Served, engine: Sc
 def test_a_bad_file_is_told_and_the_scene_stays(
     inspector: Page, name: str, content: bytes, said: str
 ) -> None:
-    chosen = {"name": name, "mimeType": "application/octet-stream", "buffer": content}
-    inspector.get_by_label("Open a scene file").set_input_files(chosen)  # type: ignore[arg-type]
+    chosen = FilePayload(name=name, mimeType="application/octet-stream", buffer=content)
+    inspector.get_by_label("Open a scene file").set_input_files(chosen)
     expect(inspector.get_by_role("alert")).to_contain_text(said)
     expect(inspector.get_by_role("status")).to_have_text(f"{name} was not opened.")
     expect(inspector.get_by_label("Scene", exact=True)).to_have_value("slow-leader")

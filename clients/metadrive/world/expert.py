@@ -132,10 +132,10 @@ class Expert:
             if blocked < _ROUND_M + 0.8:
                 return None
             memory.reversing = False
+        if not self._swerves and blocked < _SWERVE_S * me.speed:
+            return None
         for rail in sorted(options, key=lambda r: self._blocked_on(me, r, bodies)):
             if self._blocked_on(me, rail, bodies) < blocked + 30:
-                continue
-            if not self._swerves and blocked < _SWERVE_S * me.speed:
                 continue
             if has_room(me, self._map, self._map.rails, rail, bodies):
                 length = min(max(3.6 * me.speed, _ROUND_M), blocked + 0.5)
