@@ -21,7 +21,7 @@ from looktwice.model.network.motion import present_speeds
 from looktwice.model.network.route_line import RouteLine
 
 VERDICT_TOKENS: Final = 1
-LOOK_GAIN: Final = 0.15
+LOOK_GAIN: Final = 0.3
 """A sketch deserves a second look where the second one is so much likelier to hold."""
 _GAIN_WIDTH: Final = 0.05
 _CERTAIN: Final = 6.0
