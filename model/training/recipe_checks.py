@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,12 @@ from looktwice.model.training.reflections import PlacedReflections
 
 
 def check_files(
-    recipe: Recipe, loaded: Loaded, *, reflections: Path | None, failures: Path | None, followed: Path | None
+    recipe: Recipe,
+    loaded: Loaded,
+    *,
+    reflections: Path | None,
+    failures: Path | None,
+    followed: Collection[Path],
 ) -> None:
     """Raise ValueError unless a recipe is given the files that it learns from, and no others.
 
@@ -24,7 +30,7 @@ def check_files(
         loaded: the checkpoint to start from.
         reflections: file of a build's reflections.
         failures: file of a model's own answers with feedback.
-        followed: file of trajectories that were followed.
+        followed: files of trajectories that were followed.
     """
     # What second sketches change is learned from all scenes, and no reflection of a build tells it.
     told = recipe.sketched and loaded.settings.second_sketch
@@ -32,8 +38,8 @@ def check_files(
         wants = "needs reflections" if reflections is None else "takes no reflections"
         why = f": {loaded.card.name} tells in the prompt what else might be driven" if told else ""
         raise ValueError(f"recipe {recipe.name} {wants}{why}")
-    if (followed is None) != (recipe.goal != "judge"):
-        wants = "needs followed trajectories" if followed is None else "takes no followed trajectories"
+    if bool(followed) != (recipe.goal == "judge"):
+        wants = "takes no followed trajectories" if followed else "needs followed trajectories"
         raise ValueError(f"recipe {recipe.name} {wants}")
     if failures is not None and recipe.attempting is None:
         raise ValueError(f"recipe {recipe.name} takes no failures")

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -164,7 +165,7 @@ def run(
     reflections: Path | None = None,
     visual_codes: Path | None = None,
     failures: Path | None = None,
-    followed: Path | None = None,
+    followed: Sequence[Path] = (),
 ) -> None:
     """Train ``source`` by a recipe and write the outcome to ``target``, weights in bfloat16.
 
@@ -183,11 +184,11 @@ def run(
         reflections: file of the reflections that the recipe asks for.
         visual_codes: folder of codes of pictures, which the checkpoint gets; without it, it keeps its own.
         failures: file of a model's own answers with feedback, for recipes that can learn from them.
-        followed: file of trajectories that were followed, which ``critic`` learns from.
+        followed: files of trajectories that were followed, which ``critic`` learns from.
 
     Raises:
         FeedbackFileError: ``failures`` is missing, damaged, or of another version.
-        FollowedFileError: ``followed`` is.
+        FollowedFileError: one of ``followed`` is.
         ValueError: the recipe wants reflections and there are none, or the other way round, or they are on
             other scenes, or on plans made with tracks where ``source`` takes none; it learns from pictures or
             judges draws, and no scene can be learned from so; it takes no failures, and
@@ -236,7 +237,7 @@ def run(
     if failures is not None and recipe.attempting is not None:
         times_s = family_named(recipe.attempting).times_s
         tried = place_attempts(examples, read_feedback(failures), times_s, taught)
-    judged = None if followed is None else place_verdicts(examples, read_followed(followed))
+    judged = place_verdicts(examples, chain.from_iterable(map(read_followed, followed))) if followed else None
     learner, dataset, sampler, collator = _prepare(
         recipe, loaded, scenes, examples, taught, on_examples, tried, judged, settings
     )

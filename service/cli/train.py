@@ -60,8 +60,8 @@ def train(
         typer.Option(help="File that `looktwice failures` wrote, for elf-sft: it learns to refine, too."),
     ] = None,
     followed: Annotated[
-        Path | None,
-        typer.Option(help="File that `looktwice scenes follow` wrote, for critic."),
+        list[Path] | None,
+        typer.Option(help="File that `looktwice scenes follow` wrote, for critic; again for more."),
     ] = None,
     visual_codes: Annotated[
         Path | None,
@@ -242,7 +242,7 @@ def train(
             reflections,
             visual_codes,
             failures,
-            followed,
+            followed or (),
         )
         training_curves(target / LOG_FILE, target / "curves.png")
 

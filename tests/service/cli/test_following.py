@@ -8,7 +8,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from looktwice.model.bundled import CHECKPOINT, SCENES
-from looktwice.model.driving.followed_store import read_followed
+from looktwice.model.driving.followed_store import read_followed, write_followed
 from looktwice.model.network.checkpoint import load
 from looktwice.service.cli.commands import app
 
@@ -39,7 +39,12 @@ def test_from_scenes_to_a_critic(generated: Path, tmp_path: Path) -> None:
     refused = CliRunner().invoke(app, asked)
     assert refused.exit_code == 2
     assert "needs followed trajectories" in refused.output
-    done = CliRunner().invoke(app, [*asked, "--followed", str(out)])
+    more = tmp_path / "more.parquet"
+    refused = CliRunner().invoke(app, [*asked, "--followed", str(out), "--followed", str(more)])
+    assert refused.exit_code == 2
+    assert "more.parquet" in refused.output
+    write_followed(more, [row for row in rows if row.mend])
+    done = CliRunner().invoke(app, [*asked, "--followed", str(out), "--followed", str(more)])
     assert done.exit_code == 0, done.output
     made = load(target)
     assert made.settings.second_sketch
