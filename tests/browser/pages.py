@@ -27,7 +27,7 @@ def pixels(page: Page, selector: str) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(encoded)).convert("RGB"))
 
 
-def near(image: np.ndarray, rgb: tuple[int, int, int]) -> np.ndarray:
+def near(image: np.ndarray, rgb: RGB) -> np.ndarray:
     found: np.ndarray = np.abs(image.astype(int) - rgb).max(axis=-1) < 12
     return found
 
