@@ -62,7 +62,7 @@ class GenerateConfig:
         drifts: the expert strays from its line now and then; scenes show how it comes back.
         lapses: it brakes late now and then; scenes show how it brakes then.
         speeds: in each scene the car is slower or faster than it was, by chance, and the expert goes on from
-            there (`other_speeds`); such scenes have no pictures.
+            there; such scenes have no pictures.
         width_px: of the pictures, which are twice as wide as high.
         driver: name and revision of the model that drives; scenes are then of its own states, with what the
             expert would do from there (`own_states`). None for the expert.
@@ -109,10 +109,10 @@ class GenerateConfig:
             raise GenerationError(
                 "without pictures there are no dense targets, cameras around or next frames"
             )
-        if self.speeds and (self.pictures or self.driver is not None):
+        if self.speeds and (self.pictures or self.teacher is not None):
             raise GenerationError(
-                "pictures do not show other speeds than were driven: such scenes have none, and no driver "
-                "but the expert"
+                "pictures do not show other speeds than were driven: such scenes have none, and the expert "
+                "says what to do from there"
             )
 
 
@@ -340,7 +340,14 @@ def _of_pilot(
     every = max(1, round(config.stride_s / DriveConfig().replan_s))
     driver = pilot_of(config, pilot, seed)
     scenes, drove = own_states(
-        seed, driver, rig, DriveConfig(config.duration_s), every, teacher, hazards=config.hazards
+        seed,
+        driver,
+        rig,
+        DriveConfig(config.duration_s),
+        every,
+        teacher,
+        hazards=config.hazards,
+        speeds=config.speeds,
     )
     return _EpisodeScenes(scenes, drove.ended, "", drove.plans // every)
 

@@ -49,7 +49,7 @@ def other_speeds(
         step = world.now - (HISTORY_STEPS - 1)
         if step < 0 or step % stride or world.ego.speed < _STANDING_MS:
             continue
-        times = float(np.random.default_rng([world.live.seed, world.now]).uniform(*_TIMES))
+        times = another_speed(world)
         try:
             forked = fork_expert(world, times_speed=times)
         except ForkError:
@@ -60,6 +60,16 @@ def other_speeds(
         lane_maps = lane_maps or LaneMaps(world.live)
         made = labelled_scene(forked.log, world.now, blank_clips(FRONT_CAMERAS), lane_maps.at(world.now))
         if made is not None:
-            scene = replace(made.scene, history=at_speed(made.scene.history, times))
-            scenes.append(replace(made, scene=scene))
+            scenes.append(seen_at(made, times))
     return scenes, world.log(), tried
+
+
+def another_speed(world: EpisodeWorld) -> float:
+    """What the ego's speed is multiplied by, by chance: always the same at the same moment."""
+    return float(np.random.default_rng([world.live.seed, world.now]).uniform(*_TIMES))
+
+
+def seen_at(labelled: LabelledScene, times: float) -> LabelledScene:
+    """A scene whose ego came the same way at so many times its speed."""
+    scene = labelled.scene
+    return replace(labelled, scene=replace(scene, history=at_speed(scene.history, times)))

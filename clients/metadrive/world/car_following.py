@@ -129,9 +129,24 @@ def in_path(me: Vehicle, view: RailView) -> npt.NDArray[np.bool_]:
 
 
 def wanted_acceleration(
-    me: Vehicle, style: Style, limit: float, view: RailView, stands_off: bool = True
+    me: Vehicle,
+    style: Style,
+    limit: float,
+    view: RailView,
+    *,
+    stands_off: bool = True,
+    took_over: bool = False,
 ) -> float:
-    """The acceleration that suits the road, the vehicles ahead and people about to be in the way."""
+    """The acceleration that suits the road, the vehicles ahead and people about to be in the way.
+
+    Args:
+        me: who drives.
+        style: how.
+        limit: of speed, in m/s.
+        view: who is around.
+        stands_off: keep farther behind what has to be driven round.
+        took_over: somebody else has driven until now, so people may be nearer than they can be yielded to.
+    """
     speed = max(me.speed, 0.0)
     wish = min(style.speed, limit)
     if speed <= wish:
@@ -144,7 +159,7 @@ def wanted_acceleration(
         if stands_off:
             gap = gap - _STAND_OFF_M * view.fixed[ahead]
         wanted = min(wanted, float(_following(style, speed, gap, view.along[ahead]).min()))
-    stop = _yield_distance(me, style, view)
+    stop = _yield_distance(me, view, took_over)
     if stop is not None:
         wanted = min(wanted, float(_following(style, speed, np.array([stop + 2.0]), np.zeros(1))[0]))
     return wanted
@@ -165,8 +180,11 @@ def _following(style: Style, speed: float, gap: Array, lead_speed: Array) -> Arr
     return np.minimum(np.maximum(harsh, -EMERGENCY_BRAKE), style.acceleration)
 
 
-def _yield_distance(me: Vehicle, style: Style, view: RailView) -> float | None:
-    """Metres to where ``me`` must stop for someone who is or will be in the way."""
+def _yield_distance(me: Vehicle, view: RailView, took_over: bool) -> float | None:
+    """Metres to where ``me`` must stop for someone who is or will be in the way.
+
+    Who steps out too near to be yielded to is passed, unless they would be hit: that is for who took over.
+    """
     nearest: float | None = None
     for i in np.flatnonzero(view.person & (view.s > me.s + 1.0) & (view.s < me.s + _SIGHT_M)):
         distance = float(view.s[i] - me.s) - 0.5 * me.size[0]
@@ -179,7 +197,8 @@ def _yield_distance(me: Vehicle, style: Style, view: RailView) -> float | None:
         arrives_in = distance / max(me.speed, 1.0)
         if (inside and not leaving) or (approaching and enters_in < arrives_in + 2.5):
             stop = max(distance - _PEDESTRIAN_GAP_M, 0.0)
-            if me.speed**2 / (2 * EMERGENCY_BRAKE) < distance:
+            hit = took_over and (inside or enters_in < arrives_in)
+            if hit or me.speed**2 / (2 * EMERGENCY_BRAKE) < distance:
                 nearest = stop if nearest is None else min(nearest, stop)
     return nearest
 

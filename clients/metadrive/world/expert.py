@@ -62,7 +62,7 @@ class Expert:
         self._eager = eager
         self._lapses = lapses
         self._memory = _Memory()
-        self._swerves = True
+        self._took_over = False
 
     @property
     def reversing(self) -> bool:
@@ -72,10 +72,11 @@ class Expert:
     def take_over(self) -> None:
         """Begin anew, where somebody else has driven: what it has in mind is of another time.
 
-        It has not chosen to be so near to what blocks its lane, and brakes where it would have to swerve.
+        It has not chosen to be so near to what blocks its lane or to who steps out, and brakes where it would
+        have to swerve, or could no longer stop.
         """
         self._memory = _Memory()
-        self._swerves = False
+        self._took_over = True
 
     def step(self, me: Vehicle, bodies: list[Body]) -> None:
         """Decide and move one step."""
@@ -89,7 +90,9 @@ class Expert:
             me.advance(rails, self._backing_out(me, view), backing_out=True)
             return
         limit = self._limits.at(me.rail, me.s + 0.4 * me.speed)
-        wanted = wanted_acceleration(me, self.style, limit, view, stands_off=self._ambition)
+        wanted = wanted_acceleration(
+            me, self.style, limit, view, stands_off=self._ambition, took_over=self._took_over
+        )
         if self._lapses is not None:
             wanted = self._lapses.heeded(me, limit, wanted)
         me.advance(rails, smoothed(me, self.style, wanted))
@@ -132,7 +135,7 @@ class Expert:
             if blocked < _ROUND_M + 0.8:
                 return None
             memory.reversing = False
-        if not self._swerves and blocked < _SWERVE_S * me.speed:
+        if self._took_over and blocked < _SWERVE_S * me.speed:
             return None
         for rail in sorted(options, key=lambda r: self._blocked_on(me, r, bodies)):
             if self._blocked_on(me, rail, bodies) < blocked + 30:

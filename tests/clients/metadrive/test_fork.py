@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from looktwice.clients.metadrive.world.actors import Vehicle
+from looktwice.clients.metadrive.world.actors import STEP_S, Pedestrian, Vehicle
 from looktwice.clients.metadrive.world.car_following import SpeedLimits, Style, neighbours
 from looktwice.clients.metadrive.world.episode import EpisodeWorld, make_world
 from looktwice.clients.metadrive.world.expert import Expert
@@ -112,6 +112,36 @@ def test_who_takes_over_brakes_where_the_expert_would_swerve(taken_over: bool) -
         assert me.s < car.s - me.size[0], "it stands behind the car"
     else:
         assert me.s > car.s, "it has gone round the car"
+
+
+@pytest.mark.parametrize(("left_m", "brakes"), [(-3.0, True), (-7.0, False)])
+@pytest.mark.parametrize("taken_over", [False, True])
+def test_who_takes_over_brakes_for_people_whom_it_can_no_longer_yield_to(
+    taken_over: bool, left_m: float, brakes: bool
+) -> None:
+    """At 14 m/s, somebody walks towards the lane 14 m ahead, too near to stop for."""
+    road_map = driven(0).live.road_map
+    rails, style = road_map.rails, Style(15.0)
+    expert = Expert(road_map, style, SpeedLimits(rails, style.lateral), ambition=True, eager=False)
+    if taken_over:
+        expert.take_over()
+    me = Vehicle(0, "vehicle", "130", 0, 0, 0, 14.0, 40.0)
+    me.rail = next(number for number, rail in enumerate(rails) if rail.covers(me.progress, 0.0))
+    me.s = rails[me.rail].s_at(me.progress)
+    me.place(rails)
+    ahead = me.s + 14.0 + 0.5 * me.size[0]
+    x, y, along = rails[me.rail].pose(ahead, left_m)
+    progress = rails[me.rail].progress(ahead)
+    person = Pedestrian(1, "pedestrian", "pedestrian", x, y, along + np.pi / 2, 0.0, progress)
+    person.walking, person.walk_m, person.walking_speed = True, 10.0, 1.4
+    person.step()
+    for _ in range(round(0.8 / STEP_S)):
+        expert.step(me, [me, person])
+        person.step()
+    if taken_over and brakes:
+        assert me.speed < 11.0
+    else:
+        assert me.speed > 13.5
 
 
 def test_following_the_expert_s_trajectory_is_safe_and_leaving_the_road_is_not() -> None:

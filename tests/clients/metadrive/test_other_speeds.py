@@ -43,8 +43,8 @@ def test_the_expert_goes_on_from_another_speed(tmp_path: Path) -> None:
 def test_other_speeds_are_the_expert_s_and_have_no_pictures(tmp_path: Path) -> None:
     with pytest.raises(GenerationError, match="pictures do not show"):
         GenerateConfig(dense=False, speeds=True)
-    with pytest.raises(GenerationError, match="no driver but the expert"):
-        GenerateConfig(dense=False, pictures=False, speeds=True, driver="somebody")
+    with pytest.raises(GenerationError, match="the expert says what to do from there"):
+        GenerateConfig(dense=False, pictures=False, speeds=True, driver="somebody", teacher="somebody")
     command = ["scenes", "generate", str(tmp_path), "--first-seed", "0", "--episodes", "1", "--speeds"]
     told = CliRunner().invoke(app, [*command, "--no-dense"])
     assert told.exit_code == 2

@@ -38,7 +38,7 @@ from looktwice.model.driving.metrics import collides, leaves_road
 from looktwice.model.driving.scene import Scene, SceneError
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.tracks import Track
-from looktwice.model.driving.trajectory import path_length
+from looktwice.model.driving.trajectory import path_length, present_speed, speeds
 from looktwice.model.network.checkpoint import load
 from looktwice.model.network.small_planner import SmallPlanner
 from looktwice.service.cli.commands import app
@@ -127,6 +127,37 @@ def test_among_hazards_only_their_moments_become_scenes() -> None:
     assert len(ahead) > sum(map(hazard_ahead, usual.shown.values()))
     with pytest.raises(GenerationError, match="a model has to drive"):
         GenerateConfig(dense=False, hazards=True)
+
+
+def test_where_even_the_expert_collides_it_brakes() -> None:
+    config = DriveConfig(duration_s=20.0)
+    states, drove = own_states(6, ConstantVelocity(), config=config, every=1, hazards=True)
+    assert drove.ended == "collision"
+    lost = [each for each in states if all(np.isnan(agent.future).all() for agent in each.agents)]
+    assert lost
+    for labelled in lost:
+        speeds_ms = speeds(labelled.future)
+        assert labelled.future.shape == (64, 4)
+        assert np.diff(speeds_ms).max() < 0.1, "it never picks up speed"
+        assert present_speed(labelled.scene.history) > 5
+        assert speeds_ms[-1] == 0
+    assert len(states) > len(lost), "others can be saved"
+
+
+def test_the_expert_may_take_over_at_another_speed() -> None:
+    usual, others = (
+        own_states(SEED, ConstantVelocity(), config=CONFIG, every=2, speeds=other)[0]
+        for other in (False, True)
+    )
+    was = {each.scene.scene_id: present_speed(each.scene.history) for each in usual}
+    times = []
+    for labelled in others:
+        speed_ms = present_speed(labelled.scene.history)
+        assert abs(float(speeds(labelled.future)[0]) - speed_ms) < 1.0, "it goes on from that speed"
+        if (before_ms := was.get(labelled.scene.scene_id)) is not None:
+            times.append(speed_ms / before_ms)
+    assert len(times) > 2
+    assert 0.39 <= min(times) < max(times) <= 1.61
 
 
 def test_a_planner_that_is_not_told_the_tracks_is_no_teacher(
