@@ -319,15 +319,38 @@ def with_second_sketches(loaded: Loaded, *, seed: int = 0) -> Loaded:
     return _with_intents(loaded, replace(loaded.settings, second_sketch=True), seed)
 
 
+def with_fine_vision(loaded: Loaded, *, seed: int = 0) -> Loaded:
+    """A checkpoint with convolutions beside its tower, to be trained.
+
+    Args:
+        loaded: one with a resampler, and without them; it stays as it is.
+        seed: of the new weights.
+    """
+    settings = replace(loaded.settings, fine_vision=True)
+    model = _made(loaded, settings, seed)
+    assert model.resampler is not None
+    assert model.fine_vision is not None
+    model.resampler.fine_layer.hush()
+    model.fine_vision.expect_nobody()
+    model.load_state_dict(loaded.model.state_dict(), strict=False)
+    model.train(False)
+    return replace(loaded, model=model, inputs=InputBuilder(loaded.vocabulary, settings, loaded.visual_codes))
+
+
+def _made(loaded: Loaded, settings: VlaSettings, seed: int) -> LookTwiceVla:
+    """A network of other settings, all its weights new."""
+    config = with_settings(copy.deepcopy(loaded.model.config), settings, loaded.vocabulary)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return LookTwiceVla(config)
+
+
 def _with_intents(loaded: Loaded, settings: VlaSettings, seed: int) -> Loaded:
     """A checkpoint with more tokens of an intent, as many queries of its resampler, and its own weights."""
     more = settings.intent_tokens - loaded.settings.intent_tokens
     resampled = loaded.settings.scene_tokens
     wider = replace(settings, scene_tokens=resampled + more if resampled else 0)
-    config = with_settings(copy.deepcopy(loaded.model.config), wider, loaded.vocabulary)
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        model = LookTwiceVla(config)
+    model = _made(loaded, wider, seed)
     model.load_state_dict(loaded.model.state_dict(), strict=False)
     assert model.sketch_books is not None
     model.sketch_books.fill(loaded.codec)

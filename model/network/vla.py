@@ -17,6 +17,7 @@ from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 from looktwice.model.driving.trajectory import ROUTE_POINTS, FloatArray
 from looktwice.model.network.encoders import HistoryEncoder, RouteEncoder
 from looktwice.model.network.fact_reader import likely
+from looktwice.model.network.fine_vision import FineVision
 from looktwice.model.network.inputs import ModelInputs, Prompt, rotary_positions
 from looktwice.model.network.intent import SketchBooks, SketchCodes, TrackReader
 from looktwice.model.network.resampler import SceneResampler
@@ -82,26 +83,44 @@ class LookTwiceVla(Qwen2_5_VLForConditionalGeneration):  # type: ignore[no-untyp
         self.resampler = (
             SceneResampler(
                 hidden_size,
-                self.settings.vision_tokens,
+                self.settings.tower_tokens,
                 self.settings.scene_queries,
+                cameras=self.settings.cameras,
+                fine_tokens=self.settings.fine_tokens,
                 sketches=stages > 0,
                 second=second,
             )
             if self.settings.scene_tokens
             else None
         )
+        self.fine_vision = FineVision(hidden_size, self.settings) if self.settings.fine_vision else None
         self._fast_vision = attends_to_whole_pictures(config.vision_config)
         self.post_init()  # type: ignore[no-untyped-call]
 
-    def vision(self, patches: Tensor, grid_thw: Tensor, tower: nn.Module | None = None) -> Tensor:
+    def vision(
+        self,
+        patches: Tensor,
+        grid_thw: Tensor,
+        tower: nn.Module | None = None,
+        fine_vision: nn.Module | None = None,
+    ) -> Tensor:
         """Vision tokens [k, hidden] of clips, one after the other; independent of each other.
 
         Args:
             patches: [p, 1176], normalised floats as Qwen2.5-VL's processor makes them, or uint8, which
                 are normalised on the way (a quarter of the memory to move).
             grid_thw: int64 [clips, 3], slices, rows, columns of patches.
-            tower: a copy of the vision tower in another type, to be used in its place.
+            tower, fine_vision: copies of these parts in another type, to be used in their place.
         """
+        tokens = self.tower_tokens(patches, grid_thw, tower)
+        if self.fine_vision is None:
+            return tokens
+        fine = (fine_vision or self.fine_vision)(patches)
+        coarse = tokens.view(len(grid_thw), -1, tokens.shape[-1])
+        return torch.cat([coarse, fine.to(coarse.dtype)], dim=1).flatten(0, 1)
+
+    def tower_tokens(self, patches: Tensor, grid_thw: Tensor, tower: nn.Module | None = None) -> Tensor:
+        """Those of `vision` that the tower makes."""
         visual: Any = self.model.visual if tower is None else tower
         grids = set(map(tuple, grid_thw.tolist()))
         if self._fast_vision and len(grids) == 1 and not visual.gradient_checkpointing:
@@ -354,8 +373,9 @@ def is_vision(name: str) -> bool:
 
 
 def is_tower(name: str) -> bool:
-    """Whether a weight belongs to the vision tower; ``name`` as in `is_vision`."""
-    return ".visual." in f".{name}"
+    """Whether a weight belongs to the vision tower or what looks beside it; ``name`` as in `is_vision`."""
+    name = f".{name}"
+    return ".visual." in name or ".fine_vision." in name
 
 
 def is_planner(name: str) -> bool:

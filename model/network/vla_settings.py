@@ -14,6 +14,8 @@ from looktwice.model.families.trajectory_codes import CODES
 from looktwice.model.network.intent import INTENT_TOKENS
 from looktwice.model.network.second_sketch import VERDICT_TOKENS
 
+SPOTTED: Final = {"pedestrian": 4, "vehicle": 4, "obstacle": 3}
+"""How many of each kind the convolutions beside the tower tell of in a clip."""
 CONFIG_KEY: Final = "looktwice"
 """Where these settings lie in a checkpoint's ``config.json``."""
 
@@ -39,6 +41,7 @@ class VlaSettings:
             (`looktwice.model.network.intent`); 0 for none.
         second_sketch: whether the prompt also tells what else might be driven, and a verdict
             (`looktwice.model.network.second_sketch`).
+        fine_vision: whether convolutions look beside the tower (`looktwice.model.network.fine_vision`).
         scene_tokens: 0 where every vision token stands in the prompt, as in Qwen2.5-VL; otherwise a
             resampler brings those of all cameras down to so many.
         patch_size, temporal_patch_size, spatial_merge_size, tokens_per_second: as in the backbone's
@@ -56,6 +59,7 @@ class VlaSettings:
     with_tracks: bool = False
     sketch_tokens: int = 0
     second_sketch: bool = False
+    fine_vision: bool = False
     scene_tokens: int = 0
     patch_size: int = 14
     temporal_patch_size: int = 2
@@ -76,6 +80,11 @@ class VlaSettings:
             raise SettingsError(f"sketch_tokens must lie in 0..{CODES}, got {self.sketch_tokens}")
         if self.second_sketch and not self.sketch_tokens:
             raise SettingsError("a second sketch stands beside a first one: sketch_tokens must not be 0")
+        if self.fine_vision and (self.temporal_patch_size != CLIP_FRAMES or not self.scene_tokens):
+            raise SettingsError(
+                "convolutions beside the tower need whole clips as one slice, and a resampler: "
+                f"temporal_patch_size must be {CLIP_FRAMES}, and scene_tokens not 0"
+            )
         least = len(FACT_GROUPS) + self.intent_tokens
         if 0 < self.scene_tokens < least:
             raise SettingsError(
@@ -106,8 +115,18 @@ class VlaSettings:
 
     @property
     def vision_tokens(self) -> int:
-        """Vision tokens of all clips."""
+        """Vision tokens of all clips, those of convolutions among them."""
+        return len(self.cameras) * (self.clip_tokens + self.fine_tokens)
+
+    @property
+    def tower_tokens(self) -> int:
+        """Those of `vision_tokens` that the tower makes."""
         return len(self.cameras) * self.clip_tokens
+
+    @property
+    def fine_tokens(self) -> int:
+        """Tokens of one clip that convolutions make."""
+        return sum(SPOTTED.values()) if self.fine_vision else 0
 
     @property
     def intent_tokens(self) -> int:
@@ -145,6 +164,8 @@ class VlaSettings:
             del values["sketch_tokens"]
         if not self.second_sketch:
             del values["second_sketch"]
+        if not self.fine_vision:
+            del values["fine_vision"]
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     @classmethod

@@ -42,6 +42,15 @@ class FactSample(NamedTuple):
     facts: npt.NDArray[np.float32]
 
 
+class FactLook(NamedTuple):
+    """How an example is looked at: its mirror image, with its route, and with whose past."""
+
+    place: int
+    mirror: bool
+    route: bool
+    past: int
+
+
 class FactDataset(Dataset[FactSample]):
     """All examples, each time mirrored or not, with or without its route, with its past or not, by chance.
 
@@ -60,15 +69,22 @@ class FactDataset(Dataset[FactSample]):
         return len(self._examples)
 
     def __getitem__(self, index: int) -> FactSample:
+        return self.taken(self.chance(index))
+
+    def chance(self, index: int) -> FactLook:
+        """How to look at an example this time."""
         chance = self.random.random(3)
         mirror = self._vision.mirrored and bool(chance[0] < 0.5)
-        sample = self.look(index, mirror=mirror, route=bool(chance[1] < self._route_share))
-        if chance[2] >= OTHER_PAST_SHARE:
+        past = int(self.random.integers(len(self))) if chance[2] < OTHER_PAST_SHARE else index
+        return FactLook(index, mirror, bool(chance[1] < self._route_share), past)
+
+    def taken(self, look: FactLook) -> FactSample:
+        """One example, looked at so."""
+        sample = self.look(look.place, mirror=look.mirror, route=look.route)
+        if look.past == look.place:
             return sample
-        past = self._examples.history[self.random.integers(len(self))]
-        return sample._replace(
-            history=past, facts=np.where(NEEDS_OWN_SPEED, np.float32(np.nan), sample.facts)
-        )
+        facts = np.where(NEEDS_OWN_SPEED, np.float32(np.nan), sample.facts)
+        return sample._replace(history=self._examples.history[look.past], facts=facts)
 
     def look(self, index: int, *, mirror: bool, route: bool) -> FactSample:
         """One example as it is asked for."""

@@ -203,13 +203,16 @@ class GroundingLearner(nn.Module):
     def gather(
         self, patches: Tensor, history: Tensor, route: Tensor, has_route: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Vision tokens [b, v, hidden] and gathered tokens [b, queries, hidden] of scenes."""
+        """The tower's tokens [clips, v, hidden] and gathered tokens [b, queries, hidden] of scenes."""
         vla = self._vla[0]
         settings = vla.settings
         clips = len(history) * len(settings.cameras)
         tokens = vla.vision(patches, torch.tensor([settings.grid] * clips))
-        tokens = tokens.view(len(history), settings.vision_tokens, -1)
-        return tokens, self.resampler.gather(tokens, history, route, has_route)
+        gathered = self.resampler.gather(
+            tokens.view(len(history), settings.vision_tokens, -1), history, route, has_route
+        )
+        # Of each clip the tower's tokens come first.
+        return tokens.view(clips, -1, tokens.shape[-1])[:, : settings.clip_tokens], gathered
 
     def forward(
         self,
@@ -256,9 +259,9 @@ class GroundingLearner(nn.Module):
         }
 
     def _dense(self, tokens: Tensor, shape: torch.Size) -> Tensor:
-        """What every cell shows, [b, cameras, rows, columns, classes + 3], from tokens [b, v, hidden]."""
+        """What every cell shows, [b, cameras, rows, columns, classes + 3], from tokens [clips, v, hidden]."""
         batch, cameras = shape[:2]
-        grid = tokens.view(batch, cameras, self._slices, self._rows, self._columns, -1)
+        grid = tokens.reshape(batch, cameras, self._slices, self._rows, self._columns, -1)
         # The time slices of one place side by side.
         beside = grid.permute(0, 1, 3, 4, 2, 5).flatten(4)
         dense: Tensor = self.dense_head(beside).float()

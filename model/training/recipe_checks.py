@@ -63,6 +63,11 @@ def check_checkpoint(recipe: Recipe, loaded: Loaded) -> None:
 
 def check_vision(source: Path, loaded: Loaded, vision_source: Path, vision: Loaded) -> None:
     """Raise ValueError unless the decoder of one checkpoint can read what the other one sees."""
+    if loaded.settings.fine_vision and not vision.settings.fine_vision:
+        raise ValueError(
+            f"{source} has convolutions beside its tower and {vision_source} has none: "
+            "`looktwice train fine-vision` gives it some"
+        )
     if vision.settings.intent_tokens != loaded.settings.intent_tokens:
         raise ValueError(
             f"{source} has {loaded.settings.intent_tokens} tokens of an intent and {vision_source} "

@@ -26,7 +26,7 @@ from looktwice.model.families.vla_world.rewards import REWARDS as VLA_WORLD_REWA
 from looktwice.model.training.outcome.draw_rewards import RewardWeights
 from looktwice.model.training.response_targets import SectionWeights
 
-Goal = Literal["ground", "facts", "read", "judge", "respond", "outcome", "code"]
+Goal = Literal["ground", "fine", "facts", "read", "judge", "respond", "outcome", "code"]
 FeedbackWriter = Literal["teacher", "rule"]
 
 
@@ -91,10 +91,10 @@ class Recipe:
 
     Attributes:
         name: as the command line gives it.
-        goal: ``ground`` trains the vision tower alone, ``facts`` the reading of what a frozen tower sees,
-            ``read`` what to do about tracks or, with pictures, about what was gathered from them, ``judge``
-            what comes of trajectories, ``respond`` trains everything on responses, ``outcome`` on what comes
-            of own draws, ``code`` the codes of pictures alone.
+        goal: ``ground`` trains the vision tower alone, ``fine`` the convolutions beside a frozen one,
+            ``facts`` the reading of what is seen, ``read`` what to do about tracks or, with pictures, about
+            what was gathered from them, ``judge`` what comes of trajectories, ``respond`` trains everything
+            on responses, ``outcome`` on what comes of own draws, ``code`` the codes of pictures alone.
         pictures: whether responses are learned with pictures.
         tasks: share of the examples for each response format.
         route_share: share of the examples whose route is given.
@@ -227,6 +227,7 @@ NANO: Final[Mapping[str, Recipe]] = (
                 tracks_share=0.75,
             ),
             Recipe("ground", "ground", steps=6000, batch_size=24, learning_rate=1e-3, warmup_steps=200),
+            replace(_READ, name="fine-vision", goal="fine", steps=3000, batch_size=32),
             replace(_READ, name="read-facts", goal="facts", steps=2000, batch_size=64, learning_rate=3e-4),
             replace(_READ, name="read-tracks", pictures=False, steps=6000, batch_size=256),
             replace(_READ, name="read-scene", steps=4000, batch_size=64),

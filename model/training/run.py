@@ -31,6 +31,7 @@ from looktwice.model.network.checkpoint import (
     expand_stock,
     load,
     save,
+    with_fine_vision,
     with_formats,
     with_second_sketches,
     with_sketches,
@@ -55,6 +56,7 @@ from looktwice.model.training.critics import (
 from looktwice.model.training.dense import DENSE_SHAPE
 from looktwice.model.training.examples import Examples, load_examples
 from looktwice.model.training.fact_reading import FactDataset, FactLearner, reading_errors
+from looktwice.model.training.fine_looks import FineDataset, FineLearner
 from looktwice.model.training.grounding import (
     GroundingDataset,
     GroundingLearner,
@@ -202,6 +204,8 @@ def run(
     refining = [recipe.attempting] if failures is not None and recipe.attempting is not None else []
     if new := [task for task in (*recipe.tasks, *refining) if task not in loaded.settings.formats]:
         loaded = with_formats(loaded, new, seed=recipe.seed)
+    if recipe.goal == "fine" and not loaded.settings.fine_vision:
+        loaded = with_fine_vision(loaded, seed=recipe.seed)
     if recipe.goal == "judge" and not loaded.settings.second_sketch:
         loaded = with_second_sketches(loaded, seed=recipe.seed)
     if recipe.goal == "read" and not loaded.settings.sketch_tokens:
@@ -211,6 +215,8 @@ def run(
     stages = list(loaded.card.details.get("stages", []))
     if vision_source is not None:
         vision = load(vision_source)
+        if vision.settings.fine_vision and not loaded.settings.fine_vision:
+            loaded = with_fine_vision(loaded, seed=recipe.seed)
         check_vision(source, loaded, vision_source, vision)
         for mine, theirs in zip(vision_parts(loaded.model), vision_parts(vision.model), strict=True):
             mine.load_state_dict(theirs.state_dict())
@@ -312,8 +318,8 @@ def _workers(recipe: Recipe, settings: RunSettings) -> int:
 
 
 def vision_parts(vla: LookTwiceVla) -> list[nn.Module]:
-    """What stands between pictures and the decoder: the tower and, where there is one, the resampler."""
-    return [vla.model.visual, *([vla.resampler] if vla.resampler is not None else [])]
+    """What stands between pictures and the decoder: the tower and, where there are any, what is beside it."""
+    return [part for part in (vla.model.visual, vla.fine_vision, vla.resampler) if part is not None]
 
 
 def small_planners(vla: LookTwiceVla) -> list[IntentReader]:
@@ -361,16 +367,19 @@ def _prepare(
             examples,
             settings.cache,
             mirrored=recipe.mirror_share > 0,
+            fine=recipe.goal != "fine",
             bf16=settings.bf16,
             workers=settings.workers,
         )
-    if recipe.goal == "facts":
+    if recipe.goal in ("facts", "fine"):
         assert vision is not None, "facts are read from pictures"
         if not examples.pictured.any():
             raise ValueError(f"recipe {recipe.name} learns from pictures, and no scene has any")
-        reader = FactLearner(loaded.model)
         seen_facts = FactDataset(examples, vision, recipe.route_share, recipe.seed)
-        return reader, Subset(seen_facts, looked_at(examples)), None, stacked
+        if recipe.goal == "fine":
+            close = FineDataset(seen_facts, examples, loaded.inputs)
+            return FineLearner(loaded.model), Subset(close, looked_at(examples)), None, stacked
+        return FactLearner(loaded.model), Subset(seen_facts, looked_at(examples)), None, stacked
     if recipe.goal == "judge":
         assert vision is not None, "facts are read from pictures"
         assert judged is not None, "critics learn from followed trajectories"

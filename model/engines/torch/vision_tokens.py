@@ -55,8 +55,10 @@ class VisionEncoder:
         self._loaded, self._frames, self._one_by_one = loaded, frames, one_by_one
         self._clips = ClipCache(clip_bytes)
         model: Any = loaded.model
-        tower = model.model.visual
-        self._tower = tower if products is None else copy.deepcopy(tower).to(products)
+        parts = model.model.visual, model.fine_vision
+        self._tower, self._fine_vision = (
+            part if products is None or part is None else copy.deepcopy(part).to(products) for part in parts
+        )
 
     def encode(self, scenes: Sequence[Scene]) -> list[Encoded | Exception]:
         """Encode the pictures of scenes together.
@@ -108,6 +110,7 @@ class VisionEncoder:
                 torch.from_numpy(np.concatenate(every[first : first + at_once])).to(loaded.model.device),
                 grid,
                 self._tower,
+                self._fine_vision,
             )
             for first in range(0, len(every), at_once)
         ]

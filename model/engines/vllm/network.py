@@ -26,6 +26,7 @@ from vllm.multimodal.processing import (
 
 from looktwice.model.engines.vllm.items import CLIPS, PLACEHOLDERS, kinds_of
 from looktwice.model.network.encoders import HistoryEncoder, RouteEncoder
+from looktwice.model.network.fine_vision import FineVision
 from looktwice.model.network.intent import SketchBooks, SketchCodes, TrackReader
 from looktwice.model.network.resampler import SceneResampler
 from looktwice.model.network.vision import normalised
@@ -144,11 +145,15 @@ class LookTwiceForVllm(Qwen2_5_VLForConditionalGeneration):
                 self.route_encoder = RouteEncoder(hidden_size)
             if settings.with_tracks:
                 self.track_reader = TrackReader(hidden_size, sketches=stages > 0, second=second)
+            if settings.fine_vision:
+                self.fine_vision = FineVision(hidden_size, settings)
             if settings.scene_tokens:
                 self.resampler = SceneResampler(
                     hidden_size,
-                    settings.vision_tokens,
+                    settings.tower_tokens,
                     settings.scene_queries,
+                    cameras=settings.cameras,
+                    fine_tokens=settings.fine_tokens,
                     sketches=stages > 0,
                     second=second,
                 )
@@ -195,4 +200,7 @@ class LookTwiceForVllm(Qwen2_5_VLForConditionalGeneration):
         """Vision tokens [clips, tokens, hidden] from uint8 patches [clips x p, width]."""
         values = normalised(patches.to(self.visual.device)).to(self.visual.dtype)
         tokens: Tensor = self.visual(values, grid_thw=[list(self.settings.grid)] * clips)
-        return tokens.view(clips, -1, tokens.shape[-1])
+        tokens = tokens.view(clips, -1, tokens.shape[-1])
+        if not self.settings.fine_vision:
+            return tokens
+        return torch.cat([tokens, self.fine_vision(values).to(tokens.dtype)], dim=1)

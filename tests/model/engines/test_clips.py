@@ -51,9 +51,9 @@ def test_pictures_seen_lately_are_not_encoded_again(
         runner.begin_prompts([PromptRequest(scene, "cf_vla", 0)])
         slices, vision = [], loaded.model.vision
 
-        def looking(pixels: Any, grid: Any, tower: Any) -> Any:
+        def looking(pixels: Any, grid: Any, *copies: Any) -> Any:
             slices.extend(grid)
-            return vision(pixels, grid, tower)
+            return vision(pixels, grid, *copies)
 
         monkeypatch.setattr(loaded.model, "vision", looking)
         runner.begin_prompts([PromptRequest(shown(scene), "cf_vla", 1)])

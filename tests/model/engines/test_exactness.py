@@ -173,7 +173,8 @@ made_up: st.SearchStrategy[Families] = st.one_of(
 def exact(
     request: pytest.FixtureRequest, toy_family: None, tmp_path_factory: pytest.TempPathFactory
 ) -> Loaded:
-    settings = NANO_SETTINGS if request.param == "resampled" else VlaSettings()
+    resampled = replace(NANO_SETTINGS, fine_vision=True)
+    settings = resampled if request.param == "resampled" else VlaSettings()
     settings = replace(settings, formats=NAMES, reflection="phrases")
     folder = CHECKPOINT or write_untrained(
         tmp_path_factory.mktemp("narrow") / "untrained", narrow=True, settings=settings

@@ -9,7 +9,7 @@ import torch
 
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE, NO_PICTURE
 from looktwice.model.families.cf_vla.targets import PAPER_WEIGHTS
-from looktwice.model.network.checkpoint import Loaded, load
+from looktwice.model.network.checkpoint import Loaded, load, with_fine_vision
 from looktwice.model.network.patches import patchify
 from looktwice.model.training.batches import collate
 from looktwice.model.training.examples import Examples, example_frames
@@ -90,7 +90,7 @@ def test_a_killed_cache_goes_on_where_it_was(loaded: Loaded, tmp_path: Path) -> 
     assert done == [1, 2, 3, 4], "an episode that is there is not worked out again"
     more = Examples.concatenate([OTHERS, EXAMPLES])
     joined = open_examples(more)
-    assert done == [1, 2, 3, 4, 1], "others that are added cost what they add"
+    assert done == [1, 2, 3, 4, 5], "others that are added cost what they add"
     for index in range(len(EXAMPLES)):
         np.testing.assert_array_equal(joined.tokens(len(OTHERS) + index, False), whole.tokens(index, False))
 
@@ -102,6 +102,21 @@ def test_another_tower_has_another_cache(loaded: Loaded, resampling_checkpoint: 
     first = open_vision(loaded, EXAMPLES, tmp_path, mirrored=False)
     second = open_vision(other, EXAMPLES, tmp_path, mirrored=False)
     assert not np.array_equal(first.tokens(0, False), second.tokens(0, False))
+
+
+def test_convolutions_beside_the_tower_have_files_of_their_own(loaded: Loaded, tmp_path: Path) -> None:
+    first, second = (with_fine_vision(loaded, seed=seed) for seed in range(2))
+    open_vision(loaded, EXAMPLES, tmp_path, mirrored=False)
+    of_tower = set(tmp_path.iterdir())
+    caches = [open_vision(each, EXAMPLES, tmp_path, mirrored=False) for each in (first, second)]
+    assert len(set(tmp_path.iterdir()) - of_tower) == 2 * len(of_tower), (
+        "the tower's are not worked out again"
+    )
+    for cache, checkpoint in zip(caches, (first, second), strict=True):
+        expected = seen_now(checkpoint, 1, False).numpy()
+        np.testing.assert_allclose(cache.tokens(1, False), expected, atol=2e-3, rtol=2e-3)
+    tower_alone = open_vision(first, EXAMPLES, tmp_path, mirrored=False, fine=False)
+    assert len(tower_alone.tokens(1, False)) == 2 * loaded.settings.clip_tokens
 
 
 def test_other_pictures_under_the_same_names_have_another_cache(loaded: Loaded, tmp_path: Path) -> None:
@@ -138,4 +153,4 @@ def test_learning_from_the_cache_is_learning_from_the_pictures(loaded: Loaded) -
         with torch.no_grad():
             return float(learner(**collate([data[item] for item in items]))["loss"])
 
-    assert loss(VisionCache([tokens.astype(np.float16)])) == pytest.approx(loss(None), rel=1e-3)
+    assert loss(VisionCache([[tokens.astype(np.float16)]], cameras=2)) == pytest.approx(loss(None), rel=1e-3)

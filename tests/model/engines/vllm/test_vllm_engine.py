@@ -148,7 +148,8 @@ def test_both_engines_write_the_same_with_a_resampler_and_tracks(
     loop: asyncio.AbstractEventLoop, tmp_path: Path
 ) -> None:
     """With and without tracks and a route, free text told live; vLLM ends before others use the cores."""
-    checkpoint = write_untrained(tmp_path / "free", settings=replace(NANO_SETTINGS, reflection="free_text"))
+    nano = replace(NANO_SETTINGS, reflection="free_text", fine_vision=True)
+    checkpoint = write_untrained(tmp_path / "free", settings=nano)
     arguments = {"enforce_eager": True, "block_size": 32}
     settings = VllmSettings(rows=8, dtype="float32", arguments=arguments)
     theirs = VllmEngine(checkpoint, settings)
