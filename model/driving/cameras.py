@@ -58,12 +58,16 @@ class CameraSpec:
 
     def unproject(self, column: Any, row: Any, depth: Any) -> npt.NDArray[np.float64]:
         """Points [..., 3] in the ego frame seen at pixel positions with metric ``depth``."""
-        left = (self.width / 2 - column) / self.focal_px * depth
         up = (self.horizon * self.height - row) / self.focal_px * depth
+        return np.stack([*self.from_above(column, depth), up + self.up_m], axis=-1)
+
+    def from_above(self, column: Any, depth: Any) -> tuple[Any, Any]:
+        """x and y in the ego frame of what a column shows at metric ``depth``: numbers, arrays or tensors."""
+        left = (self.width / 2 - column) / self.focal_px * depth
         turn = math.radians(self.heading_degrees)
         x = depth * math.cos(turn) - left * math.sin(turn) + self.forward_m
         y = depth * math.sin(turn) + left * math.cos(turn) + self.left_m
-        return np.stack([x, y, up + self.up_m], axis=-1)
+        return x, y
 
 
 FRONT_CAMERAS: Final = (

@@ -7,7 +7,6 @@ gather stands in the prompt instead (a perceiver resampler, https://arxiv.org/ab
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -138,14 +137,12 @@ class SpottedReader(nn.Module):
         told, there = tokens[..., : len(TOLD)], tokens[..., len(TOLD) :][..., : self.seen.in_features]
         likely, _, away_log, across, _ = told.unbind(-1)
         away_m = away_log.clamp(0, _FARTHEST_LOG).expm1()
-        ahead, left = [], []
-        for camera, spec in enumerate(self._specs):
-            beside_m = -across[:, camera] * math.tan(math.radians(spec.hfov_degrees) / 2) * away_m[:, camera]
-            turn = math.radians(spec.heading_degrees)
-            ahead.append(away_m[:, camera] * math.cos(turn) - beside_m * math.sin(turn) + spec.forward_m)
-            left.append(away_m[:, camera] * math.sin(turn) + beside_m * math.cos(turn) + spec.left_m)
-        left_m = torch.stack(left, dim=1).clamp(-_WIDE_M, _WIDE_M)
-        at = torch.stack([torch.stack(ahead, dim=1) / _AHEAD_M, left_m / _BESIDE_M], dim=-1)
+        places = [
+            spec.from_above(spec.width / 2 * (1 + across[:, camera]), away_m[:, camera])
+            for camera, spec in enumerate(self._specs)
+        ]
+        ahead_m, left_m = (torch.stack(part, dim=1) for part in zip(*places, strict=True))
+        at = torch.stack([ahead_m / _AHEAD_M, left_m.clamp(-_WIDE_M, _WIDE_M) / _BESIDE_M], dim=-1)
         numbers = torch.cat([told, at], dim=-1) * likely[..., None]
         made: Tensor = self.told(numbers) + self.seen(there) + self.places
         return made.flatten(1, 2)

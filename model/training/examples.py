@@ -256,15 +256,19 @@ def _fill_cache(file: Path, cached: Path, cameras: tuple[str, ...]) -> None:
 
 
 def example_frames(
-    examples: Examples, index: int, mirror: bool, inputs: InputBuilder
+    examples: Examples, index: int, mirror: bool, inputs: InputBuilder, latest: int = CLIP_FRAMES
 ) -> npt.NDArray[np.uint8]:
-    """An example's pictures in the network's size, uint8 [cameras x 4, h, w, 3], or their mirror images."""
+    """An example's pictures in the network's size, or their mirror images.
+
+    Returns:
+        uint8 [cameras x ``latest``, h, w, 3], the oldest first.
+    """
     cameras, count = examples.picture_spans.shape[1:3]
     frames = np.stack(
         [
             inputs.frame(examples.picture(index, camera, number))
             for camera in range(cameras)
-            for number in range(count)
+            for number in range(count - latest, count)
         ]
     )
     return np.ascontiguousarray(frames[:, :, ::-1]) if mirror else frames

@@ -22,7 +22,7 @@ from looktwice.model.network.fine_vision import STRIDE
 from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.network.vla_settings import SPOTTED, VlaSettings
-from looktwice.model.training.examples import Examples
+from looktwice.model.training.examples import Examples, example_frames
 from looktwice.model.training.fact_reading import FactDataset
 from looktwice.model.training.grounding import LIGHT_SHARE, fact_loss, fact_weights, in_other_light
 
@@ -84,17 +84,9 @@ class FineDataset(Dataset[FineSample]):
         look = self._facts.chance(index)
         facts = self._facts.taken(look)
         settings, examples = self._inputs.settings, self._examples
-        frames = np.stack(
-            [
-                self._inputs.frame(examples.picture(index, camera, number))
-                for camera in range(len(settings.cameras))
-                for number in (-2, -1)
-            ]
-        )
+        frames = example_frames(examples, index, look.mirror, self._inputs, latest=2)
         if self._facts.random.random() < LIGHT_SHARE:
             frames = in_other_light(frames, self._facts.random)
-        if look.mirror:
-            frames = frames[:, :, ::-1]
         pictures = frames.reshape(len(settings.cameras), 2, *frames.shape[1:]).transpose(0, 1, 4, 2, 3)
         marked_so = marked(examples.perception(index), settings, mirror=look.mirror)
         return FineSample(

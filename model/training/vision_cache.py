@@ -99,12 +99,12 @@ def open_vision(
     changes = np.diff(examples.episode) | np.diff(pictured)
     ends = [*np.flatnonzero(changes) + 1, len(examples)]
     episodes = [range(start, end) for start, end in zip([0, *ends], ends, strict=False)]
-    seen = [places for places in episodes if pictured[places.start]]
+    shown = {places: _digest(examples, places) for places in episodes if pictured[places.start]}
     looks = _looks(loaded, fine=fine)
     paths = [
         {
-            places: folder / f"vision-{_key(look.name, examples, places, mirrored=mirrored)}.npy"
-            for places in seen
+            places: folder / f"vision-{hash_of(_VERSION, mirrored, look.name, digest)}.npy"
+            for places, digest in shown.items()
         }
         for look in looks
     ]
@@ -198,10 +198,11 @@ def _named(loaded: Loaded, part: nn.Module) -> str:
     return hash_of(loaded.settings.cameras, loaded.settings.grid, *numbers)
 
 
-def _key(look: str, examples: Examples, places: range, *, mirrored: bool) -> str:
+def _digest(examples: Examples, places: range) -> bytes:
+    """Tells the pictures of some examples apart from others."""
     # Not by the names of scenes: two folders may have scenes of one name, with other pictures.
     spans = examples.picture_spans[places.start : places.stop].reshape(-1, 2)
     pictures = hashlib.sha256()
     for first, last in spans.tolist():
         pictures.update((last - first).to_bytes(8, "big") + examples.pictures[first:last].data)
-    return hash_of(_VERSION, mirrored, look, pictures.digest())
+    return pictures.digest()
