@@ -47,14 +47,18 @@ class CameraSpec:
 
     def project(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
         """Column, row and depth [n, 3] of points [n, 3] in the ego frame; rows count downwards."""
-        turn = math.radians(self.heading_degrees)
-        moved = np.asarray(points, np.float64) - [self.forward_m, self.left_m, self.up_m]
-        depth = moved[:, 0] * math.cos(turn) + moved[:, 1] * math.sin(turn)
-        left = -moved[:, 0] * math.sin(turn) + moved[:, 1] * math.cos(turn)
+        x, y, z = np.asarray(points, np.float64).T
+        depth, left = self.depth_and_left(x, y)
         with np.errstate(divide="ignore", invalid="ignore"):
             column = self.width / 2 - self.focal_px * left / depth
-            row = self.horizon * self.height - self.focal_px * moved[:, 2] / depth
+            row = self.horizon * self.height - self.focal_px * (z - self.up_m) / depth
         return np.stack([column, row, depth], axis=1)
+
+    def depth_and_left(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """How far x and y of the ego frame lie along the view and to its left: numbers, arrays or tensors."""
+        turn = math.radians(self.heading_degrees)
+        x, y = x - self.forward_m, y - self.left_m
+        return x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn)
 
     def unproject(self, column: Any, row: Any, depth: Any) -> npt.NDArray[np.float64]:
         """Points [..., 3] in the ego frame seen at pixel positions with metric ``depth``."""

@@ -77,7 +77,7 @@ _SIGNED: Final[npt.NDArray[np.bool_]] = np.array(
 
 
 NEEDS_OWN_SPEED: Final[npt.NDArray[np.bool_]] = np.array(
-    [name.endswith(("_speed", "standing", "braking")) for name in FACTS]
+    [name.endswith(("_speed", "_speed_left", "standing", "braking")) for name in FACTS]
 )
 """Which facts pictures tell only to who knows how fast the car itself is: the others do not depend on it."""
 TELLS_OF_OBJECT: Final[npt.NDArray[np.bool_]] = np.array(

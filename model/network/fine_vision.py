@@ -8,12 +8,14 @@ picture of a clip, and at how it differs from the one before.
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from looktwice.model.network.matching import Matched, Matching
 from looktwice.model.network.patches import PIXEL_MEAN, PIXEL_STD
 from looktwice.model.network.vla_settings import SPOTTED, VlaSettings
 
@@ -31,10 +33,19 @@ _LAYERS: Final = (
 )
 """Channels, stride and size of each convolution."""
 _GROUPS: Final = 8
-TOLD: Final = ("likely", "logit", "away_log", "across", "down")
+TOLD: Final = (
+    *("likely", "logit", "away_log", "across", "down", "came", "sure"),
+    *("nearer_log", "grown_log", "grown_sure"),
+)
 """What the first numbers of a token tell: how likely somebody is there, the same as a logit, log(1 + metres)
-to them, and where in the picture, from -1 to 1."""
+to them, where in the picture, from -1 to 1, how much farther to the right they were in the picture before, on
+the same scale, and how likely that is; the logarithm of how much farther away they were, and the same from
+how much narrower they were found, and how likely that is."""
 _LOGITS: Final = 5.0
+_NARROWEST: Final = 2 / STRIDE
+_WIDEST: Final = 10.0
+_NEARER: Final = 2.0
+"""Nobody comes nearer or goes farther away by this between two pictures."""
 _NOBODY: Final = -20.0
 _RARELY: Final = -4.0
 
@@ -45,17 +56,29 @@ def channels_of(hidden_size: int) -> int:
 
 
 class Found(NamedTuple):
-    """What is found at every place of pictures.
+    """What is found in k clips, and the n that are likeliest to be there.
 
     Attributes:
-        logits: [k, kinds, rows, columns], whether one of each kind of `SPOTTED` stands there.
+        logits: [k, kinds, rows, columns], whether one of each kind of `SPOTTED` stands at each place.
         away_log: [k, rows, columns], log(1 + metres) to whom stands there.
-        shift: [k, rows, columns], how far beside the middle of the place they are, in places.
+        shift: [k, rows, columns], how far to the right of the middle of the place they are, in places.
+        half_log: [k, rows, columns], log of half their width, in places.
+        nearer_log: [k, rows, columns], log of how much farther away they were in the picture before.
+        features: [k, channels, rows, columns], what is seen there.
+        spotted: int64 [k, n], the places of the likeliest.
+        spotted_logits: [k, n], of their kind.
+        matched: [k, 3 x n], of the left side, the middle and the right side of each.
     """
 
     logits: Tensor
     away_log: Tensor
     shift: Tensor
+    half_log: Tensor
+    nearer_log: Tensor
+    features: Tensor
+    spotted: Tensor
+    spotted_logits: Tensor
+    matched: Matched
 
 
 class FineVision(nn.Module):
@@ -80,7 +103,8 @@ class FineVision(nn.Module):
             ]
             before = channels
         self.layers = nn.Sequential(*layers)
-        self.head = nn.Conv2d(before, len(SPOTTED) + 2, 1)
+        self.head = nn.Conv2d(before, len(SPOTTED) + 4, 1)
+        self.matching = Matching()
 
     @torch.no_grad()
     def expect_nobody(self) -> None:
@@ -103,53 +127,90 @@ class FineVision(nn.Module):
         shown = whole[..., -2:, :, :].permute(0, 6, 5, 1, 3, 7, 2, 4, 8)
         return shown.reshape(len(whole), 2, 3, rows * patch, columns * patch)
 
-    def changing(self, pictures: Tensor) -> Tensor:
-        """The latest picture and how it differs from the one before, [k, 6, h, w].
+    def find(self, pictures: Tensor) -> Found:
+        """Who stands where in pictures [k, 2, 3, h, w], normalised floats, or uint8 as they are.
 
-        Args:
-            pictures: [k, 2, 3, h, w], normalised floats, or uint8 as they are.
+        Of each kind so many are spotted as `SPOTTED` says, the likeliest first; none beside a likelier one.
         """
         if pictures.dtype == torch.uint8:
             mean, std = (
                 torch.tensor(part, device=pictures.device).view(3, 1, 1) for part in (PIXEL_MEAN, PIXEL_STD)
             )
             pictures = (pictures / 255 - mean) / std
-        before, latest = pictures.to(self.head.weight.dtype).unbind(1)
-        return torch.cat([latest, latest - before], dim=1)
-
-    def features(self, pictures: Tensor) -> Tensor:
-        """What every place of pictures [k, 6, h, w] shows: [k, channels, h / 16, w / 16], rounded up."""
-        found: Tensor = self.layers(pictures.contiguous(memory_format=torch.channels_last))
-        return found
-
-    def find(self, features: Tensor) -> Found:
-        """Who stands at each place of `features`."""
+        pictures = pictures.to(self.head.weight.dtype)
+        before, latest = pictures.unbind(1)
+        changing = torch.cat([latest, latest - before], dim=1)
+        features = self.layers(changing.contiguous(memory_format=torch.channels_last))
         found = self.head(features)
-        return Found(found[:, : len(SPOTTED)], found[:, -2], found[:, -1])
-
-    def spotted(self, features: Tensor, found: Found) -> Tensor:
-        """Tokens [k, `VlaSettings.fine_tokens`, hidden] of those that are likeliest to be there.
-
-        Of each kind so many as `SPOTTED` says, the likeliest first; none beside a likelier one. A token tells
-        `TOLD`, then what is seen there, the less the less likely anybody is; the rest is zero.
-        """
-        rows, columns = found.away_log.shape[-2:]
-        logits = found.logits
+        logits = found[:, : len(SPOTTED)]
+        away_log, shift, half_log, nearer_log = found[:, len(SPOTTED) :].unbind(1)
         peaks = torch.where(F.max_pool2d(logits, 3, 1, 1) == logits, logits, _NOBODY).flatten(2)
         best = [peaks[:, kind].topk(count) for kind, count in enumerate(SPOTTED.values())]
-        logit = torch.cat([each.values for each in best], dim=1)  # [k, n]
         place = torch.cat([each.indices for each in best], dim=1)
-        away_log, shift = (part.flatten(1).gather(1, place) for part in (found.away_log, found.shift))
-        across = 2 * (place % columns + 0.5 + shift) / columns - 1
-        down = 2 * (place // columns + 0.5).to(across.dtype) / rows - 1
-        likely = logit.sigmoid()
-        told = torch.stack([likely, logit / _LOGITS, away_log, across, down], dim=-1)
-        every = features.flatten(2).transpose(1, 2)
-        there = every.gather(1, place[..., None].expand(-1, -1, every.shape[2])) * likely[..., None]
-        tokens = torch.cat([told, there.to(told.dtype)], dim=-1)
+        column, row = _middle(place, shift)
+        half = half_of(half_log.flatten(1).gather(1, place))
+        columns = torch.stack([column - half, column, column + half], dim=-1).detach()
+        rows = row[..., None].expand(columns.shape)
+        return Found(
+            logits,
+            away_log,
+            shift,
+            half_log,
+            nearer_log,
+            features,
+            place,
+            torch.cat([each.values for each in best], dim=1),
+            self.matching(pictures, STRIDE * columns.flatten(1), STRIDE * rows.flatten(1)),
+        )
+
+    def tokens(self, found: Found) -> Tensor:
+        """Tokens [k, `VlaSettings.fine_tokens`, hidden] of those that are spotted.
+
+        A token tells `TOLD`, then what is seen there, the less the less likely anybody is; the rest is zero.
+        """
+        rows, columns = found.away_log.shape[-2:]
+        column, row = _middle(found.spotted, found.shift)
+        away_log, half_log, nearer_log = (
+            part.flatten(1).gather(1, found.spotted)
+            for part in (found.away_log, found.half_log, found.nearer_log)
+        )
+        likely = found.spotted_logits.sigmoid()
+        came_px, sure = (part.view(*likely.shape, 3) for part in found.matched.came_px())
+        came, half = came_px / STRIDE, half_of(half_log)
+        # Who was narrower in the picture before was farther away.
+        half_before = (half + (came[..., 2] - came[..., 0]) / 2).clamp(half / _NEARER, half * _NEARER)
+        told = torch.stack(
+            [
+                likely,
+                found.spotted_logits / _LOGITS,
+                away_log,
+                2 * column / columns - 1,
+                2 * row / rows - 1,
+                2 * came[..., 1] / columns,
+                sure[..., 1],
+                nearer_log,
+                (half / half_before).log(),
+                sure[..., 0] * sure[..., 2],
+            ],
+            dim=-1,
+        )
+        every = found.features.flatten(2).transpose(1, 2)
+        there = every.gather(1, found.spotted[..., None].expand(-1, -1, every.shape[2]))
+        tokens = torch.cat([told, there * likely[..., None]], dim=-1)
         return F.pad(tokens, (0, self._hidden_size - tokens.shape[-1]))
 
     def forward(self, patches: Tensor) -> Tensor:
         """Tokens [clips, `VlaSettings.fine_tokens`, hidden] of patches as in `pictures`."""
-        features = self.features(self.changing(self.pictures(patches)))
-        return self.spotted(features, self.find(features))
+        return self.tokens(self.find(self.pictures(patches)))
+
+
+def half_of(half_log: Tensor) -> Tensor:
+    """Half a width, in places, of its logarithm."""
+    return half_log.clamp(math.log(_NARROWEST), math.log(_WIDEST)).exp()
+
+
+def _middle(place: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+    """Column and row [k, n] of those at places [k, n], counted in places."""
+    columns = shift.shape[-1]
+    beside = shift.flatten(1).gather(1, place)
+    return place % columns + 0.5 + beside, (place // columns + 0.5).to(beside.dtype)

@@ -8,28 +8,44 @@ gather stands in the prompt instead (a perceiver resampler, https://arxiv.org/ab
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from looktwice.model.driving.cameras import CAMERA_SPECS
-from looktwice.model.driving.facts import FACT_GROUPS, FACTS, WALKER_FIELDS
+from looktwice.model.driving.cameras import CAMERA_SPECS, CameraSpec
+from looktwice.model.driving.facts import (
+    FACT_GROUPS,
+    FACTS,
+    SPEED_SCALE_MS,
+    WALKER_FIELDS,
+    WALKER_SPEED_SCALE_MS,
+)
+from looktwice.model.driving.scene import CLIP_PERIOD_S
+from looktwice.model.driving.trajectory import STEP_S
 from looktwice.model.network.encoders import HistoryEncoder, RouteEncoder
 from looktwice.model.network.fact_reader import FactReader, likely, weighed
 from looktwice.model.network.fine_vision import TOLD, channels_of
 from looktwice.model.network.intent import IntentReader, SketchCodes
+from looktwice.model.network.route_line import RouteLine
 from looktwice.model.network.second_sketch import Known
 
 _HEADS: Final = 4
 _LAYERS: Final = 2
 _EPSILON: Final = 1e-6
 _FARTHEST_LOG: Final = 5.0
+_NEARER_LOG: Final = 2.0
 _AHEAD_M: Final = 20.0
 _BESIDE_M: Final = 3.0
 _WIDE_M: Final = 30.0
 """Scales of where those are who are spotted, and how far to a side they are told."""
+_FASTEST_MS: Final = 30.0
+_ROUGH_MS: Final = 0.5
+"""A speed that may be off by so much is told as half as fast."""
+_OF_ROUTE: Final = ("along", "beside")
+PICTURE_BEFORE: Final = -1 - round(CLIP_PERIOD_S / STEP_S)
+"""The row of a history where the ego was when the picture before the latest was taken."""
 _PEOPLE: Final = FACT_GROUPS.index(WALKER_FIELDS)
 """The first query of those who walk; the last one is before that of the `_ROAD`."""
 _ROAD: Final = len(FACT_GROUPS) - 1
@@ -70,6 +86,7 @@ class SceneResampler(nn.Module):
         self.layers = nn.ModuleList(CrossLayer(hidden_size) for _ in range(_LAYERS))
         if fine_tokens:
             self.spotted = SpottedReader(hidden_size, cameras, fine_tokens)
+            self.people_layers = nn.ModuleList(CrossLayer(hidden_size) for _ in range(_LAYERS))
             self.fine_layer = CrossLayer(hidden_size)
         self.norm = nn.RMSNorm(hidden_size, eps=_EPSILON)
         self.facts = FactReader(hidden_size)
@@ -109,15 +126,19 @@ class SceneResampler(nn.Module):
         for layer in self.layers:
             x = layer(x, seen)
         if self._fine_tokens:
+            spotted = self.spotted(of_clips[:, :, of_tower:], history, route, has_route)
             # What the tower tells of people fits the scenes that it was learned in, and few others.
-            x = torch.cat([x[:, :_PEOPLE], alone[:, _PEOPLE:_ROAD], x[:, _ROAD:]], dim=1)
-            x = self.fine_layer(x, self.spotted(of_clips[:, :, of_tower:]))
+            people = alone[:, _PEOPLE:_ROAD]
+            for layer in self.people_layers:
+                people = layer(people, spotted)
+            x = self.fine_layer(x, spotted)
+            x = torch.cat([x[:, :_PEOPLE], people, x[:, _ROAD:]], dim=1)
         gathered: Tensor = self.norm(x)
         return gathered
 
 
 class SpottedReader(nn.Module):
-    """Whom convolutions spotted, told with where they are in the ego's frame.
+    """Whom convolutions spotted, told with where they are, and how they move.
 
     Args:
         hidden_size: of tokens.
@@ -129,23 +150,85 @@ class SpottedReader(nn.Module):
         super().__init__()
         self._specs = [CAMERA_SPECS[camera] for camera in cameras]
         self.places = nn.Parameter(0.02 * torch.randn(len(cameras), fine_tokens, hidden_size))
-        self.told = nn.Linear(len(TOLD) + 2, hidden_size)
+        self.told = nn.Linear(len(TOLD) + len(Spotted._fields) + len(_OF_ROUTE), hidden_size)
         self.seen = nn.Linear(channels_of(hidden_size), hidden_size)
 
-    def forward(self, tokens: Tensor) -> Tensor:
-        """[b, cameras x n, hidden] of tokens [b, cameras, n, hidden] of `FineVision`."""
-        told, there = tokens[..., : len(TOLD)], tokens[..., len(TOLD) :][..., : self.seen.in_features]
-        likely, _, away_log, across, _ = told.unbind(-1)
-        away_m = away_log.clamp(0, _FARTHEST_LOG).expm1()
-        places = [
-            spec.from_above(spec.width / 2 * (1 + across[:, camera]), away_m[:, camera])
-            for camera, spec in enumerate(self._specs)
-        ]
-        ahead_m, left_m = (torch.stack(part, dim=1) for part in zip(*places, strict=True))
-        at = torch.stack([ahead_m / _AHEAD_M, left_m.clamp(-_WIDE_M, _WIDE_M) / _BESIDE_M], dim=-1)
-        numbers = torch.cat([told, at], dim=-1) * likely[..., None]
-        made: Tensor = self.told(numbers) + self.seen(there) + self.places
+    def forward(self, tokens: Tensor, history: Tensor, route: Tensor, has_route: Tensor) -> Tensor:
+        """[b, cameras x n, hidden] of tokens [b, cameras, n, hidden] of `FineVision`.
+
+        ``history`` [b, 16, 4], ``route`` [b, 20, 2] and ``has_route`` [b] as in `SceneResampler.gather`.
+        """
+        told, there = tokens[..., : len(TOLD)].float(), tokens[..., len(TOLD) :][..., : self.seen.in_features]
+        ego_before = history[:, None, PICTURE_BEFORE].float()  # for all tokens of a camera
+        of_cameras = [placed(spec, told[:, camera], ego_before) for camera, spec in enumerate(self._specs)]
+        at = Spotted(*(torch.stack(parts, dim=1) for parts in zip(*of_cameras, strict=True)))
+        places_m = torch.stack([at.ahead_m, at.left_m], dim=-1).flatten(1, 2)
+        along_m, beside_m, _ = RouteLine.of(route, has_route).places(places_m)
+        of_route = torch.stack([along_m / _AHEAD_M, beside_m.clamp(-_WIDE_M, _WIDE_M) / _BESIDE_M], dim=-1)
+        of_route = (of_route * has_route[:, None, None]).view(*told.shape[:-1], len(_OF_ROUTE))
+        numbers = torch.cat([told, at.scaled(), of_route], dim=-1) * told[..., :1]
+        made: Tensor = self.told(numbers.to(there.dtype)) + self.seen(there) + self.places
         return made.flatten(1, 2)
+
+
+class Spotted(NamedTuple):
+    """Who is spotted, in the ego's frame, [..., n] each.
+
+    Attributes:
+        ahead_m, left_m: where they are.
+        left_ms: how fast they cross, the less the less sure that is: a pixel is more metres farther away.
+        ahead_ms: how fast they drive ahead, over the ground.
+    """
+
+    ahead_m: Tensor
+    left_m: Tensor
+    left_ms: Tensor
+    ahead_ms: Tensor
+
+    def scaled(self) -> Tensor:
+        """All of it, of order one, [..., n, 4]."""
+        left_m = self.left_m.clamp(-_WIDE_M, _WIDE_M)
+        left_ms, ahead_ms = (each.clamp(-_FASTEST_MS, _FASTEST_MS) for each in (self.left_ms, self.ahead_ms))
+        parts = (
+            self.ahead_m / _AHEAD_M,
+            left_m / _BESIDE_M,
+            left_ms / WALKER_SPEED_SCALE_MS,
+            ahead_ms / SPEED_SCALE_MS,
+        )
+        return torch.stack(parts, dim=-1)
+
+
+def placed(spec: CameraSpec, told: Tensor, ego_before: Tensor) -> Spotted:
+    """Where those are whom one camera tells of, and how they move.
+
+    How fast they cross: from where they were in the picture before, and where they would have been had they
+    not moved. How fast they drive: from how much nearer they came, and how far the ego drove.
+
+    Args:
+        spec: of the camera.
+        told: [b, n, `TOLD`].
+        ego_before: [b, 1, 4], where the ego was when the picture before was taken.
+    """
+    _, _, away_log, across, _, came, sure, nearer_log, *_ = told.unbind(-1)
+    away_m = away_log.clamp(0, _FARTHEST_LOG).expm1()
+    ahead_m, left_m = spec.from_above(spec.width / 2 * (1 + across), away_m)
+    x_m, y_m, _, yaw = ego_before.unbind(-1)
+    still_x_m = (ahead_m - x_m) * yaw.cos() + (left_m - y_m) * yaw.sin()
+    still_y_m = (left_m - y_m) * yaw.cos() - (ahead_m - x_m) * yaw.sin()
+    away_if_still_m, left_if_still_m = spec.depth_and_left(still_x_m, still_y_m)
+    off_ms = away_m / spec.focal_px / CLIP_PERIOD_S  # by a pixel
+    column_before = spec.width / 2 * (1 + across + came)
+    left_before_m = (spec.width / 2 - column_before) / spec.focal_px * away_if_still_m
+    before_x_m, before_y_m = spec.from_above(
+        column_before, away_m * nearer_log.clamp(-_NEARER_LOG, _NEARER_LOG).exp()
+    )
+    moved_ahead_m = ahead_m - x_m - before_x_m * yaw.cos() + before_y_m * yaw.sin()
+    return Spotted(
+        ahead_m,
+        left_m,
+        sure * (left_if_still_m - left_before_m) / CLIP_PERIOD_S / (1 + (off_ms / _ROUGH_MS) ** 2),
+        moved_ahead_m / CLIP_PERIOD_S,
+    )
 
 
 class _SceneIntent(IntentReader):

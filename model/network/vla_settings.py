@@ -14,7 +14,7 @@ from looktwice.model.families.trajectory_codes import CODES
 from looktwice.model.network.intent import INTENT_TOKENS
 from looktwice.model.network.second_sketch import VERDICT_TOKENS
 
-SPOTTED: Final = {"pedestrian": 4, "vehicle": 4, "obstacle": 3}
+SPOTTED: Final = {"pedestrian": 4, "vehicle": 6, "obstacle": 3}
 """How many of each kind the convolutions beside the tower tell of in a clip."""
 CONFIG_KEY: Final = "looktwice"
 """Where these settings lie in a checkpoint's ``config.json``."""

@@ -111,7 +111,7 @@ class FactLearner(nn.Module):
         # By another name than in the network, where it learns at the tower's rate: none, here.
         self.reader = vla.resampler
         self.reader.intent.requires_grad_(False)
-        self.register_buffer("fact_weights", fact_weights())
+        self.register_buffer("fact_weights", fact_weights(fine=vla.fine_vision is not None))
 
     fact_weights: Tensor
 

@@ -44,8 +44,9 @@ _AGENT_RANGE_WEIGHT: Final = 5.0
 _MOTION_WEIGHT: Final = 2.0
 _FACT_WEIGHT: Final = 6.0
 """Brings the mean over facts level with the other losses."""
-_FIELD_WEIGHTS: Final = {"speed": 4.0, "gap_log_m": 2.0}
+_FIELD_WEIGHTS: Final = {"speed": 4.0, "speed_left": 4.0, "gap_log_m": 2.0}
 _SECOND_RANK_WEIGHT: Final = 0.5
+_SMALL_TIMES: Final = 4.0
 _NEAR: Final = 0.05
 """Errors below count by their square, above by their size."""
 _PLAN_WEIGHT: Final = 0.3
@@ -269,9 +270,16 @@ class GroundingLearner(nn.Module):
         return dense.permute(0, 1, 2, 4, 3, 5, 6).reshape(*shape, _CLASSES + 3)
 
 
-def fact_weights() -> Tensor:
-    """How much each fact counts, [facts]."""
-    return torch.tensor([_weight(name) for name in FACTS])
+def fact_weights(*, fine: bool = False) -> Tensor:
+    """How much each fact counts, [facts].
+
+    Args:
+        fine: whether convolutions look for what is small. Then that counts more: it is read from few scenes,
+            and seventy other facts are told well already.
+    """
+    small = [name.startswith("walker") or "obstacle" in name for name in FACTS]
+    times = torch.where(torch.tensor(small), _SMALL_TIMES if fine else 1.0, 1.0)
+    return times * torch.tensor([_weight(name) for name in FACTS])
 
 
 def _weight(name: str) -> float:

@@ -12,9 +12,10 @@ import torch
 
 from looktwice.model.driving.cameras import CAMERA_SPECS
 from looktwice.model.driving.facts import FACT_GROUPS, WALKER_FIELDS
+from looktwice.model.driving.route_frame import RouteFrame
 from looktwice.model.driving.scene import CLIP_FRAMES
 from looktwice.model.network.checkpoint import Loaded, load, save, with_fine_vision
-from looktwice.model.network.fine_vision import TOLD, FineVision, Found, channels_of
+from looktwice.model.network.fine_vision import TOLD, FineVision, channels_of
 from looktwice.model.network.patches import normalise, patchify
 from looktwice.model.network.resampler import CrossLayer, SpottedReader
 from looktwice.model.network.vla_settings import NANO_SETTINGS, SPOTTED, SettingsError, VlaSettings
@@ -68,6 +69,7 @@ def test_a_checkpoint_gets_them_beside_what_it_has(plain: Loaded, fine: Loaded, 
     added = {name for name in new if name not in old}
     assert {".".join(name.split(".")[:2]) for name in added if not name.startswith("fine_vision.")} == {
         "resampler.spotted",
+        "resampler.people_layers",
         "resampler.fine_layer",
     }
     history, route = torch.tensor(inputs.history)[None], torch.zeros(1, 20, 2)
@@ -97,12 +99,17 @@ def test_the_likeliest_of_each_kind_are_told_first(fine: Loaded) -> None:
     """Two people and a vehicle stand in a picture of 11 x 21 places."""
     seen = fine.model.fine_vision
     assert seen is not None
-    features = torch.rand(1, channels_of(256), 11, 21)
     logits = torch.full((1, len(SPOTTED), 11, 21), -9.0)
     logits[0, 0, 5, 3], logits[0, 0, 2, 18], logits[0, 0, 2, 17], logits[0, 1, 6, 10] = 2.0, 4.0, 3.0, 1.0
-    away_log, shift = torch.zeros(2, 1, 11, 21)
+    away_log, shift, half_log, nearer_log = torch.zeros(4, 1, 11, 21)
     away_log[0, 2, 18], away_log[0, 5, 3], shift[0, 2, 18] = 3.0, 2.0, 0.25
-    [tokens] = seen.spotted(features, Found(logits, away_log, shift))
+    told_so = torch.cat([logits[0], away_log, shift, half_log, nearer_log])[None]
+    hook = seen.head.register_forward_hook(lambda *_: told_so)
+    with torch.no_grad():
+        found = seen.find(torch.randn(1, 2, 3, 168, 336))
+        [tokens] = seen.tokens(found)
+    hook.remove()
+    features = found.features
     assert tokens.shape == (fine.settings.fine_tokens, 256)
     first, second, third = (dict(zip(TOLD, each.tolist(), strict=False)) for each in tokens[:3])
     assert first["likely"] > second["likely"] > 0.8 > 0.01 > third["likely"], "none beside a likelier one"
@@ -121,14 +128,25 @@ def test_where_those_are_who_are_spotted_is_told_in_the_ego_s_frame(camera: str)
     """Somebody 20 m off, a little beside the middle of the picture."""
     reader, spec = SpottedReader(64, [camera], 1), CAMERA_SPECS[camera]
     across, away_m = 0.3, 20.0
-    told = torch.tensor([1.0, 0.8, float(np.log1p(away_m)), across, 0.1])
+    told = torch.zeros(len(TOLD))
+    told[TOLD.index("likely")], told[TOLD.index("across")] = 1.0, across
+    told[TOLD.index("away_log")] = float(np.log1p(away_m))
     tokens = torch.nn.functional.pad(told, (0, 64 - len(TOLD))).view(1, 1, 1, 64)
-    numbers: list[torch.Tensor] = []
-    reader.told.register_forward_pre_hook(lambda _, arguments: numbers.append(arguments[0]))
-    assert reader(tokens).shape == (1, 1, 64)
     column = spec.width / 2 * (1 + across)
     x_m, y_m, _ = spec.unproject(column, spec.horizon * spec.height, away_m)
-    assert numbers[0][0, 0, 0, -2:].tolist() == pytest.approx([x_m / 20, y_m / 3], rel=1e-4)
+    angles = 0.1 + 0.02 * np.arange(20)
+    route = np.cumsum(4 * np.column_stack([np.cos(angles), np.sin(angles)]), axis=0).astype(np.float32)
+    numbers: list[torch.Tensor] = []
+    reader.told.register_forward_pre_hook(lambda _, arguments: numbers.append(arguments[0]))
+    for has_route in (True, False):
+        given = torch.from_numpy(route)[None], torch.tensor([has_route])
+        assert reader(tokens, torch.zeros(1, 16, 4), *given).shape == (1, 1, 64)
+    known, unknown = (each[0, 0, 0, len(TOLD) :].tolist() for each in numbers)
+    assert known[:4] == unknown[:4] == pytest.approx([x_m / 20, np.clip(y_m, -30, 30) / 3, 0, 0], rel=1e-4)
+    assert unknown[4:] == [0, 0]
+    if x_m > 0:
+        [[along_m, left_m]] = RouteFrame(route).places(np.array([[x_m, y_m]]))
+        assert known[4:] == pytest.approx([along_m / 20, np.clip(left_m, -30, 30) / 3], abs=1e-3)
 
 
 def test_people_are_read_from_the_convolutions_alone(fine: Loaded) -> None:
@@ -136,12 +154,11 @@ def test_people_are_read_from_the_convolutions_alone(fine: Loaded) -> None:
     resampler = fine.model.resampler
     assert resampler is not None
     history, route, no_route = torch.zeros(1, 16, 4), torch.zeros(1, 20, 2), torch.zeros(1, dtype=torch.bool)
-    tokens = torch.randn(1, 2, fine.settings.vision_tokens // 2, 256)
+    tokens = torch.rand(1, 2, fine.settings.vision_tokens // 2, 256)
     other_tower, other_fine = tokens.clone(), tokens.clone()
-    other_tower[:, :, : fine.settings.clip_tokens] += 1
-    other_fine[:, :, fine.settings.clip_tokens :] += 1
-    layer = CrossLayer(256)
-    state, resampler.fine_layer = resampler.fine_layer, layer
+    other_tower[:, :, : fine.settings.clip_tokens] += torch.randn(256)
+    other_fine[:, :, fine.settings.clip_tokens :] += torch.rand(256)
+    state, resampler.fine_layer = resampler.fine_layer, CrossLayer(256)
     told, by_tower, by_fine = (
         resampler.gather(each.flatten(1, 2), history, route, no_route)[0]
         for each in (tokens, other_tower, other_fine)
