@@ -50,9 +50,13 @@ class CameraSpec:
         x, y, z = np.asarray(points, np.float64).T
         depth, left = self.depth_and_left(x, y)
         with np.errstate(divide="ignore", invalid="ignore"):
-            column = self.width / 2 - self.focal_px * left / depth
-            row = self.horizon * self.height - self.focal_px * (z - self.up_m) / depth
+            column, row = self.column_and_row(depth, left, z)
         return np.stack([column, row, depth], axis=1)
+
+    def column_and_row(self, depth: Any, left: Any, up: Any) -> tuple[Any, Any]:
+        """Where the picture shows what lies so far along the view, to its left and above the ground."""
+        column = self.width / 2 - self.focal_px * left / depth
+        return column, self.horizon * self.height - self.focal_px * (up - self.up_m) / depth
 
     def depth_and_left(self, x: Any, y: Any) -> tuple[Any, Any]:
         """How far x and y of the ego frame lie along the view and to its left: numbers, arrays or tensors."""
@@ -65,9 +69,13 @@ class CameraSpec:
         up = (self.horizon * self.height - row) / self.focal_px * depth
         return np.stack([*self.from_above(column, depth), up + self.up_m], axis=-1)
 
+    def left_of(self, column: Any, depth: Any) -> Any:
+        """How far to the left of the view what a column shows at metric ``depth`` lies."""
+        return (self.width / 2 - column) / self.focal_px * depth
+
     def from_above(self, column: Any, depth: Any) -> tuple[Any, Any]:
         """x and y in the ego frame of what a column shows at metric ``depth``: numbers, arrays or tensors."""
-        left = (self.width / 2 - column) / self.focal_px * depth
+        left = self.left_of(column, depth)
         turn = math.radians(self.heading_degrees)
         x = depth * math.cos(turn) - left * math.sin(turn) + self.forward_m
         y = depth * math.sin(turn) + left * math.cos(turn) + self.left_m

@@ -28,7 +28,12 @@ from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
 from looktwice.model.driving.trajectory import FUTURE_STEPS, ROUTE_POINTS, STEP_S
 from looktwice.model.network.motion import POSE_SCALE, present_speeds
 from looktwice.model.network.route_line import RouteLine
-from looktwice.model.network.track_features import TRACK_FEATURES
+from looktwice.model.network.track_features import (
+    TRACK_FEATURES,
+    TRACK_SPEED_SCALE_MS,
+    X_SCALE_M,
+    Y_SCALE_M,
+)
 
 OBJECT_FIELDS: Final = (
     *("present", "along_m", "left_m", "speed_along_ms", "speed_left_ms", "half_length_m", "half_width_m"),
@@ -94,8 +99,9 @@ def objects_of_tracks(tracks: Tensor, line: RouteLine) -> Tensor:
     def told(name: str) -> Tensor:
         return tracks[..., TRACK_FEATURES.index(name)].float()
 
-    cos, sin, speed = told("cos_heading"), told("sin_heading"), 10 * told("speed")
-    along, left, heading = line.places(torch.stack([30 * told("x"), 5 * told("y")], dim=2))
+    cos, sin, speed = told("cos_heading"), told("sin_heading"), TRACK_SPEED_SCALE_MS * told("speed")
+    xy_m = torch.stack([X_SCALE_M * told("x"), Y_SCALE_M * told("y")], dim=2)
+    along, left, heading = line.places(xy_m)
     turn = torch.atan2(sin, cos) - heading
     standing = (speed.abs() < _STANDING_MS).to(speed.dtype)
     return torch.stack(

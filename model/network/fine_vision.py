@@ -20,7 +20,7 @@ from looktwice.model.network.patches import PIXEL_MEAN, PIXEL_STD
 from looktwice.model.network.vla_settings import SPOTTED, VlaSettings
 
 STRIDE: Final = 16
-"""Pixels from one place of `FineVision.features` to the next."""
+"""Pixels from one place of `Found.features` to the next."""
 _CHANNELS: Final = 96
 _LAYERS: Final = (
     (16, 2, 5),
@@ -148,7 +148,7 @@ class FineVision(nn.Module):
         best = [peaks[:, kind].topk(count) for kind, count in enumerate(SPOTTED.values())]
         place = torch.cat([each.indices for each in best], dim=1)
         column, row = _middle(place, shift)
-        half = half_of(half_log.flatten(1).gather(1, place))
+        half = _half_of(half_log.flatten(1).gather(1, place))
         columns = torch.stack([column - half, column, column + half], dim=-1).detach()
         rows = row[..., None].expand(columns.shape)
         return Found(
@@ -176,7 +176,7 @@ class FineVision(nn.Module):
         )
         likely = found.spotted_logits.sigmoid()
         came_px, sure = (part.view(*likely.shape, 3) for part in found.matched.came_px())
-        came, half = came_px / STRIDE, half_of(half_log)
+        came, half = came_px / STRIDE, _half_of(half_log)
         # Who was narrower in the picture before was farther away.
         half_before = (half + (came[..., 2] - came[..., 0]) / 2).clamp(half / _NEARER, half * _NEARER)
         told = torch.stack(
@@ -204,7 +204,7 @@ class FineVision(nn.Module):
         return self.tokens(self.find(self.pictures(patches)))
 
 
-def half_of(half_log: Tensor) -> Tensor:
+def _half_of(half_log: Tensor) -> Tensor:
     """Half a width, in places, of its logarithm."""
     return half_log.clamp(math.log(_NARROWEST), math.log(_WIDEST)).exp()
 

@@ -218,7 +218,7 @@ def placed(spec: CameraSpec, told: Tensor, ego_before: Tensor) -> Spotted:
     away_if_still_m, left_if_still_m = spec.depth_and_left(still_x_m, still_y_m)
     off_ms = away_m / spec.focal_px / CLIP_PERIOD_S  # by a pixel
     column_before = spec.width / 2 * (1 + across + came)
-    left_before_m = (spec.width / 2 - column_before) / spec.focal_px * away_if_still_m
+    left_before_m = spec.left_of(column_before, away_if_still_m)
     before_x_m, before_y_m = spec.from_above(
         column_before, away_m * nearer_log.clamp(-_NEARER_LOG, _NEARER_LOG).exp()
     )

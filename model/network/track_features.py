@@ -39,9 +39,9 @@ MIRRORED: Final = tuple(
 """Columns that change sign where left and right are swapped."""
 _OF_ROUTE: Final = slice(TRACK_FEATURES.index("on_route"), TRACK_FEATURES.index("speed_left") + 1)
 _STANDING_MS: Final = 0.3
-_X_SCALE_M: Final = 30.0
-_Y_SCALE_M: Final = 5.0
-_SPEED_SCALE_MS: Final = 10.0
+X_SCALE_M: Final = 30.0
+Y_SCALE_M: Final = 5.0
+TRACK_SPEED_SCALE_MS: Final = 10.0
 
 
 def track_features(tracks: Sequence[Track], route: FloatArray | None) -> FloatArray:
@@ -62,11 +62,11 @@ def track_features(tracks: Sequence[Track], route: FloatArray | None) -> FloatAr
         indicator = 0 if hazard else ("left" in track.lights) - ("right" in track.lights)
         features[row] = (
             1.0,
-            track.x_m / _X_SCALE_M,
-            track.y_m / _Y_SCALE_M,
+            track.x_m / X_SCALE_M,
+            track.y_m / Y_SCALE_M,
             math.cos(track.heading_rad),
             math.sin(track.heading_rad),
-            track.speed_ms / _SPEED_SCALE_MS,
+            track.speed_ms / TRACK_SPEED_SCALE_MS,
             frame is not None,
             places[row, 0] / 30,
             places[row, 1] / 3,
@@ -87,11 +87,11 @@ def track_features(tracks: Sequence[Track], route: FloatArray | None) -> FloatAr
 def moving(features: FloatArray) -> FloatArray:
     """Those that `track_features` tells of, [n, 5]: x_m, y_m, cosine and sine of their heading, speed_ms."""
     scales = {
-        "x": _X_SCALE_M,
-        "y": _Y_SCALE_M,
+        "x": X_SCALE_M,
+        "y": Y_SCALE_M,
         "cos_heading": 1.0,
         "sin_heading": 1.0,
-        "speed": _SPEED_SCALE_MS,
+        "speed": TRACK_SPEED_SCALE_MS,
     }
     present = features[:, TRACK_FEATURES.index("present")] > 0
     return np.stack(

@@ -19,7 +19,7 @@ from torch.utils.data import Dataset
 from looktwice.model.driving.cameras import CAMERA_SPECS
 from looktwice.model.driving.perceived import Perceived
 from looktwice.model.driving.scene import CLIP_PERIOD_S
-from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.driving.trajectory import FloatArray, to_ego_frame
 from looktwice.model.network.fine_vision import STRIDE
 from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.matching import FINE_PX, STEP_PX, Matched
@@ -163,9 +163,9 @@ def marked(perceived: Perceived | None, faces: FloatArray, settings: VlaSettings
             away_m, up_m = away_m - half_deep_m, _UP_M[agent.kind]
             if not away_m[0] > 0:
                 continue
-            column_px = spec.width / 2 - spec.focal_px * (left_m[:, None] + half_m * _SIDES) / away_m[:, None]
-            column = column_px[0, 1] / STRIDE
-            row = (spec.horizon * spec.height + spec.focal_px * (spec.up_m - up_m) / away_m[0]) / STRIDE
+            sides_m = left_m[:, None] + half_m * _SIDES
+            column_px, row_px = spec.column_and_row(away_m[:, None], sides_m, up_m)
+            column, row = column_px[0, 1] / STRIDE, row_px[0, 0] / STRIDE
             if not (0 <= row < rows and 0 <= column < columns):
                 continue
             at = int(row), int(column)
@@ -193,17 +193,16 @@ def faces_of(perceived: Perceived | None, tracks: FloatArray, history: FloatArra
     """
     agents = () if perceived is None else perceived.agents
     told = moving(tracks).astype(np.float64)
-    ego_m, yaw = history[PICTURE_BEFORE, :2].astype(np.float64), float(history[PICTURE_BEFORE, 3])
-    to_ego_before = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     faces = np.full((len(agents), 3), np.nan, np.float32)
     for place, agent in enumerate(agents):
         faces[place, 0] = agent.length_m / 2
         off_m = np.hypot(told[:, 0] - agent.x_m, told[:, 1] - agent.y_m)
         if off_m.size and off_m.min() < _SAME_M:
             x_m, y_m, cos, sin, speed_ms = told[off_m.argmin()]
-            before_m = np.array([x_m, y_m]) - CLIP_PERIOD_S * speed_ms * np.array([cos, sin])
+            gone_m = CLIP_PERIOD_S * speed_ms
+            before = x_m - gone_m * cos, y_m - gone_m * sin, 0.0, 0.0
             faces[place, 0] = (agent.length_m * abs(cos) + agent.width_m * abs(sin)) / 2
-            faces[place, 1:] = to_ego_before @ (before_m - ego_m)
+            faces[place, 1:] = to_ego_frame(before, history[PICTURE_BEFORE])[:2]
     return faces
 
 
