@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
@@ -10,7 +10,7 @@ from typing import Any
 
 from looktwice.model.driving.lead import LEAD_WITHIN_M
 from looktwice.model.driving.scene import LabelledScene
-from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.driving.trajectory import FloatArray, at_speed, path_length
 from looktwice.model.engines.engine import Draw, Engine
 from looktwice.model.evaluation.bootstrap import Comparison, compare
 from looktwice.model.evaluation.open_loop import (
@@ -35,8 +35,8 @@ class EvaluationReport:
 
     Attributes:
         rows, comparisons: of the table.
-        speed_response: by variant and factor of speed, how much of the change of speed its path follows: 1
-            copies it, 0 does not mind.
+        speed_response: by variant or planner, and by factor of speed, how much of the change of speed its
+            path follows: 1 copies it, 0 does not mind.
     """
 
     rows: tuple[VariantRow, ...]
@@ -88,9 +88,29 @@ async def evaluate_checkpoint(
     results = await evaluate_variants(engine, scenes, variants, concurrency=concurrency, on_result=on_result)
     rows = [row for name, of in baselines.items() for row in _rows(name, of)]
     rows += [row for variant, of in results.items() for row in variant_rows(variant, of)]
-    return EvaluationReport(
-        tuple(rows), tuple(compare_variants(baselines, results)), speed_responses(results)
-    )
+    responses = {
+        name: _planner_response(planner, scenes, {variant.speed for variant in variants})
+        for name, planner in planners.items()
+    }
+    responses = {name: of for name, of in responses.items() if of} | speed_responses(results)
+    return EvaluationReport(tuple(rows), tuple(compare_variants(baselines, results)), responses)
+
+
+def _planner_response(
+    planner: Callable[[LabelledScene], FloatArray], scenes: Sequence[LabelledScene], speeds: Set[float]
+) -> dict[float, float]:
+    """How much of a change of speed a planner's paths follow, by factor, 1 left out."""
+
+    def path_m(times: float) -> float:
+        return sum(path_length(planner(_at_speed(each, times))) for each in scenes)
+
+    usual_m = path_m(1.0)
+    return {times: (path_m(times) / usual_m - 1) / (times - 1) for times in sorted(speeds - {1.0})}
+
+
+def _at_speed(labelled: LabelledScene, times: float) -> LabelledScene:
+    scene = labelled.scene
+    return replace(labelled, scene=replace(scene, history=at_speed(scene.history, times)))
 
 
 def speed_responses(results: Mapping[Variant, Sequence[SceneResult]]) -> dict[str, dict[float, float]]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from looktwice.model.driving.scene import FRONT_WIDE
-from looktwice.model.driving.trajectory import FloatArray
+from looktwice.model.driving.trajectory import FloatArray, constant_velocity
 from looktwice.model.engines.engine import Controls, DrawFinished, Event, PlanRequest
 from looktwice.model.evaluation.open_loop import SceneResult
 from looktwice.model.evaluation.report import (
@@ -103,11 +103,19 @@ def test_a_planner_that_copies_its_speed_has_a_response_of_one(report: Evaluatio
     assert told == {"0.5": pytest.approx(1.0, abs=0.02), "1.5": pytest.approx(1.0, abs=0.02)}
 
 
-def test_a_planner_of_ones_own_has_a_row() -> None:
-    planners = {"teacher": lambda labelled: labelled.future}
-    report = asyncio.run(evaluate_checkpoint(FakeEngine(), SCENES, [], planners=planners))
+def test_a_planner_of_ones_own_has_a_row_and_a_response_to_speed() -> None:
+    planners = {
+        "teacher": lambda labelled: labelled.future,
+        "as before": lambda labelled: constant_velocity(labelled.scene.history),
+    }
+    variants = [each for each in standard_variants(["cf_vla"], Controls(n=1)) if each.route]
+    report = asyncio.run(evaluate_checkpoint(FakeEngine(), SCENES, variants, planners=planners))
     row = next(row for row in report.rows if row.name == "teacher")
     assert row.values["agreed_ade_m"] == 0
+    assert report.speed_response["teacher"] == {0.5: 0, 1.5: 0}
+    assert report.speed_response["as before"] == {0.5: pytest.approx(1), 1.5: pytest.approx(1)}
+    alone = asyncio.run(evaluate_checkpoint(FakeEngine(), SCENES, [], planners=planners))
+    assert not alone.speed_response, "no variant asks for other speeds"
 
 
 def test_the_text_holds_rows_comparisons_and_responses(report: EvaluationReport) -> None:

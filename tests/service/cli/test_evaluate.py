@@ -117,7 +117,8 @@ def test_json_has_the_keys_that_scripts_rely_on_and_a_row_for_each_small_planner
     for measure in ("agreed_ade_m", "greedy_ade_m", "agreement_plan_trajectory"):
         assert isinstance(free[measure], float)
         assert len(free["intervals"][measure]) == 2
-    assert set(told["speed_response"]["meta-act + route"]) == {"0.5", "1.5"}
+    for name in ("meta-act + route", "blind a", "teacher"):
+        assert set(told["speed_response"][name]) == {"0.5", "1.5"}
 
     refused = CliRunner().invoke(app, [*asked, *one, *another])
     assert refused.exit_code == 2
