@@ -18,7 +18,13 @@ from looktwice.model.driving.agents import SceneError as SceneError
 from looktwice.model.driving.lane_map import LaneMap
 from looktwice.model.driving.tracks import Track as Track
 from looktwice.model.driving.tracks import check_tracks, tracks_of
-from looktwice.model.driving.trajectory import FloatArray, check_history, check_route, check_trajectory
+from looktwice.model.driving.trajectory import (
+    FloatArray,
+    at_speed,
+    check_history,
+    check_route,
+    check_trajectory,
+)
 
 FRONT_WIDE: Final = "front_wide_120"
 FRONT_TELE: Final = "front_tele_30"
@@ -237,6 +243,10 @@ class LabelledScene:
             route=self.scene.route if route else None,
             tracks=tracks_of(self.agents) if tracks else None,
         )
+
+    def at_speed(self, times: float) -> LabelledScene:
+        """The same scene for an ego that came the same way at so many times its speed."""
+        return replace(self, scene=replace(self.scene, history=at_speed(self.scene.history, times)))
 
     @property
     def split(self) -> Literal["train", "validation", "test"]:

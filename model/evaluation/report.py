@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
@@ -10,7 +10,7 @@ from typing import Any
 
 from looktwice.model.driving.lead import LEAD_WITHIN_M
 from looktwice.model.driving.scene import LabelledScene
-from looktwice.model.driving.trajectory import FloatArray, at_speed, path_length
+from looktwice.model.driving.trajectory import FloatArray, path_length
 from looktwice.model.engines.engine import Draw, Engine
 from looktwice.model.evaluation.bootstrap import Comparison, compare
 from looktwice.model.evaluation.open_loop import (
@@ -88,41 +88,46 @@ async def evaluate_checkpoint(
     results = await evaluate_variants(engine, scenes, variants, concurrency=concurrency, on_result=on_result)
     rows = [row for name, of in baselines.items() for row in _rows(name, of)]
     rows += [row for variant, of in results.items() for row in variant_rows(variant, of)]
+    speeds = sorted({variant.speed for variant in variants} - {1.0})
     responses = {
-        name: _planner_response(planner, scenes, {variant.speed for variant in variants})
+        name: {
+            times: _response(_path_m(planner, scenes, times), _all_m(baselines[name]), times)
+            for times in speeds
+        }
         for name, planner in planners.items()
+        if speeds
     }
-    responses = {name: of for name, of in responses.items() if of} | speed_responses(results)
+    responses |= speed_responses(results)
     return EvaluationReport(tuple(rows), tuple(compare_variants(baselines, results)), responses)
-
-
-def _planner_response(
-    planner: Callable[[LabelledScene], FloatArray], scenes: Sequence[LabelledScene], speeds: Set[float]
-) -> dict[float, float]:
-    """How much of a change of speed a planner's paths follow, by factor, 1 left out."""
-
-    def path_m(times: float) -> float:
-        return sum(path_length(planner(_at_speed(each, times))) for each in scenes)
-
-    usual_m = path_m(1.0)
-    return {times: (path_m(times) / usual_m - 1) / (times - 1) for times in sorted(speeds - {1.0})}
-
-
-def _at_speed(labelled: LabelledScene, times: float) -> LabelledScene:
-    scene = labelled.scene
-    return replace(labelled, scene=replace(scene, history=at_speed(scene.history, times)))
 
 
 def speed_responses(results: Mapping[Variant, Sequence[SceneResult]]) -> dict[str, dict[float, float]]:
     """How much of a change of speed the paths of variants follow; see `EvaluationReport.speed_response`."""
-    path_m = {variant: sum(result.path_m for result in of) for variant, of in results.items()}
+    path_m = {variant: _all_m(of) for variant, of in results.items()}
     responses: dict[str, dict[float, float]] = {}
     for variant, length_m in path_m.items():
         free = _free(variant, results)
         if variant.speed != 1.0 and free is not None:
-            change = length_m / path_m[free] - 1
-            responses.setdefault(free.name, {})[variant.speed] = change / (variant.speed - 1)
+            response = _response(length_m, path_m[free], variant.speed)
+            responses.setdefault(free.name, {})[variant.speed] = response
     return responses
+
+
+def _response(path_m: float, usual_m: float, times: float) -> float:
+    """How much of a change of speed, so many times the usual one, paths follow that are so long in all."""
+    return (path_m / usual_m - 1) / (times - 1)
+
+
+def _path_m(
+    planner: Callable[[LabelledScene], FloatArray], scenes: Sequence[LabelledScene], times: float
+) -> float:
+    """How long a planner's paths are in all, at so many times the speed of scenes."""
+    return sum(path_length(planner(each.at_speed(times))) for each in scenes)
+
+
+def _all_m(results: Sequence[SceneResult]) -> float:
+    """How long the paths of results are in all."""
+    return sum(result.path_m for result in results)
 
 
 async def evaluate_variants(

@@ -13,7 +13,6 @@ import numpy as np
 
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.scene import Clip, LabelledScene
-from looktwice.model.driving.trajectory import at_speed
 from looktwice.model.engines.engine import (
     Controls,
     Draw,
@@ -195,9 +194,7 @@ def request_for(labelled: LabelledScene, variant: Variant) -> PlanRequest:
     # A draw's random numbers depend on the seed alone: one seed for all scenes would give all the same
     # luck. A seed from the scene's name does not, and variants still meet the same luck in the same scene.
     seed = variant.controls.seed ^ zlib.crc32(scene.scene_id.encode())
-    given = labelled.given(route=variant.route, tracks=variant.tracks)
-    if variant.speed != 1.0:
-        given = replace(given, history=at_speed(given.history, variant.speed))
+    given = labelled.at_speed(variant.speed).given(route=variant.route, tracks=variant.tracks)
     return PlanRequest(
         request_id=f"{variant.name}/{scene.scene_id}",
         scene=given,

@@ -8,7 +8,6 @@ decides. Pictures would still show the speed that was, so these scenes have none
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -20,7 +19,7 @@ from looktwice.clients.metadrive.world.episode_log import EpisodeLog
 from looktwice.clients.metadrive.world.fork import ForkError, fork_expert
 from looktwice.model.driving.cameras import FRONT_CAMERAS
 from looktwice.model.driving.scene import LabelledScene
-from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS, at_speed
+from looktwice.model.driving.trajectory import FUTURE_STEPS, HISTORY_STEPS
 
 _TIMES: Final = (0.4, 1.6)
 _STANDING_MS: Final = 0.5
@@ -60,16 +59,10 @@ def other_speeds(
         lane_maps = lane_maps or LaneMaps(world.live)
         made = labelled_scene(forked.log, world.now, blank_clips(FRONT_CAMERAS), lane_maps.at(world.now))
         if made is not None:
-            scenes.append(seen_at(made, times))
+            scenes.append(made.at_speed(times))
     return scenes, world.log(), tried
 
 
 def another_speed(world: EpisodeWorld) -> float:
     """What the ego's speed is multiplied by, by chance: always the same at the same moment."""
     return float(np.random.default_rng([world.live.seed, world.now]).uniform(*_TIMES))
-
-
-def seen_at(labelled: LabelledScene, times: float) -> LabelledScene:
-    """A scene whose ego came the same way at so many times its speed."""
-    scene = labelled.scene
-    return replace(labelled, scene=replace(scene, history=at_speed(scene.history, times)))

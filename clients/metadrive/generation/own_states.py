@@ -19,7 +19,7 @@ import numpy as np
 from looktwice.clients.metadrive.closed_loop.drives import Drive, DriveConfig, drive
 from looktwice.clients.metadrive.closed_loop.pilots import Pilot
 from looktwice.clients.metadrive.drawing.rig import Rig
-from looktwice.clients.metadrive.generation.other_speeds import another_speed, seen_at
+from looktwice.clients.metadrive.generation.other_speeds import another_speed
 from looktwice.clients.metadrive.scenes.lane_maps import LaneMaps
 from looktwice.clients.metadrive.scenes.windows import labelled_scene, taught_scene
 from looktwice.clients.metadrive.world.car_following import EMERGENCY_BRAKE
@@ -113,12 +113,12 @@ class _States:
             made = taught_scene(
                 world.live, world.now, scene.clips, braked(forked.trajectory, forked.speeds_ms)
             )
-            return seen_at(made, times)
+            return made.at_speed(times)
         if len(forked.trajectory) < FUTURE_STEPS:
             return None
         self.lane_maps = self.lane_maps or LaneMaps(world.live)
         scored = labelled_scene(forked.log, world.now, scene.clips, self.lane_maps.at(world.now))
-        return None if scored is None else seen_at(scored, times)
+        return None if scored is None else scored.at_speed(times)
 
 
 def braked(trajectory: FloatArray, speeds_ms: FloatArray) -> FloatArray:
