@@ -59,7 +59,7 @@ async def do_jobs(
 
 @contextmanager
 def progress_bar(run: StageRun, total: int | None, *, quiet: bool) -> Iterator[Callable[[Tally], None]]:
-    """A bar on stderr, moved by what it is told; it also says who is waited for."""
+    """Progress bar on stderr; also shows retries."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
     from stamina.instrumentation import RetryDetails, get_on_retry_hooks, set_on_retry_hooks

@@ -81,7 +81,7 @@ def test_the_fixture_covers_every_outcome(version: Version) -> None:
 def test_states_are_those_of_navsims_simulator() -> None:
     expected = frozen("v2.2")
     worst = 0.0
-    for seed in range(0, WORLDS, 2):
+    for seed in range(WORLDS):
         drawn = case(seed)
         world = drawn.world
         states = simulate(reference_poses(drawn.plans, world.vehicle, world.ego), world.vehicle, world.ego)
@@ -94,7 +94,7 @@ def test_states_are_those_of_navsims_simulator() -> None:
 def test_extended_comfort_and_the_human_filter_are_navsims() -> None:
     expected = frozen("v2.2")
     forgiven = 0
-    for seed in range(0, WORLDS, 5):
+    for seed in range(WORLDS):
         drawn = case(seed)
         world = drawn.world
         references = reference_poses(drawn.previous[None], world.vehicle, world.ego)
@@ -112,4 +112,4 @@ def test_extended_comfort_and_the_human_filter_are_navsims() -> None:
                 wanted = np.ones(5)
                 forgiven += 1
             assert found.sub_scores[name] == pytest.approx(wanted, abs=1e-9), (seed, name)
-    assert forgiven > 50
+    assert forgiven > 250
