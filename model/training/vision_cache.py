@@ -1,8 +1,8 @@
 """What a frozen tower sees in all examples, worked out once: an epoch then costs no tower.
 
-The tokens lie in files of float16, one an episode, mapped into memory. A file's name tells tower, cameras
-and pictures apart, so tokens of others are never taken. Scenes that are added cost what they add, and a
-killed run goes on behind the last whole episode.
+The tokens lie in files of float16, one an episode, mapped into memory. A file's name tells tower, cameras,
+precision and pictures apart, so tokens of others are never taken. Scenes that are added cost what they add,
+and a killed run goes on behind the last whole episode.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def open_vision(
     looks = _looks(loaded, fine=fine)
     paths = [
         {
-            places: folder / f"vision-{hash_of(_VERSION, mirrored, look.name, digest)}.npy"
+            places: folder / f"vision-{hash_of(_VERSION, mirrored, bf16, look.name, digest)}.npy"
             for places, digest in shown.items()
         }
         for look in looks

@@ -44,7 +44,7 @@ def test_the_cache_holds_what_the_tower_sees(loaded: Loaded, tmp_path: Path) -> 
     cache = open_vision(loaded, EXAMPLES, tmp_path, mirrored=True)
     for index, mirror in ((0, False), (3, True), (19, True)):
         kept = torch.from_numpy(cache.tokens(index, mirror).astype(np.float32))
-        # Worked out in bfloat16, and kept in float16.
+        # Kept in float16.
         torch.testing.assert_close(kept, seen_now(loaded, index, mirror), rtol=0.1, atol=0.05)
 
 
@@ -102,6 +102,12 @@ def test_another_tower_has_another_cache(loaded: Loaded, resampling_checkpoint: 
     first = open_vision(loaded, EXAMPLES, tmp_path, mirrored=False)
     second = open_vision(other, EXAMPLES, tmp_path, mirrored=False)
     assert not np.array_equal(first.tokens(0, False), second.tokens(0, False))
+
+
+def test_mixed_precision_has_a_cache_of_its_own(loaded: Loaded, tmp_path: Path) -> None:
+    exact = open_vision(loaded, OTHERS, tmp_path, mirrored=False).tokens(0, False)
+    mixed = open_vision(loaded, OTHERS, tmp_path, mirrored=False, bf16=True).tokens(0, False)
+    assert not np.array_equal(exact, mixed)
 
 
 def test_convolutions_beside_the_tower_have_files_of_their_own(loaded: Loaded, tmp_path: Path) -> None:
