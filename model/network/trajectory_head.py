@@ -16,6 +16,9 @@ _HEADING_WEIGHT: Final = 1.5
 """Metres that a radian of mean error in heading counts in the loss."""
 _ALL_MODES_WEIGHT: Final = 0.03
 """Of the modes that are not the nearest: enough to keep them on the road."""
+_NEAR_STEPS: Final = 15
+_NEAR_WEIGHT: Final = 5.0
+"""How much more a step of the first 1.5 s counts than a later one: the next plan comes before those."""
 
 
 class Guesses(NamedTuple):
@@ -85,20 +88,32 @@ class TrajectoryHead(nn.Module):
         """The loss of guesses against futures [b, 64, 4], and the best guess's ADE in metres.
 
         The best guess is drawn to the expert's trajectory in metres; of the modes only the nearest one is.
+        The first 1.5 s count more.
         """
         poses = futures[..., [0, 1, 3]]
-        ade, turned = _apart(self.curves(guesses.best, speeds_ms), poses)
-        modes, modes_turned = _apart(self.curves(guesses.modes, speeds_ms), poses[:, None])
+        weights = _near_weights(poses)
+        best_m, best_rad = _apart(self.curves(guesses.best, speeds_ms), poses)
+        modes_m, modes_rad = _apart(self.curves(guesses.modes, speeds_ms), poses[:, None])
+        best = ((best_m + _HEADING_WEIGHT * best_rad) * weights).mean(dim=-1)
+        modes = (modes_m * weights).mean(dim=-1)
         nearest = modes.detach().argmin(dim=1)
         rows = torch.arange(len(nearest), device=nearest.device)
-        nearest_loss = (modes + _HEADING_WEIGHT * modes_turned)[rows, nearest]
+        nearest_loss = modes[rows, nearest] + _HEADING_WEIGHT * (modes_rad[rows, nearest] * weights).mean(
+            dim=-1
+        )
         others = _ALL_MODES_WEIGHT * modes.mean(dim=1)
         scored = F.cross_entropy(guesses.scores.float(), nearest)
-        loss = (ade + _HEADING_WEIGHT * turned + nearest_loss + others).mean() + scored
-        return {"loss": loss, "ade_m": ade.detach().mean()}
+        loss = (best + nearest_loss + others).mean() + scored
+        return {"loss": loss, "ade_m": best_m.detach().mean()}
+
+
+def _near_weights(poses: Tensor) -> Tensor:
+    """What each step of a trajectory counts [64]: one on average."""
+    weights = torch.ones(poses.shape[-2], device=poses.device)
+    weights[:_NEAR_STEPS] = _NEAR_WEIGHT
+    return weights / weights.mean()
 
 
 def _apart(curves: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean distance in metres and mean difference of heading in radians, over the last two axes."""
-    distance = (curves[..., :2] - poses[..., :2]).norm(dim=-1).mean(dim=-1)
-    return distance, (curves[..., 2] - poses[..., 2]).abs().mean(dim=-1)
+    """Distance in metres and difference of heading in radians, at each step [..., 64]."""
+    return (curves[..., :2] - poses[..., :2]).norm(dim=-1), (curves[..., 2] - poses[..., 2]).abs()
