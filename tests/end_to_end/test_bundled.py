@@ -16,6 +16,7 @@ from PIL import Image
 from looktwice.clients import wire
 from looktwice.clients.planner import PlannerClient, PlanResult
 from looktwice.model.bundled import CHECKPOINT, SCENES
+from looktwice.model.driving.images import decode_image
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import split_of_seed
 from looktwice.model.driving.scene_store import read_scenes
@@ -35,6 +36,17 @@ def test_bundled_scenes_are_twelve_that_show_every_tag_none_of_them_learned_from
     assert len(BUNDLED) == 12
     assert [split_of_seed(labelled.seed) for labelled in BUNDLED] == ["validation", *["test"] * 11]
     assert len({tag for labelled in BUNDLED for tag in labelled.tags}) == 6
+
+
+def test_every_bundled_scene_has_a_lane_map_and_next_frames_of_its_cameras() -> None:
+    for labelled in BUNDLED:
+        assert labelled.lane_map is not None, labelled.scene.scene_id
+        now = {clip.camera: clip.images[-1] for clip in labelled.scene.clips}
+        later = {frame.camera: frame.image for frame in labelled.next_frames}
+        assert later.keys() == now.keys(), labelled.scene.scene_id
+        for camera, picture in later.items():
+            assert picture != now[camera]
+            assert decode_image(picture).shape == decode_image(now[camera]).shape
 
 
 def test_the_checkpoint_is_small_and_tells_how_it_was_made(served: Served[TorchEngine]) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 from typer.testing import CliRunner
 
 from looktwice.model.bundled import SCENES
+from looktwice.model.driving.scene_store import read_scenes, write_scenes
 from looktwice.service.cli.commands import app
 from looktwice.service.routes.request_examples import example_score
 
@@ -47,9 +49,18 @@ def test_a_scene_file_is_scored_planner_by_planner(tmp_path: Path, untrained_che
     assert len({row["name"] for row in told["pdms"]}) == 4
     assert expert["score"] > 0.9
     assert expert["scenes"] == checkpoint["scenes"] == 2
-    # Scenes from before lane maps: what they lack is named.
-    assert told["epdms"][0]["score"] is None
-    assert set(told["epdms"][0]["missing"]) == {
+    assert told["epdms"][0]["score"] > 0.9
+    assert told["epdms"][0]["missing"] == {}
+
+
+def test_what_scenes_from_before_lane_maps_lack_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "scenes.parquet"
+    write_scenes(path, [replace(next(read_scenes(SCENES)), lane_map=None)])
+    result = RUNNER.invoke(app, ["score", str(path), "--json"])
+    assert result.exit_code == 0, result.output
+    expert = json.loads(result.stdout.splitlines()[-1])["epdms"][0]
+    assert expert["score"] is None
+    assert set(expert["missing"]) == {
         *("driving_direction_compliance", "traffic_light_compliance", "lane_keeping"),
     }
 

@@ -36,6 +36,8 @@ def test_experts_of_bundled_scenes_hit_nothing_and_stay_on_the_road() -> None:
         world = world_of(labelled)
         expert = plans_of(labelled.future)
         found = score(world, expert[None], "v1.1", Others(reference=expert, against="expert"), centre=True)
+        later = score(world, expert[None], "v2.2", Others(reference=expert, against="expert"), centre=True)
+        assert later.missing == (EXTENDED_COMFORT,), labelled.scene.scene_id
         for name in (COLLISIONS, DRIVABLE):
             value = found.sub_scores[name]
             assert value is not None
