@@ -19,8 +19,7 @@ from looktwice.model.formats.pieces import (
     Sequence,
     Shorthand,
     Value,
-    children,
-    repeatable,
+    holds,
 )
 
 DIGITS: Final = "digits"
@@ -116,7 +115,8 @@ class Repeat(Compound):
             raise FormatError(
                 f"{self.at_least} to {self.at_most} repeats; 0 to {MAX_REPEATS} can be written, and 1 at most"
             )
-        repeatable(self.piece)
+        if holds(self.piece) != 1:
+            raise FormatError("what is repeated must hold one value; make a record of several")
 
     def expand(self) -> Piece:
         """Those that must be there, and the rest."""
@@ -151,16 +151,3 @@ class RepeatRest(Shorthand):
         between = Literal(repeat.between if self.done else "")
         more = Sequence((between, repeat.piece, RepeatRest(repeat, self.done + 1)))
         return more if self.done < repeat.at_least else Maybe(more)
-
-
-def number_alphabets(piece: Piece) -> dict[str, int]:
-    """The alphabets that numbers within ``piece`` are codes of, with how many codes each has.
-
-    Those of `Codes` count too where their size is declared, as that of the codes of pictures.
-    """
-    if isinstance(piece, Number):
-        return {} if piece.spelling == DIGITS else {piece.spelling: len(piece.texts)}
-    if isinstance(piece, Codes):
-        return {} if piece.size is None else {piece.alphabet: piece.size}
-    within = (piece.piece,) if isinstance(piece, Repeat) else children(piece)
-    return {name: size for each in within for name, size in number_alphabets(each).items()}

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from looktwice.model.driving.plan import Plan
+from looktwice.model.formats.contents import narrowing_sections
 from looktwice.model.formats.fixed import FixedValues, with_fixed
 from looktwice.model.formats.free_text import BEGUN, Alphabet, TextRules, TextState
 from looktwice.model.formats.lengths import longest
@@ -32,7 +33,6 @@ from looktwice.model.formats.pieces import (
     Shorthand,
     Texts,
     Values,
-    narrowing_sections,
     with_picks,
 )
 from looktwice.model.formats.plan_tracks import with_given
@@ -140,8 +140,8 @@ class CompiledFormat:
         self._expanded: dict[Shorthand, Piece] = {}
         self._texts: dict[FreeText, TextRules] = {}
         self._free: dict[bool, Alphabet] = {}
-        self._codes: dict[tuple[str, int], npt.NDArray[np.int64]] = {}
-        self._spellings: dict[tuple[str, int], Texts] = {}
+        self._codes: dict[range, npt.NDArray[np.int64]] = {}
+        self._spellings: dict[range, Texts] = {}
         self._first_bytes: dict[Piece, frozenset[int]] = {}
         self.sentence_ends = frozenset(id for mark in ".!?" for id in self.literal(mark)[-1:])
         """Ids of the tokens that end a sentence."""
@@ -236,22 +236,25 @@ class CompiledFormat:
             raise FormatError(f"the vocabulary has no alphabet {alphabet!r}; it has {', '.join(alphabets)}")
         return alphabets[alphabet]
 
+    def codebook(self, piece: Codes, place: int) -> range:
+        """Ids of the codebook of a place: of all its codes, those included that `Codes.only` leaves out."""
+        books = self.codebooks(piece.alphabet)
+        return books[place % len(books)]
+
     def codes(self, piece: Codes, place: int) -> npt.NDArray[np.int64]:
         """Ids of the codes that may stand at a place."""
-        books = self.codebooks(piece.alphabet)
-        key = (piece.alphabet, place % len(books))
-        if key not in self._codes:
-            self._codes[key] = np.arange(books[key[1]].start, books[key[1]].stop)
-        known, only = self._codes[key], None if piece.only is None else piece.only[place]
+        book = self.codebook(piece, place)
+        if book not in self._codes:
+            self._codes[book] = np.arange(book.start, book.stop)
+        known, only = self._codes[book], None if piece.only is None else piece.only[place]
         return known if only is None else known[only : only + 1]
 
     def spellings(self, piece: Codes, place: int) -> Texts:
-        """The texts of the codes that may stand at a place."""
-        books = self.codebooks(piece.alphabet)
-        key = (piece.alphabet, place % len(books))
-        if key not in self._spellings:
-            self._spellings[key] = Texts(self._vocabulary.decode([token]) for token in books[key[1]])
-        return self._spellings[key]
+        """The texts of the codebook of a place."""
+        book = self.codebook(piece, place)
+        if book not in self._spellings:
+            self._spellings[book] = Texts(self._vocabulary.decode([token]) for token in book)
+        return self._spellings[book]
 
     def first_bytes(self, piece: Piece) -> frozenset[int]:
         """The bytes that a piece, which is never empty, may begin with."""

@@ -231,10 +231,20 @@ class Codes:
     def __post_init__(self) -> None:
         if self.count < 1:
             raise FormatError(f"at least one code must be written, not {self.count}")
+        if self.only is not None and len(self.only) != self.count:
+            raise FormatError(f"{self.count} codes are written, and `only` tells of {len(self.only)}")
+
+    def check(self, place: int, code: int) -> None:
+        """Raise `FormatError` where only another code than this one is written at a place."""
+        only = None if self.only is None else self.only[place]
+        if only is not None and code != only:
+            raise FormatError(
+                f"{self.alphabet} code {place + 1} of {self.count} can only be {only}, not {code}"
+            )
 
 
 class Shorthand(ABC):
-    """A piece that stands for simpler pieces. Its dataclass must be frozen."""
+    """A piece that stands for simpler pieces, none of them a section. Its dataclass must be frozen."""
 
     @abstractmethod
     def expand(self) -> Piece:
@@ -284,7 +294,6 @@ class Record(Shorthand):
 
     def __post_init__(self) -> None:
         _check_names(self.body, frozenset())
-        _refuse_sections(self.body, "a record")
 
     def expand(self) -> Piece:
         """Its body."""
@@ -320,25 +329,17 @@ def holds(piece: Piece) -> int | None:
             return None if others or count is None else 1 + count
         case Maybe(inner):
             return 1 if holds(inner) == 0 else None
-        case _:
+        case FreeText() | Codes() | Compound() | Record():
             return 1
-
-
-def narrowing_sections(piece: Piece) -> frozenset[str]:
-    """The sections whose texts narrow something within ``piece``."""
-    narrowings = (each for each in walk(piece) if isinstance(each, Narrowing))
-    return frozenset(section for each in narrowings for section in each.sections)
-
-
-def repeatable(piece: Piece) -> None:
-    """Raise `FormatError` unless ``piece`` may be repeated: it holds exactly one value, and no section."""
-    if holds(piece) != 1:
-        raise FormatError("what is repeated must hold one value; make a record of several")
-    _refuse_sections(piece, "a repeat")
+        case Shorthand():
+            return holds(piece.expand())
 
 
 def children(piece: Piece) -> collections.abc.Sequence[Piece]:
-    """The pieces that ``piece`` is declared with; none of a shorthand that stands for others."""
+    """The pieces that ``piece`` is declared with; none of a shorthand that stands for others.
+
+    `contents` looks into those, too; they hold no section.
+    """
     match piece:
         case Section(_, body) | Record(body):
             return (body,)
@@ -349,7 +350,6 @@ def children(piece: Piece) -> collections.abc.Sequence[Piece]:
         case Maybe(inner):
             return (inner,)
         case _:
-            # A compound holds no section.
             return ()
 
 
@@ -402,11 +402,6 @@ def _sections(piece: Piece) -> Iterator[str]:
     return (each.name for each in walk(piece) if isinstance(each, Section))
 
 
-def _refuse_sections(piece: Piece, where: str) -> None:
-    if section := next(_sections(piece), None):
-        raise FormatError(f"section {section!r} must not stand within {where}")
-
-
 def _check_names(piece: Piece, above: frozenset[str]) -> frozenset[str]:
     """The names of values up to the end of ``piece``; raises `FormatError` for one missing or there twice."""
     if isinstance(piece, Choice | Maybe | FreeText | Codes | Compound | Record):
@@ -420,4 +415,6 @@ def _check_names(piece: Piece, above: frozenset[str]) -> frozenset[str]:
     if isinstance(piece, Sequence | Maybe):
         for child in children(piece):
             above = _check_names(child, above)
+    if isinstance(piece, Shorthand) and not isinstance(piece, Compound | Record):
+        return _check_names(piece.expand(), above)
     return above

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from looktwice.model.formats.contents import contents
 from looktwice.model.formats.pieces import (
     Choice,
     Codes,
@@ -19,6 +20,7 @@ from looktwice.model.formats.pieces import (
     Section,
     Sequence,
     Shorthand,
+    walk,
 )
 from looktwice.model.formats.plan_tracks import PlanTracks
 
@@ -41,8 +43,35 @@ _END: Final = frozenset([Start(None, "")])
 
 
 def check(compiled: CompiledFormat) -> None:
-    """Raise `FormatError` where a format could be read in two ways, or lacks an alphabet."""
+    """Raise `FormatError` where a format could be read in two ways, lacks an alphabet or hides a section."""
+    for piece in walk(compiled.format.body):
+        if isinstance(piece, Shorthand):
+            _refuse_sections(piece)
     _Checker(compiled).starts(compiled.format.body, "", _END)
+
+
+def check_codes(compiled: CompiledFormat, piece: Codes) -> None:
+    """Raise `FormatError` where a piece does not fit its alphabet, or the vocabulary has none."""
+    books = compiled.codebooks(piece.alphabet)
+    if len(books) not in (1, piece.count):
+        raise FormatError(
+            f"{piece.count} codes out of alphabet {piece.alphabet!r}, which has {len(books)} codebooks; "
+            "one code of each is written"
+        )
+    if piece.size is not None and any(len(book) != piece.size for book in books):
+        raise FormatError(f"alphabet {piece.alphabet!r} needs {piece.size} codes in each codebook")
+    for place, code in enumerate(piece.only or ()):
+        size = len(compiled.codebook(piece, place))
+        if code is not None and not 0 <= code < size:
+            raise FormatError(
+                f"{piece.alphabet} code {place + 1} is to be {code}, which is none of 0 to {size - 1}"
+            )
+
+
+def _refuse_sections(shorthand: Shorthand) -> None:
+    for piece in contents(shorthand):
+        if isinstance(piece, Section):
+            raise FormatError(f"section {piece.name!r} must not stand within a {type(shorthand).__name__}")
 
 
 def first_bytes(compiled: CompiledFormat, piece: Piece) -> frozenset[int]:
@@ -86,7 +115,7 @@ class _Checker:
             case FreeText():
                 return frozenset([Start(piece, section)])
             case Codes():
-                self._codes(piece)
+                check_codes(self._compiled, piece)
                 return frozenset([Start(piece, section)])
             case PlanTracks():
                 # Its times and words are none the beginning of another.
@@ -110,16 +139,6 @@ class _Checker:
                 self._apart(what, section, then, frozenset(longer[text]))
             found |= {Start(text[0], section)} if text else then
         return frozenset(found)
-
-    def _codes(self, piece: Codes) -> None:
-        books = self._compiled.codebooks(piece.alphabet)
-        if len(books) not in (1, piece.count):
-            raise FormatError(
-                f"{piece.count} codes out of alphabet {piece.alphabet!r}, which has {len(books)} codebooks; "
-                "one code of each is written"
-            )
-        if piece.size is not None and any(len(book) != piece.size for book in books):
-            raise FormatError(f"alphabet {piece.alphabet!r} needs {piece.size} codes in each codebook")
 
     def _apart(self, what: str, section: str, then: frozenset[Start], others: frozenset[int]) -> None:
         """Check that what comes behind ``what`` begins with none of ``others``, in the same section."""

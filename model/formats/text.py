@@ -168,6 +168,10 @@ class _TextReader:
             if found is None:
                 raise self.error(f"expected {piece.alphabet} code {place + 1} of {piece.count}")
             code, end = found
+            try:
+                piece.check(place, code)
+            except FormatError as error:
+                raise self.error(error.message) from error
             self._go_to(end)
             codes.append(code)
         return tuple(codes)

@@ -182,10 +182,14 @@ class _Writer:
                 f"section {section!r} needs {piece.count} codes and cannot be written from {value!r}"
             )
         for place, code in enumerate(value):
-            ids = self._compiled.codes(piece, place)
-            if isinstance(code, bool) or not isinstance(code, int) or not 0 <= code < len(ids):
-                raise FormatError(f"section {section!r}: code {code!r} is none of 0 to {len(ids) - 1}")
-            self._emit((int(ids[code]),), section)
+            book = self._compiled.codebook(piece, place)
+            if isinstance(code, bool) or not isinstance(code, int) or not 0 <= code < len(book):
+                raise FormatError(f"section {section!r}: code {code!r} is none of 0 to {len(book) - 1}")
+            try:
+                piece.check(place, code)
+            except FormatError as error:
+                raise FormatError(f"section {section!r}: {error}") from error
+            self._emit((book[code],), section)
 
     def _emit(self, ids: tuple[int, ...], section: str) -> None:
         self.tokens += [Token(token, section) for token in ids]

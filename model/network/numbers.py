@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from looktwice.model.families.picture_codes import PICTURE, levels_of
 from looktwice.model.families.registry import families_of
-from looktwice.model.formats.compounds import number_alphabets
+from looktwice.model.formats.contents import number_alphabets
 from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.model.network.vocabulary import Vocabulary
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import string
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from hypothesis import assume
@@ -22,6 +24,7 @@ from looktwice.model.formats.pieces import (
     FreeText,
     Literal,
     Maybe,
+    Narrowing,
     Option,
     Piece,
     Record,
@@ -33,7 +36,7 @@ from looktwice.model.formats.pieces import (
     holds,
 )
 from looktwice.model.formats.plan_tracks import MAX_SEGMENTS, PlanTracks
-from tests.model.formats.vocabulary import TENTHS, ByteVocabulary
+from tests.model.formats.vocabulary import PAINTS, TENTHS, ByteVocabulary
 
 
 @st.composite
@@ -106,7 +109,56 @@ def branching_formats(draw: st.DrawFn) -> Format:
 
 VOCABULARY = ByteVocabulary()
 _TEXTS = st.text("ab1<>/-,. \n;", min_size=1, max_size=3)
+_SECTIONS = ["one", "two", "three"]
 _WORDS = ["a", "ab", "abc", "b", "lost", "lost in", "1", "12", "</think>", "<", "\n"]
+
+
+@dataclass(frozen=True)
+class Quoted(Shorthand):
+    """A shorthand that the language does not know: a piece behind a sign."""
+
+    piece: Piece
+
+    def expand(self) -> Piece:
+        return Sequence((Literal(">"), self.piece))
+
+
+@dataclass(frozen=True)
+class Listed(Compound):
+    """A compound that the language does not know: all values of a piece as one tuple."""
+
+    piece: Piece
+    name: str | None = None
+
+    def expand(self) -> Piece:
+        return self.piece
+
+    def join(self, parts: tuple[Value, ...]) -> Value:
+        return parts
+
+    def split(self, value: Value) -> tuple[Value, ...]:
+        if not isinstance(value, tuple):
+            raise FormatError(f"a tuple is needed, not {value!r}")
+        return value
+
+
+@dataclass(frozen=True)
+class Fewer(Narrowing):
+    """A choice whose last options can be written behind some texts only."""
+
+    section: str
+    choice: Choice
+
+    @property
+    def sections(self) -> tuple[str, ...]:
+        return (self.section,)
+
+    def expand(self) -> Piece:
+        return self.choice
+
+    def narrowed(self, written: Mapping[str, str]) -> Piece:
+        options = self.choice.options
+        return replace(self.choice, options=options[: 1 + len(written[self.section]) % len(options)])
 
 
 class _Pieces:
@@ -119,7 +171,8 @@ class _Pieces:
         draw = self._draw
         kinds = ["literal", "text", "codes", "number", "plan"]
         if depth:
-            kinds += ["choice", "maybe", "sequence", "repeat", "record"] + ["section"] * (2 * sections)
+            kinds += ["choice", "maybe", "sequence", "repeat", "record", "quoted", "listed", "fewer"]
+            kinds += ["section"] * (2 * sections)
         name = self._name() if named else None
         match draw(st.sampled_from(kinds)):
             case "literal":
@@ -131,10 +184,19 @@ class _Pieces:
                 )
                 return FreeText(stop, draw(st.integers(*budget)), draw(st.booleans()), name)
             case "codes":
-                alphabet, count = draw(
-                    st.sampled_from([(TRAJECTORY, CODES), ("paint", 1), ("paint", 3), ("tenth", 2)])
+                alphabet, count, size = draw(
+                    st.sampled_from(
+                        [
+                            (TRAJECTORY, CODES, VOCABULARY.size),
+                            ("paint", 1, PAINTS),
+                            ("paint", 3, PAINTS),
+                            ("tenth", 2, TENTHS),
+                        ]
+                    )
                 )
-                return Codes(alphabet, count, name=name)
+                code = st.none() | st.integers(0, size - 1)
+                only = draw(st.none() | st.tuples(*[code] * count))
+                return Codes(alphabet, count, draw(st.sampled_from([None, size])), name, only=only)
             case "number":
                 if draw(st.booleans()):
                     return Number(-1.0, 1.0, 2 / (TENTHS - 1), "tenth", name)
@@ -144,13 +206,7 @@ class _Pieces:
                 some = draw(st.sets(st.sampled_from(GROUPS), min_size=1))
                 return PlanTracks(tuple(group for group in GROUPS if group in some), name)
             case "choice":
-                words = draw(st.lists(st.sampled_from(["", *_WORDS]), unique=True, min_size=1, max_size=4))
-                return Choice(
-                    tuple(
-                        Option(word, self.piece(depth - 1, sections=sections, named=named)) for word in words
-                    ),
-                    name,
-                )
+                return self._choice(depth, name, sections=sections)
             case "maybe":
                 return Maybe(self.piece(depth - 1, sections=sections, named=named), name)
             case "sequence":
@@ -167,9 +223,32 @@ class _Pieces:
                 return Repeat(item, most, least, draw(st.sampled_from(["", ", ", "\n", "a"])), name)
             case "record":
                 return Record(self.piece(depth - 1, sections=False, named=True), name)
+            case "quoted":
+                return Quoted(self.piece(depth - 1, sections=False, named=named))
+            case "listed":
+                return Listed(self.piece(depth - 1, sections=False), name)
+            case "fewer":
+                return Fewer(
+                    draw(st.sampled_from(["", *_SECTIONS])), self._choice(depth, name, sections=False)
+                )
             case _:
-                section = draw(st.sampled_from(["one", "two", "three"]))
-                return Section(section, self.piece(depth - 1, sections=sections))
+                return Section(draw(st.sampled_from(_SECTIONS)), self.piece(depth - 1, sections=sections))
+
+    def narrowed(self) -> Piece:
+        """A section, and behind it a piece that it narrows, by chance within another one."""
+        draw, section = self._draw, self._draw(st.sampled_from(_SECTIONS))
+        before = Section(section, self._choice(1, None, sections=False))
+        fewer = Fewer(section, self._choice(draw(st.integers(0, 2)), None, sections=False))
+        ways = [fewer, Quoted(fewer), Listed(fewer), Repeat(Listed(fewer), 2, draw(st.integers(0, 2)), ", ")]
+        return Sequence((before, draw(st.sampled_from(ways)), Literal(draw(st.sampled_from(["", "."])))))
+
+    def _choice(self, depth: int, name: str | None, *, sections: bool) -> Choice:
+        """A choice between words, and at some depth what follows each."""
+        words = self._draw(st.lists(st.sampled_from(["", *_WORDS]), unique=True, min_size=1, max_size=4))
+        if not depth:
+            return Choice(tuple(map(Option, words)), name)
+        then = [self.piece(depth - 1, sections=sections, named=name is not None) for _ in words]
+        return Choice(tuple(map(Option, words, then)), name)
 
     def _name(self) -> str:
         self._names += 1
@@ -180,7 +259,12 @@ class _Pieces:
 def compiled_formats(draw: st.DrawFn) -> CompiledFormat:
     """Formats made of all pieces, among them only those that can be read without doubt."""
     pieces = _Pieces(draw)
-    parts = [pieces.piece(draw(st.integers(0, 3)), sections=True) for _ in range(draw(st.integers(1, 3)))]
+    parts = [
+        pieces.narrowed()
+        if draw(st.integers(0, 2)) == 2
+        else pieces.piece(draw(st.integers(0, 3)), sections=True)
+        for _ in range(draw(st.integers(1, 3)))
+    ]
     try:
         body = Sequence((*parts, Literal("<|im_end|>")))
         return CompiledFormat(Format("made up", body), VOCABULARY)
@@ -192,48 +276,74 @@ def compiled_formats(draw: st.DrawFn) -> CompiledFormat:
 @st.composite
 def values_of(draw: st.DrawFn, compiled: CompiledFormat) -> Values:
     """Values of a whole response."""
-    values: dict[str, list[tuple[str | None, Value]]] = {}
-    _say(draw, compiled, compiled.format.body, values.setdefault("", []), values)
-    return Values({name: tuple(value for _, value in said) for name, said in values.items() if said})
+    response = _Response(draw, compiled)
+    response.say(compiled.format.body, "", response.values.setdefault("", []))
+    return Values({name: tuple(value for _, value in said) for name, said in response.values.items() if said})
 
 
 _Said = list[tuple[str | None, Value]]
 
 
-def _say(
-    draw: st.DrawFn, compiled: CompiledFormat, piece: Piece, into: _Said, sections: dict[str, _Said]
-) -> None:
-    match piece:
-        case Sequence(parts):
-            for part in parts:
-                _say(draw, compiled, part, into, sections)
-        case Section(name, body):
-            _say(draw, compiled, body, sections.setdefault(name, []), sections)
-        case Choice(options, name):
-            option = draw(st.sampled_from(options))
-            into.append((name, option.text))
-            _say(draw, compiled, option.then, into, sections)
-        case Maybe(inner, name):
-            into.append((name, draw(st.booleans())))
-            if into[-1][1]:
-                _say(draw, compiled, inner, into, sections)
-        case FreeText(stop, most, multiline, name):
-            letters = sorted({*"ab1 <", *stop, "\n"} if multiline else {*"ab1 <", *stop} - {"\n"})
-            text = draw(st.text(letters, min_size=1, max_size=most))
-            assume((text + stop).find(stop) == len(text))
-            into.append((name, text))
-        case Codes(_, count):
-            sizes = [len(compiled.codes(piece, place)) for place in range(count)]
-            into.append((piece.name, tuple(draw(st.integers(0, size - 1)) for size in sizes)))
-        case PlanTracks(groups, name):
-            into.append((name, draw(plans(groups))))
-        case Record(body, name):
-            fields: _Said = []
-            _say(draw, compiled, body, fields, sections)
-            into.append((name, {str(field): value for field, value in fields}))
-        case Compound():
-            said: _Said = []
-            _say(draw, compiled, compiled.expanded(piece), said, sections)
-            into.append((piece.name, piece.join(tuple(value for _, value in said))))
-        case Shorthand():
-            _say(draw, compiled, compiled.expanded(piece), into, sections)
+class _Response:
+    """Draws values by section; the texts of sections tell what narrows the pieces behind them."""
+
+    def __init__(self, draw: st.DrawFn, compiled: CompiledFormat) -> None:
+        self._draw, self._compiled = draw, compiled
+        self._texts: dict[str, str] = {}
+        self.values: dict[str, _Said] = {}
+
+    def say(self, piece: Piece, section: str, into: _Said) -> None:
+        """Draw the values of a piece in a section."""
+        draw = self._draw
+        match piece:
+            case Literal(text):
+                self._write(text, section)
+            case Sequence(parts):
+                for part in parts:
+                    self.say(part, section, into)
+            case Section(name, body):
+                self.say(body, name, self.values.setdefault(name, []))
+            case Choice(options, name):
+                option = draw(st.sampled_from(options))
+                into.append((name, option.text))
+                self._write(option.text, section)
+                self.say(option.then, section, into)
+            case Maybe(inner, name):
+                into.append((name, draw(st.booleans())))
+                if into[-1][1]:
+                    self.say(inner, section, into)
+            case FreeText(stop, most, multiline, name):
+                letters = sorted({*"ab1 <", *stop, "\n"} if multiline else {*"ab1 <", *stop} - {"\n"})
+                text = draw(st.text(letters, min_size=1, max_size=most))
+                assume((text + stop).find(stop) == len(text))
+                into.append((name, text))
+                self._write(text + stop, section)
+            case Codes(_, count):
+                into.append((piece.name, tuple(self._code(piece, place, section) for place in range(count))))
+            case PlanTracks(groups, name):
+                plan = draw(plans(groups))
+                into.append((name, plan))
+                self._write(str(plan), section)
+            case Record(body, name):
+                fields: _Said = []
+                self.say(body, section, fields)
+                into.append((name, {str(field): value for field, value in fields}))
+            case Compound():
+                said: _Said = []
+                self.say(self._compiled.expanded(piece), section, said)
+                into.append((piece.name, piece.join(tuple(value for _, value in said))))
+            case Narrowing():
+                written = {name: self._texts.get(name, "") for name in piece.sections}
+                self.say(piece.narrowed(written), section, into)
+            case Shorthand():
+                self.say(self._compiled.expanded(piece), section, into)
+
+    def _code(self, piece: Codes, place: int, section: str) -> int:
+        ids = self._compiled.codes(piece, place)
+        token = int(ids[self._draw(st.integers(0, len(ids) - 1))])
+        code = token - self._compiled.codebook(piece, place).start
+        self._write(list(self._compiled.spellings(piece, place).position_of)[code], section)
+        return code
+
+    def _write(self, text: str, section: str) -> None:
+        self._texts[section] = self._texts.get(section, "") + text

@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from looktwice.model.formats.cursor import CompiledFormat, Cursor, Token
+from looktwice.model.formats.contents import number_alphabets
+from looktwice.model.formats.cursor import AtCode, CompiledFormat, Cursor, Token
 from looktwice.model.formats.pieces import FormatError
 from looktwice.model.formats.text import parse, parse_beginning
 from tests.model.formats.strategies import VOCABULARY, compiled_formats, values_of
@@ -94,15 +95,31 @@ def test_what_the_cursor_writes_parses_and_renders_to_the_same_text(
     assert VOCABULARY.decode(ids_of(compiled.render(parse(compiled, text)))) == text
 
 
+@given(compiled_formats(), st.integers(0, 2**32 - 1))
+def test_the_alphabets_of_codes_that_are_written_are_told(compiled: CompiledFormat, seed: int) -> None:
+    told, cursor = number_alphabets(compiled.format.body), compiled.start()
+    for token in walk(cursor, seed):
+        if isinstance(cursor.active, AtCode) and cursor.active.piece.size is not None:
+            assert told[cursor.active.piece.alphabet] == cursor.active.piece.size
+        cursor = cursor.advance(token.id)
+
+
 @given(st.data(), compiled_formats(), st.integers(0, 2**32 - 1))
 def test_a_changed_text_parses_only_if_the_cursor_can_write_it(
     data: st.DataObject, compiled: CompiledFormat, seed: int
 ) -> None:
-    text = VOCABULARY.decode(ids_of(walk(compiled.start(), seed)))
-    place = data.draw(st.integers(0, len(text)))
-    cut = data.draw(st.integers(0, 3))
-    put = data.draw(st.sampled_from(["", "a", "b", "<", "1", "\n", ",", "-", " ", text[place : place + 9]]))
-    changed = text[:place] + put + text[place + cut :]
+    ids = ids_of(walk(compiled.start(), seed))
+    text = VOCABULARY.decode(ids)
+    if data.draw(st.booleans()):
+        place = data.draw(st.integers(0, len(text)))
+        cut = data.draw(st.integers(0, 3))
+        put = ["", "a", "b", "<", "1", "\n", ",", "-", " ", text[place : place + 9]]
+        changed = text[:place] + data.draw(st.sampled_from(put)) + text[place + cut :]
+    else:
+        # The next token of the vocabulary is the next code, or the next letter.
+        place = data.draw(st.integers(0, len(ids) - 1))
+        other = min(ids[place] + 1, len(VOCABULARY) - 1)
+        changed = VOCABULARY.decode([*ids[:place], other, *ids[place + 1 :]])
     try:
         values = parse(compiled, changed)
     except FormatError:

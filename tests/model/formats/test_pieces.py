@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from looktwice.model.driving.plan import GROUPS, WORDS, parse_plan
 from looktwice.model.families.trajectory_codes import CODES, TRAJECTORY
-from looktwice.model.formats.compounds import MAX_REPEATS, Number, Repeat, number_alphabets
+from looktwice.model.formats.compounds import MAX_REPEATS, Number, Repeat
+from looktwice.model.formats.contents import number_alphabets
 from looktwice.model.formats.cursor import CompiledFormat, Cursor
 from looktwice.model.formats.pieces import (
     Choice,
@@ -30,7 +31,7 @@ from looktwice.model.formats.pieces import (
 from looktwice.model.formats.plan_tracks import PlanTracks
 from looktwice.model.formats.text import parse
 from tests.model.formats.phrases import PHRASES
-from tests.model.formats.strategies import VOCABULARY, values_of
+from tests.model.formats.strategies import VOCABULARY, Fewer, Listed, Quoted, values_of
 from tests.model.formats.test_laws import can_write, ids_of, walk
 
 END = Literal("<|im_end|>")
@@ -165,6 +166,40 @@ def test_tokens_of_a_number_are_ranked_by_the_least_number_behind_them(number: N
     assert list(allowed.ids[np.argsort(allowed.ranks)]) == sorted(least, key=least.__getitem__)
 
 
+ONLY = compile_(Section("picture", Codes("paint", 3, only=(5, None, 0))))
+
+
+def test_codes_may_be_told_by_the_format() -> None:
+    forced, cursor = ONLY.start().forced()
+    assert [VOCABULARY.texts[token.id] for token in forced] == ["<paint 5>"]
+    assert len(cursor.allowed().ids) == 8
+    text = "<paint 5><paint 7><paint 0><|im_end|>"
+    assert accepts(ONLY, text)
+    assert parse(ONLY, text)["picture"] == (5, 7, 0)
+    assert VOCABULARY.decode(ids_of(ONLY.render(Values.of({"picture": (5, 7, 0)})))) == text
+
+
+def test_other_codes_than_those_told_are_refused() -> None:
+    assert not accepts(ONLY, "<paint 5><paint 7><paint 1><|im_end|>")
+    with pytest.raises(FormatError, match="paint code 3 of 3 can only be 0, not 1") as caught:
+        parse(ONLY, "<paint 5><paint 7><paint 1><|im_end|>")
+    assert (caught.value.line, caught.value.column) == (1, 19)
+    with pytest.raises(FormatError, match="section 'picture': paint code 1 of 3 can only be 5, not 0"):
+        ONLY.render(Values.of({"picture": (0, 7, 0)}))
+
+
+XY = Choice((Option("x"), Option("y")))
+
+
+@pytest.mark.parametrize("piece", [Repeat(Fewer("long", XY), 2, 1), Listed(Fewer("long", XY))])
+def test_what_narrows_reaches_into_other_pieces(piece: Piece) -> None:
+    long = Section("long", Choice((Option("a"), Option("bb"))))
+    compiled = compile_(long, Section("s", Sequence((piece, Literal(".")))))
+    assert accepts(compiled, "ay.<|im_end|>")
+    assert accepts(compiled, "bbx.<|im_end|>")
+    assert not accepts(compiled, "bby.<|im_end|>")
+
+
 def test_words_have_no_ranks() -> None:
     assert compile_(Section("sign", Choice((Option("a"), Option("b"))))).start().allowed().ranks is None
 
@@ -186,6 +221,8 @@ def test_alphabets_of_numbers_are_told() -> None:
     within = Section("answer", Repeat(Record(Sequence((Literal("("), tenth, Literal(")")))), 3))
     assert number_alphabets(Choice((Option("a", within), Option("b", Number(0, 9, 1))))) == {"tenth": 21}
     assert number_alphabets(Sequence((Codes("paint", 3, 8), Codes("trajectory", 6)))) == {"paint": 8}
+    foreign = Quoted(Listed(Fewer("", Choice((Option("a", tenth), Option("b", Codes("paint", 1, 8)))))))
+    assert number_alphabets(Section("answer", foreign)) == {"tenth": 21, "paint": 8}
 
 
 NUMBER = compile_(Section("speed", Sequence((Number(0, 120, 1), Literal(" km/h")))))
@@ -292,6 +329,12 @@ CODED = Section("trajectory", Codes(TRAJECTORY, CODES))
         (Codes(TRAJECTORY, 96), "96 codes out of alphabet 'trajectory', which has 6 codebooks"),
         (Codes("sounds", 1), "no alphabet 'sounds'; it has trajectory, paint, tenth"),
         (Number(0, 9, 1, "tenth"), "needs 10 codes"),
+        (Codes("paint", 2, only=(None, 8)), "paint code 2 is to be 8, which is none of 0 to 7"),
+        (Codes("paint", 2, only=(-1, None)), "paint code 1 is to be -1, which is none of 0 to 7"),
+        (Record(CODED), "section 'trajectory' must not stand within a Record"),
+        (Repeat(Sequence((POSE, CODED)), 3), "section 'trajectory' must not stand within a Repeat"),
+        (Choice((Option("a", Quoted(Listed(CODED))),)), "must not stand within a Quoted"),
+        (Fewer("", Choice((Option("a", CODED),))), "must not stand within a Fewer"),
         (Sequence((Choice((Option("a"), Option("ab"))), Literal("b"))), "may begin with b'b' too"),
         (Choice((Option("a"), Option("ab", Literal("!")))), "followed by|end of the response"),
         (Sequence((Maybe(FreeText("\n", 9)), Literal("a"))), "is in doubt"),
@@ -309,6 +352,7 @@ def test_a_format_that_could_be_read_in_two_ways_does_not_compile(part: Piece, m
     ("make", "message"),
     [
         (lambda: Codes(TRAJECTORY, 0), "at least one code"),
+        (lambda: Codes("paint", 2, only=(1,)), "2 codes are written, and `only` tells of 1"),
         (lambda: Number(1, 0, 1), "no numbers from"),
         (lambda: Number(0, 1, 0.3), "no whole number of steps"),
         (lambda: Number(0, 1, 1e-5), "more than 10000 numbers"),
@@ -316,10 +360,12 @@ def test_a_format_that_could_be_read_in_two_ways_does_not_compile(part: Piece, m
         (lambda: Repeat(POSE, 1, 2), "2 to 1 repeats"),
         (lambda: Repeat(Literal("a"), 3), "must hold one value"),
         (lambda: Repeat(Sequence((POSE, POSE)), 3), "make a record"),
-        (lambda: Repeat(Sequence((POSE, CODED)), 3), "must not stand within a repeat"),
+        (lambda: Repeat(Quoted(Literal("a")), 3), "must hold one value"),
+        (lambda: Repeat(Quoted(Sequence((POSE, POSE))), 3), "make a record"),
         (lambda: Record(POSE), "needs a name, as does this Number"),
         (lambda: Record(Sequence((Number(0, 1, 1, name="x"),) * 2)), "two values named 'x'"),
-        (lambda: Record(CODED), "must not stand within a record"),
+        (lambda: Record(Quoted(POSE)), "needs a name, as does this Number"),
+        (lambda: Record(Fewer("", Choice((Option("a"),)))), "needs a name, as does this Choice"),
         (lambda: Choice(()), "options of different texts"),
         (lambda: Choice((Option("a"), Option("a"))), "options of different texts"),
         (lambda: FreeText("", 9), "needs a stop"),
