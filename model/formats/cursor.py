@@ -33,10 +33,11 @@ from looktwice.model.formats.pieces import (
     Shorthand,
     Texts,
     Values,
+    walk,
     with_picks,
 )
 from looktwice.model.formats.plan_tracks import with_given
-from looktwice.model.formats.starts import check, first_bytes
+from looktwice.model.formats.starts import check, check_codes, first_bytes
 from looktwice.model.formats.trie import Node, build_trie
 from looktwice.model.formats.writing import Token as Token
 from looktwice.model.formats.writing import write
@@ -167,7 +168,12 @@ class CompiledFormat:
         """
         body = self.body(given)
         body = with_picks(body, picks) if picks else body
-        return self._enter((with_fixed(body, fixed) if fixed else body, "", None), None)
+        if fixed:
+            body = with_fixed(body, fixed)
+            for piece in walk(body):
+                if isinstance(piece, Codes):
+                    check_codes(self, piece)
+        return self._enter((body, "", None), None)
 
     def body(self, given: Mapping[str, Plan] | None = None) -> Piece:
         """The format's declaration, with the plans of the sections in ``given`` forced; see `start`."""

@@ -14,6 +14,7 @@ from looktwice.model.formats.pieces import (
     FormatError,
     Literal,
     Maybe,
+    Narrowing,
     Piece,
     Record,
     Section,
@@ -72,12 +73,15 @@ def _decided(piece: Piece, values: ValueSource | None, sources: Mapping[str, Val
                     return Sequence((Literal(option.text), _decided(option.then, values, sources)))
             raise FormatError(f"{text!r} is none of {', '.join(option.text for option in options)}")
         case Maybe(inner, name):
-            return _decided(inner, values, sources) if values.take(name) else Literal("")
+            there = values.take(name)
+            if not isinstance(there, bool):
+                raise FormatError(f"{there!r} does not say whether a piece is there")
+            return _decided(inner, values, sources) if there else Literal("")
         case Codes():
             codes = values.take(piece.name)
             if not isinstance(codes, tuple) or len(codes) != piece.count:
                 raise FormatError(f"{piece.count} codes are needed, not {codes!r}")
-            return replace(piece, only=cast("tuple[int | None, ...]", codes))
+            return _with_codes(piece, cast("tuple[int | None, ...]", codes))
         case Record(body, name):
             record = values.take(name)
             if not isinstance(record, Mapping):
@@ -88,8 +92,21 @@ def _decided(piece: Piece, values: ValueSource | None, sources: Mapping[str, Val
             return decided
         case Compound():
             within = InOrder(piece.split(values.take(piece.name)), "a value")
-            return _decided(piece.expand(), within, sources)
-        case Shorthand():
+            decided = _decided(piece.expand(), within, sources)
+            within.finish()
+            return decided
+        case Shorthand() if not isinstance(piece, Narrowing):
             return _decided(piece.expand(), values, sources)
         case _:
             raise FormatError(f"what a {type(piece).__name__} says cannot be decided")
+
+
+def _with_codes(piece: Codes, codes: tuple[int | None, ...]) -> Codes:
+    """``piece`` with further codes decided; raises `FormatError` where it can only write others."""
+    for place, code in enumerate(codes):
+        if code is not None:
+            piece.check(place, code)
+    before = piece.only or (None,) * piece.count
+    return replace(
+        piece, only=tuple(old if new is None else new for old, new in zip(before, codes, strict=True))
+    )

@@ -394,6 +394,8 @@ def _with_picks(piece: Piece, picks: Mapping[str, str], left: set[str]) -> Piece
             return replace(piece, options=tuple(behind))
         case Maybe(inner, name):
             return Maybe(_with_picks(inner, picks, left), name)
+        case Record(body, name):
+            return Record(_with_picks(body, picks, left), name)
         case _:
             return piece
 

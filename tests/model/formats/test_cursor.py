@@ -12,7 +12,18 @@ from looktwice.model.families.cf_vla.format import MAX_THINKING_TOKENS
 from looktwice.model.families.cf_vla.traj_only import TRAJ_ONLY
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.fixed import FixedValues
-from looktwice.model.formats.pieces import Format, FormatError, Value, Values
+from looktwice.model.formats.pieces import (
+    Choice,
+    Format,
+    FormatError,
+    Literal,
+    Option,
+    Record,
+    Section,
+    Sequence,
+    Value,
+    Values,
+)
 from looktwice.model.formats.plan_tracks import MAX_SEGMENTS
 from looktwice.model.formats.text import parse
 from tests.model.formats.strategies import VOCABULARY, branching_formats, cf_vla_values, plans
@@ -176,6 +187,14 @@ def test_choices_can_be_made_beforehand(values: Values, picked: str) -> None:
             return
         cursor = cursor.advance(token.id)
     assert cursor.done
+
+
+def test_choices_of_a_record_can_be_made_beforehand() -> None:
+    mood = Record(Choice((Option("glad"), Option("wary")), "mood"))
+    format = Format("made up", Sequence((Section("mood", mood), Literal("<|im_end|>"))))
+    forced, cursor = CompiledFormat(format, VOCABULARY).start(picks={"mood": "wary"}).forced()
+    assert cursor.done
+    assert VOCABULARY.decode([token.id for token in forced]) == "wary<|im_end|>"
 
 
 @pytest.mark.parametrize(

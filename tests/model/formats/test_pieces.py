@@ -188,6 +188,24 @@ def test_other_codes_than_those_told_are_refused() -> None:
         ONLY.render(Values.of({"picture": (0, 7, 0)}))
 
 
+@pytest.mark.parametrize(
+    ("codes", "message"),
+    [
+        ((4, None, None), "paint code 1 of 3 can only be 5, not 4"),
+        ((5, 8, 0), "paint code 2 is to be 8, which is none of 0 to 7"),
+    ],
+)
+def test_codes_that_cannot_be_written_are_not_decided(codes: tuple[int | None, ...], message: str) -> None:
+    with pytest.raises(FormatError, match=message):
+        ONLY.start(fixed={"picture": (codes,)})
+
+
+def test_what_is_decided_adds_to_the_codes_told_by_the_format() -> None:
+    forced, cursor = ONLY.start(fixed={"picture": ((None, 3, None),)}).forced()
+    assert cursor.done
+    assert forced == ONLY.render(Values.of({"picture": (5, 3, 0)}))
+
+
 XY = Choice((Option("x"), Option("y")))
 
 
@@ -198,6 +216,27 @@ def test_what_narrows_reaches_into_other_pieces(piece: Piece) -> None:
     assert accepts(compiled, "ay.<|im_end|>")
     assert accepts(compiled, "bbx.<|im_end|>")
     assert not accepts(compiled, "bby.<|im_end|>")
+
+
+@pytest.mark.parametrize(
+    ("piece", "value", "message"),
+    [
+        (Listed(XY), ("x", "y"), "a value has more values than the format writes: 'y'"),
+        (Maybe(Literal("x")), "x", "'x' does not say whether a piece is there"),
+    ],
+)
+def test_what_cannot_be_rendered_cannot_be_decided(piece: Piece, value: Value, message: str) -> None:
+    compiled = compile_(Section("s", Sequence((piece, Literal(".")))))
+    with pytest.raises(FormatError):
+        compiled.render(Values.of({"s": value}))
+    with pytest.raises(FormatError, match=message):
+        compiled.start(fixed={"s": (value,)})
+
+
+def test_what_is_narrowed_cannot_be_decided() -> None:
+    compiled = compile_(Section("s", Fewer("", XY)))
+    with pytest.raises(FormatError, match="what a Fewer says cannot be decided"):
+        compiled.start(fixed={"s": ("y",)})
 
 
 def test_words_have_no_ranks() -> None:
