@@ -21,6 +21,7 @@ from looktwice.model.families.cf_vla.targets import (
     SKETCHED_WEIGHTS,
 )
 from looktwice.model.families.elf_vla import targets as elf_vla
+from looktwice.model.families.registry import family_named
 from looktwice.model.families.vla_world import targets as vla_world
 from looktwice.model.families.vla_world.rewards import REWARDS as VLA_WORLD_REWARDS
 from looktwice.model.training.outcome.draw_rewards import RewardWeights
@@ -315,12 +316,40 @@ NANO: Final[Mapping[str, Recipe]] = (
 outcome training."""
 
 
+RESPOND: Final = "respond"
+"""The recipe of a format that is named beside it; see `responding`."""
+
+
 def lasting(recipe: Recipe, steps: int) -> Recipe:
     """A recipe of so many steps; a shorter one warms up for less of them, in proportion."""
     return replace(
         recipe,
         steps=steps,
         warmup_steps=min(recipe.warmup_steps, recipe.warmup_steps * steps // recipe.steps),
+    )
+
+
+def responding(format_name: str, weights: SectionWeights) -> Recipe:
+    """A recipe that teaches responses of one format, of any family; sections without a weight weigh 1.
+
+    Raises:
+        FamilyError: nobody declares the format.
+        ValueError: it has no such section, or its family does not say what scenes teach.
+    """
+    family = family_named(format_name)
+    if family.teach is None or family.refines:
+        raise ValueError(f"scenes alone teach no responses in format {format_name!r}")
+    sections = family.format.sections()
+    if unknown := [section for section in weights if section not in sections]:
+        raise ValueError(
+            f"format {format_name!r} has no section {unknown[0]!r}; it has {', '.join(sections)}"
+        )
+    return replace(
+        NANO["elf-sft"],
+        name=RESPOND,
+        tasks={format_name: 1.0},
+        weights=dict.fromkeys(sections, 1.0) | dict(weights),
+        attempting=None,
     )
 
 

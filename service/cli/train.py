@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -11,10 +12,10 @@ import typer
 from typer.core import TyperArgument, TyperCommand
 
 from looktwice.model.bundled import CHECKPOINT as BUNDLED_CHECKPOINT
-from looktwice.service.cli.options import reported_errors
+from looktwice.service.cli.options import folder_along, reported_errors
 
 _RECIPES: Final = (
-    "create, {}; branch: when to look twice, learned alone; "
+    "create, {}; respond: a format of any family; branch: when to look twice, learned alone; "
     "ladder: from create to counterfactual, with a data set of own plans round by round, and the table; "
     "blind, teacher: the small planners of the tables, without pictures; "
     "visual-codes: pictures as codes, for models that imagine; "
@@ -43,8 +44,10 @@ def train(
         Path | None,
         typer.Option(
             "--from",
-            help="Checkpoint folder to start from; of a ladder one that writes meta-actions, for composer "
-            "one that imagines, or codes alone; for create a stock Qwen2.5-VL, which is expanded.",
+            help="Checkpoint folder to start from, or one that comes along; of a ladder one that writes "
+            "meta-actions, for composer one that imagines, or codes alone; for create a stock Qwen2.5-VL, "
+            "which is expanded.",
+            callback=lambda source: source and folder_along(source),
         ),
     ] = None,
     vision_from: Annotated[Path | None, typer.Option(help="Checkpoint whose vision tower is taken.")] = None,
@@ -107,6 +110,15 @@ def train(
             "expert did."
         ),
     ] = None,
+    format_name: Annotated[
+        str | None, typer.Option("--format", help="respond: the format to teach, by its family's name.")
+    ] = None,
+    weigh: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="respond: SECTION=WEIGHT of a section's tokens in the loss, instead of 1; again for more."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of order and initialisation.")] = 0,
     threads: Annotated[int | None, typer.Option(help="CPU threads.", min=1)] = None,
     bf16: Annotated[
@@ -152,7 +164,16 @@ def train(
     from looktwice.model.training.branch import NAME as BRANCH
     from looktwice.model.training.branch import train_branch
     from looktwice.model.training.composer import train_composer
-    from looktwice.model.training.recipes import COMPOSER, NANO, PAPER, VISUAL_CODES, lasting, refining_with
+    from looktwice.model.training.recipes import (
+        COMPOSER,
+        NANO,
+        PAPER,
+        RESPOND,
+        VISUAL_CODES,
+        lasting,
+        refining_with,
+        responding,
+    )
     from looktwice.model.training.run import RunSettings, create, run
     from looktwice.model.training.small import SmallSettings
     from looktwice.model.training.visual_codes import train_visual_codes
@@ -195,8 +216,14 @@ def train(
             climb(target, of_ladder, source, options, every=every, processes=processes, workers=following)
             return
         recipes = {each.name: each for each in (VISUAL_CODES, COMPOSER)} | dict(PAPER if paper else NANO)
+        if recipe == RESPOND:
+            if format_name is None:
+                raise ValueError("give the format to teach: --format NAME")
+            recipes[RESPOND] = responding(format_name, _weights(weigh or ()))
+        elif format_name is not None or weigh:
+            raise ValueError(f"{recipe} takes no --format and no --weigh: it has its own")
         if recipe not in recipes:
-            known = ", ".join(["create", BRANCH, "ladder", *DRIVING_KINDS, *recipes])
+            known = ", ".join(["create", RESPOND, BRANCH, "ladder", *DRIVING_KINDS, *recipes])
             raise ValueError(f"unknown recipe {recipe!r}; known are {known}")
         chosen = recipes[recipe]
         chosen = replace(
@@ -245,6 +272,20 @@ def train(
             followed or (),
         )
         training_curves(target / LOG_FILE, target / "curves.png")
+
+
+def _weights(given: Sequence[str]) -> dict[str, float]:
+    """What ``SECTION=WEIGHT`` says, by section; raises ValueError for what says something else."""
+    weights = {}
+    for each in given:
+        section, _, weight = each.partition("=")
+        try:
+            weights[section] = float(weight)
+        except ValueError:
+            raise ValueError(f"--weigh takes SECTION=WEIGHT, not {each!r}") from None
+        if not 0 <= weights[section] < math.inf:
+            raise ValueError(f"--weigh {each}: a weight is 0 or more")
+    return weights
 
 
 def _tell(figures: Mapping[str, float]) -> None:

@@ -18,8 +18,8 @@ from looktwice.model.families.registry import GROUP
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "add-a-family.md").read_text()
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", PAGE, re.S)
-MODULE, TRAINING = "\n\n".join(code for kind, code in BLOCKS[:4]), BLOCKS[5][1]
-COMMANDS = BLOCKS[6][1].splitlines()
+MODULE = "\n\n".join(code for kind, code in BLOCKS[:4])
+COMMANDS = [line.split() for _, code in BLOCKS[5:] for line in code.splitlines()]
 
 
 @pytest.fixture(scope="module")
@@ -52,12 +52,11 @@ def run(folder: Path, *command: str) -> str:
 
 
 def test_its_package_is_trained_and_planned_with(installed: Path) -> None:
-    assert [kind for kind, _ in BLOCKS] == ["python"] * 4 + ["toml", "python", "bash"]
-    short = TRAINING.replace("steps=2000", "steps=2, batch_size=2")
-    assert short != TRAINING
-    run(installed, sys.executable, "-c", short)
-    plan, evaluate = (line.split() for line in COMMANDS)
+    assert [kind for kind, _ in BLOCKS] == ["python"] * 4 + ["toml", "bash", "bash"]
+    train, plan, evaluate = COMMANDS
+    assert train[-2:] == ["--steps", "2000"]
     looktwice = str(Path(sys.executable).with_name("looktwice"))
+    run(installed, looktwice, *train[1:-1], "2", "--batch-size", "2")
     planned = run(installed, looktwice, *plan[1:])
     assert "in 4 s at" in planned
     table = run(installed, looktwice, *evaluate[1:])

@@ -79,7 +79,12 @@ def test_what_is_no_backbone_is_refused_by_name(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("recipe", "ignored"),
-    [("branch", ["--failures", "failures.parquet"]), ("branch", ["--steps", "5"]), ("blind", ["--compiled"])],
+    [
+        ("branch", ["--failures", "failures.parquet"]),
+        ("branch", ["--steps", "5"]),
+        ("blind", ["--compiled"]),
+        ("meta-act", ["--format", "traj_only"]),
+    ],
 )
 def test_options_that_a_recipe_would_ignore_are_refused(
     tmp_path: Path, recipe: str, ignored: list[str]
@@ -89,6 +94,25 @@ def test_options_that_a_recipe_would_ignore_are_refused(
     refused = ran("train", recipe, "--scenes", scenes, "--to", tmp_path / "made", "--threads", "2", *ignored)
     assert refused.exit_code == 2
     assert f"{recipe} takes no {ignored[0]}" in refused.output
+    assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ([], "give the format to teach"),
+        (
+            ["--format", "traj_only", "--weigh", "trajectory"],
+            "SECTION=WEIGHT, not 'trajectory'",
+        ),
+        (["--format", "traj_only", "--weigh", "trajectory=-1"], "a weight is 0 or more"),
+        (["--format", "traj_only", "--weigh", "plan=2"], "no section 'plan'"),
+    ],
+)
+def test_a_format_that_cannot_be_taught_is_refused(tmp_path: Path, given: list[str], told: str) -> None:
+    refused = ran("train", "respond", "--scenes", tmp_path, "--to", tmp_path / "made", *given)
+    assert refused.exit_code == 2
+    assert told in refused.output
     assert not (tmp_path / "made").exists()
 
 
