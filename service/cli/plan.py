@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from looktwice.model.engines.engine import Draw, PlanRequest
     from looktwice.model.network.model_card import ModelCard
 
-_MOST_NUMBERS: Final = 20
 _BESIDE_REQUESTS: Final = ("scenes", "checkpoint", "limit", "skip", "out", "as_json")
 """What a request does not say itself."""
 
@@ -169,6 +168,8 @@ async def _plan(
 
 def _told(scene_id: str, draws: list[Draw], chosen: int) -> list[str]:
     """Each draw in a line, and what the one to drive by says."""
+    from looktwice.service.planning.section_text import section_text
+
     lines = [f"scene {scene_id}"]
     for draw in draws:
         x_m, y_m, *_ = draw.trajectory[-1]
@@ -186,24 +187,9 @@ def _told(scene_id: str, draws: list[Draw], chosen: int) -> list[str]:
     if draw.revised_plan is not None:
         lines += ["", "Revised meta actions:", str(draw.revised_plan).rstrip()]
     for name, values in draw.sections.items():
-        if said := _said(values).strip():
-            lines += ["", f"{name.replace('_', ' ').capitalize()}: {said}"]
+        if said := section_text(name, values):
+            lines += ["", said]
     return lines
-
-
-def _said(value: Any) -> str:
-    """A value by its kind, as the inspector says it: records in a line each, long rows of numbers counted."""
-    if isinstance(value, dict):
-        return ", ".join(f"{name.replace('_', ' ')} {_said(inner)}" for name, inner in value.items())
-    if not isinstance(value, list):
-        return f"{value:g}" if isinstance(value, float) else str(value)
-    if len(value) > _MOST_NUMBERS and all(isinstance(each, int | float) for each in value):
-        return f"{len(value)} numbers"
-    return "".join(_said(each) + ("\n" if _of_records(each) else " ") for each in value).rstrip()
-
-
-def _of_records(value: Any) -> bool:
-    return isinstance(value, dict) or (isinstance(value, list) and any(map(_of_records, value)))
 
 
 def _as_json(scene_id: str, draws: list[Any], chosen: int, picture: Path) -> dict[str, Any]:

@@ -9,9 +9,10 @@ from typing import Any, Final
 import looktwice.clients.wire as wire
 from looktwice.service.openai.chat_requests import ChatRequest
 from looktwice.service.planning.events import PlannedScene
+from looktwice.service.planning.section_text import section_text
+from looktwice.service.planning.telling import PlanTeller, Written
 from looktwice.service.planning.wire_answers import plan_answer, wire_branch
 
-THINKING: Final = f"{wire_branch(looked_twice=True)} "
 _EVERY: Final = 5
 """Of the poses at 10 Hz, a message tells one in so many: every half second."""
 
@@ -35,13 +36,13 @@ class Completion:
         }
         self._request_id = completion_id
 
-    def whole(self, planned: PlannedScene) -> dict[str, Any]:
-        """The answer at once."""
+    def whole(self, planned: PlannedScene, teller: PlanTeller) -> dict[str, Any]:
+        """The answer at once; ``teller`` tells of its format."""
         answer = plan_answer(planned, self._request_id)
         choices = [
             {
                 "index": draw.index,
-                "message": {"role": "assistant", "content": text_of(draw)} | self._extra(draw),
+                "message": {"role": "assistant", "content": self._content(draw, teller)} | self._extra(draw),
                 "finish_reason": "stop",
                 "logprobs": None,
             }
@@ -50,13 +51,14 @@ class Completion:
         told = {"choices": choices, "usage": self._usage(planned), "looktwice": _outcome(answer)}
         return self._head | {"object": "chat.completion"} | told
 
-    def delta(self, index: int, text: str, *, own_line: bool = False) -> dict[str, Any]:
-        """More of one choice, on a line of its own where that is wanted; all of it makes `text_of`."""
+    def delta(self, name: str, part: Written) -> dict[str, Any] | None:
+        """What a part of a draw adds to its choice; None where it adds nothing."""
         # Clients join deltas field by field, so the role is told once.
-        role = {} if index in self._told else {"role": "assistant"}
-        content = _behind(self._told.get(index, ""), text) if own_line else text
-        self._told[index] = content
-        return self._chunk([{"index": index, "delta": role | {"content": content}}])
+        role = {} if part.index in self._told else {"role": "assistant"}
+        content = self._more(name, part)
+        if not content:
+            return None
+        return self._chunk([{"index": part.index, "delta": role | {"content": content}}])
 
     def last(self, planned: PlannedScene) -> list[dict[str, Any]]:
         """What ends a stream."""
@@ -70,6 +72,19 @@ class Completion:
         if options is not None and options.include_usage:
             chunks.append(self._chunk([]) | {"usage": self._usage(planned)})
         return chunks
+
+    def _content(self, draw: wire.Draw, teller: PlanTeller) -> str:
+        """A whole message: what a stream adds up to."""
+        return "".join(self._more(name, part) for name, part in teller.finished(draw))
+
+    def _more(self, name: str, part: Written) -> str:
+        """What a part of a draw adds to its message, on a line of its own; but words go on where they are."""
+        text, told = _text_of(name, part), self._told.get(part.index, "")
+        if not text:
+            return ""
+        goes_on = not told or told.endswith("\n") or isinstance(part, wire.ThinkingWritten)
+        self._told[part.index] = text
+        return text if goes_on else f"\n{text}"
 
     def _chunk(self, choices: list[dict[str, Any]]) -> dict[str, Any]:
         return self._head | {"object": "chat.completion.chunk", "choices": choices}
@@ -89,22 +104,24 @@ def _outcome(answer: wire.PlanResponse) -> dict[str, Any]:
     return answer.model_dump(include={"deadline", "agreed", "timing"})
 
 
-def text_of(draw: wire.Draw) -> str:
-    """A draw as a message."""
-    told = "" if draw.plan is None else draw.plan.text
-    if draw.thinking is not None:
-        told += (THINKING if draw.branch == wire_branch(looked_twice=True) else "") + draw.thinking
-    if draw.revised_plan is not None:
-        told += _behind(told, draw.revised_plan.text)
-    return told + _behind(told, trajectory_text(draw.trajectory, draw.times_s))
+def _text_of(name: str, part: Written) -> str:
+    """A part of a draw as text, by its kind: a plan, an option, words, a section or a trajectory."""
+    match part:
+        case wire.PlanWritten():
+            return part.plan.text
+        case wire.BranchTaken() if part.branch == wire_branch(looked_twice=True):
+            return f"{part.branch} "
+        case wire.ThinkingWritten():
+            return part.text
+        case wire.SectionWritten():
+            text = section_text(part.section.name, part.section.values)
+            return f"{text}\n" if text else ""
+        case wire.TrajectoryWritten() if name != "draft_trajectory":
+            return _trajectory_text(part.trajectory, part.times_s)
+    return ""
 
 
-def _behind(told: str, text: str) -> str:
-    """``text`` on a line of its own behind what was told."""
-    return text if not told or told.endswith("\n") else f"\n{text}"
-
-
-def trajectory_text(trajectory: list[list[float]], times_s: list[float] | None) -> str:
+def _trajectory_text(trajectory: list[list[float]], times_s: list[float] | None) -> str:
     """A trajectory as a line of text: x and y in m, heading in rad, every half second or at its own times."""
     told = trajectory[_EVERY - 1 :: _EVERY] if times_s is None else trajectory
     rows = [[round(x, 2), round(y, 2), round(heading, 3)] for x, y, _, heading in told]

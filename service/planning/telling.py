@@ -68,6 +68,31 @@ class PlanTeller:
                 return [("trajectory", trajectory)]
         return []
 
+    def finished(self, draw: wire.Draw) -> list[tuple[str, Written]]:
+        """The events of a whole draw, in the order of its response."""
+        family, index = self._family, draw.index
+        told: dict[str | None, tuple[str, Written]] = {
+            section.name: ("section", wire.SectionWritten(index=index, section=section))
+            for section in draw.sections
+        }
+        if family.branch is not None and draw.branch is not None:
+            told[family.branch.name] = ("branch", wire.BranchTaken(index=index, branch=draw.branch))
+        if draw.thinking:
+            told[family.reflection] = ("thinking", wire.ThinkingWritten(index=index, text=draw.thinking))
+        if draw.plan is not None:
+            told[family.first_plan] = ("plan", wire.PlanWritten(index=index, plan=draw.plan))
+        if draw.revised_plan is not None:
+            revised = wire.PlanWritten(index=index, plan=draw.revised_plan)
+            told[family.revised_plan] = ("revised_plan", revised)
+        trajectory = wire.TrajectoryWritten(
+            index=index,
+            trajectory=draw.trajectory,
+            times_s=draw.times_s,
+            consistent=draw.consistent,
+            disagreements=draw.disagreements,
+        )
+        return [*(told[section] for section in draw.tokens if section in told), ("trajectory", trajectory)]
+
     def _words(self, index: int, text: str) -> list[tuple[str, Written]]:
         if not text:
             return []

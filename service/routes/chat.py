@@ -17,12 +17,11 @@ from looktwice.service.http.openapi import Responses, event_stream, problems
 from looktwice.service.http.payloads import payload_route
 from looktwice.service.http.problem_documents import validated
 from looktwice.service.openai.chat_requests import ChatPlaces, ChatRequest, check_model, plan_document
-from looktwice.service.openai.completions import THINKING, Completion, trajectory_text
+from looktwice.service.openai.completions import Completion
 from looktwice.service.planning.events import PlannedScene
 from looktwice.service.planning.submitting import last
 from looktwice.service.planning.telling import PlanTeller, Written
 from looktwice.service.planning.validation import format_of
-from looktwice.service.planning.wire_answers import wire_branch
 from looktwice.service.problems import (
     DRAINING,
     ENGINE_FAILED,
@@ -72,7 +71,8 @@ def chat_router(deps: Dependencies) -> APIRouter:
             asked = validated(wire.PlanRequest, plan_document(chat, card))
             events = deps.planning.events(asked, arrival)
             if not chat.stream:
-                return JSONResponse(completion.whole(await while_connected(request, last(events))))
+                planned = await while_connected(request, last(events))
+                return JSONResponse(completion.whole(planned, PlanTeller(format_of(asked, card))))
             return await streamed(
                 request,
                 events,
@@ -106,26 +106,11 @@ async def _chunks(
                 if isinstance(event, PlannedScene):
                     for chunk in completion.last(event):
                         yield _data(chunk)
-                elif (text := _text(*event)) is not None:
-                    own_line = isinstance(event[1], wire.PlanWritten | wire.TrajectoryWritten)
-                    yield _data(completion.delta(event[1].index, text, own_line=own_line))
+                elif (delta := completion.delta(*event)) is not None:
+                    yield _data(delta)
         except ProblemError as error:
             yield _data({"error": dialect_error(places.problem(error))})
     yield b"data: [DONE]\n\n"
-
-
-def _text(name: str, data: Written) -> str | None:
-    """What an event adds to a message; see `text_of`."""
-    match data:
-        case wire.PlanWritten():
-            return data.plan.text
-        case wire.BranchTaken() if data.branch == wire_branch(looked_twice=True):
-            return THINKING
-        case wire.ThinkingWritten():
-            return data.text
-        case wire.TrajectoryWritten() if name == "trajectory":
-            return trajectory_text(data.trajectory, data.times_s)
-    return None
 
 
 def _data(chunk: dict[str, Any]) -> bytes:

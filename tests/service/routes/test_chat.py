@@ -19,10 +19,12 @@ from looktwice.model.bundled import CHECKPOINT
 from looktwice.model.driving.scene import Scene
 from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings
 from looktwice.model.network.checkpoint import read_parts
+from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.service.operations.keys import new_line
 from looktwice.service.operations.settings import Settings
+from looktwice.service.planning.section_text import section_text
 from looktwice.service.problems import INVALID_IMAGE, at
-from tests.checkpoints import made_up_tracks, noisy_scene
+from tests.checkpoints import made_up_tracks, noisy_scene, write_untrained
 from tests.service.http.test_problem_documents import problem
 from tests.service.scenes import scene
 from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
@@ -48,6 +50,42 @@ def messages(of: Scene | None = None) -> list[ChatCompletionMessageParam]:
 
 def extra(**fields: Any) -> dict[str, Any]:
     return {"looktwice": {"history": SCENE["history"], "route": SCENE["route"]} | fields}
+
+
+@pytest.fixture(scope="module")
+def families(toy_family: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[openai.OpenAI]:
+    """An untrained checkpoint of families that have sections of their own, or other times."""
+    settings = VlaSettings(name="own", formats=("toy", "elf_vla", "vla_world"), reflection="phrases")
+    checkpoint = write_untrained(tmp_path_factory.mktemp("own") / "own", narrow=True, settings=settings)
+    engine = TorchEngine(checkpoint, TorchSettings(rows=8, products=None))
+    with (
+        serve(engine, Settings()) as served,
+        openai.OpenAI(base_url=f"{served.url}/v1", api_key="none", max_retries=0) as made,
+    ):
+        yield made
+
+
+def asked_in(format: str, **extras: Any) -> dict[str, Any]:
+    """A chat about a scene, in a response format."""
+    shown = noisy_scene(1)
+    looktwice = {"format": format, "history": shown.history.tolist(), "numbers": "drawn"} | extras
+    return {
+        "model": "own",
+        "messages": messages(shown),
+        "n": 2,
+        "seed": 3,
+        "extra_body": {"looktwice": looktwice},
+    }
+
+
+def streamed_contents(client: openai.OpenAI, asked: dict[str, Any]) -> dict[int, str]:
+    """The message of each choice, put together from its deltas."""
+    told: dict[int, str] = {}
+    with client.chat.completions.create(**asked, stream=True) as stream:
+        for chunk in stream:
+            for choice in chunk.choices:
+                told[choice.index] = told.get(choice.index, "") + (choice.delta.content or "")
+    return told
 
 
 def test_models_are_listed(client: openai.OpenAI) -> None:
@@ -113,6 +151,45 @@ def test_a_stream_adds_up_to_the_message(client: openai.OpenAI) -> None:
         assert told[each.index] == each.message.content
         assert done[each.index]["thinking"] == REASONING
     assert usage == whole.usage
+
+
+@pytest.mark.parametrize("thinking", ["always", "never"])
+def test_a_message_says_what_only_its_format_has(families: openai.OpenAI, thinking: str) -> None:
+    asked = asked_in("toy", thinking=thinking)
+    chat = families.chat.completions.create(**asked)
+    for choice in chat.choices:
+        assert choice.message.model_extra is not None
+        draw = choice.message.model_extra["looktwice"]
+        [[gap_m], [turns]] = [section["values"] for section in draw["sections"]]
+        poses = [[round(x, 2), round(y, 2), round(heading, 3)] for x, y, _, heading in draw["trajectory"]]
+        lines = [f"Thinking: {draw['thinking']}"] if thinking == "always" else []
+        lines += [
+            f"Gap: {gap_m:g}",
+            f"Turns: {' '.join(map(str, turns))}",
+            f"Trajectory: {json.dumps(poses)}",
+        ]
+        assert choice.message.content == "\n".join([*lines, ""])
+    assert streamed_contents(families, asked) == {each.index: each.message.content for each in chat.choices}
+
+
+@pytest.mark.parametrize("format", ["elf_vla", "vla_world"])
+def test_sections_stand_in_the_order_of_the_response(families: openai.OpenAI, format: str) -> None:
+    asked = asked_in(format)
+    chat = families.chat.completions.create(**asked)
+    for choice in chat.choices:
+        content, extras = choice.message.content, choice.message.model_extra
+        assert content is not None
+        assert extras is not None
+        draw = extras["looktwice"]
+        written = [each["name"] for each in draw["sections"] if section_text(each["name"], each["values"])]
+        told = {name: content.index(f"{name.capitalize()}: ") for name in written}
+        if draw["thinking"] is not None:
+            told["think"] = content.index(draw["thinking"])
+        told["answer"] = content.index("Trajectory: [[")
+        assert sorted(told, key=lambda name: told[name]) == [name for name in draw["tokens"] if name in told]
+        assert {place == 0 or content[place - 1] == "\n" for place in told.values()} == {True}
+        assert (len(told) > 2) == (format == "vla_world")
+    assert streamed_contents(families, asked) == {each.index: each.message.content for each in chat.choices}
 
 
 def test_an_unknown_format_is_refused_before_the_stream_begins(client: openai.OpenAI) -> None:
