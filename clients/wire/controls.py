@@ -53,7 +53,9 @@ class ReflectControls(RequestModel):
     """What the caller decides about decoding behind a given plan."""
 
     thinking: Thinking = Field(
-        default="adaptive", description="Who decides on a second look: the model, always think, never think."
+        default="adaptive",
+        description="Who decides on a second look: the model, always think, never think. A model card's "
+        "`thinking` says what a format takes.",
     )
     think_threshold: Probability | None = Field(
         default=None,

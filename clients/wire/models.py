@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
 from looktwice.clients.wire.base import RequestModel, ResponseModel
+from looktwice.clients.wire.controls import Thinking
 from looktwice.clients.wire.label import TeacherName
 
 
@@ -30,6 +31,11 @@ class ModelCard(ResponseModel):
     paints: bool = Field(
         default=False, description="Whether it can paint what it imagines, as POST /v1/imagine asks."
     )
+    thinking: dict[str, list[Thinking]] = Field(
+        default_factory=dict,
+        description="What `thinking` may be in each format. A `think_threshold` has a meaning in those that "
+        "may be told `always`.",
+    )
     deadlines: bool = Field(default=True, description="Whether it keeps deadlines (`deadline_ms`).")
     cameras: list[str] = Field(description="Cameras it needs; a scene must have a clip of each.")
     image_size: Annotated[list[int], Field(min_length=2, max_length=2)] = Field(
@@ -41,6 +47,11 @@ class ModelCard(ResponseModel):
         description="What it takes of a scene beside pictures and history: route, tracks.",
     )
     details: dict[str, Any] = Field(default_factory=dict)
+
+    def thinking_in(self, format: str | None) -> list[Thinking]:
+        """What `thinking` may be in a format, the model's first without one; anything where none is told."""
+        name = next(iter(self.formats), "") if format is None else format
+        return self.thinking.get(name, list(get_args(Thinking)))
 
 
 class NamedModel(ResponseModel):

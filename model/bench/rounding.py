@@ -10,11 +10,12 @@ import numpy as np
 import torch
 
 from looktwice.model.driving.scene import Scene
-from looktwice.model.engines.engine import Controls, PlanRequest
+from looktwice.model.engines.engine import Controls, PlanRequest, Thinking
 from looktwice.model.engines.sampling import probabilities, uniform
 from looktwice.model.engines.torch.batch import Batch, Feed
 from looktwice.model.engines.torch.in_process import draws_of
 from looktwice.model.engines.torch.runner import PromptPrefill, PromptRequest, Runner
+from looktwice.model.families.registry import family_named
 from looktwice.model.network.checkpoint import load
 
 _AT_ONCE = 8
@@ -45,13 +46,15 @@ Responses = dict[tuple[str, int], tuple[int, ...]]
 def measure(checkpoint: Path, scenes: Sequence[Scene], n: int) -> list[Precision]:
     """Decode ``scenes`` with ``n`` draws each in float64, in float32, and with products in bfloat16.
 
-    Responses are in the checkpoint's first format, without a second look. Numbers and codes are drawn, too:
-    of those of least expected error no border between two tokens is known.
+    Responses are in the checkpoint's first format, without thoughts where it may do without. Numbers and
+    codes are drawn, too: of those of least expected error no border between two tokens is known.
     """
     loaded = load(checkpoint, torch.float64)
-    controls = Controls(thinking="never", n=n, numbers="drawn", codes="drawn")
+    format = loaded.card.default_format
+    thinking: Thinking = "never" if "never" in family_named(format).thinking_choices else "adaptive"
+    controls = Controls(thinking=thinking, n=n, numbers="drawn", codes="drawn")
     requests = [
-        PlanRequest(scene.scene_id, scene, loaded.card.default_format, replace(controls, seed=seed))
+        PlanRequest(scene.scene_id, scene, format, replace(controls, seed=seed))
         for seed, scene in enumerate(scenes)
     ]
     with torch.inference_mode():

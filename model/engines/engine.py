@@ -18,11 +18,10 @@ from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import CAMERAS, Scene
 from looktwice.model.driving.trajectory import HALF_SECONDS_S, TEN_HZ_S, FloatArray, at_10_hz
 from looktwice.model.families.family import Attempt, Foreseen, PictureRequest
+from looktwice.model.families.family import Thinking as Thinking
 from looktwice.model.formats.pieces import Plain, Value
 from looktwice.model.network.model_card import ModelCard
 
-Thinking = Literal["adaptive", "always", "never"]
-"""Who decides whether there is a second look: the model, or the caller."""
 Decision = Literal["least_error", "drawn"]
 """How numbers and codes are chosen."""
 Reasons = Literal["in_view", "any"]

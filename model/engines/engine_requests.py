@@ -55,7 +55,8 @@ def start_cursor(
 
     Raises:
         RequestError: it can never be served: an unknown format, a missing camera, a prefill that the format
-            cannot write, an attempt that its family does not refine, or a picture that it does not imagine.
+            cannot write, an attempt that its family does not refine, a picture that it does not imagine, or
+            thinking that it cannot be asked for.
     """
     if request.format not in formats:
         known = ", ".join(formats)
@@ -64,6 +65,7 @@ def start_cursor(
     if request.controls.prefill is not None and family.first_plan is None:
         raise RequestError(f"prefill: responses in format {request.format!r} have no plan to be given")
     _check_attempt(request, family)
+    _check_thinking(request, family)
     picks = decided(request, family)
     try:
         start = formats[request.format].start(
@@ -75,6 +77,16 @@ def start_cursor(
     if missing := [camera for camera in card.cameras if camera not in cameras]:
         raise RequestError(f"the scene lacks camera {', '.join(missing)}, which this checkpoint needs")
     return start
+
+
+def _check_thinking(request: PlanRequest, family: Family) -> None:
+    controls, known = request.controls, ", ".join(family.thinking_choices)
+    if controls.thinking not in family.thinking_choices:
+        raise RequestError(
+            f"thinking: in format {request.format!r} it can be {known}, not {controls.thinking}"
+        )
+    if controls.think_threshold is not None and family.branch is None:
+        raise RequestError(f"think_threshold: responses in format {request.format!r} have no branch")
 
 
 def _check_attempt(request: PlanRequest, family: Family) -> None:

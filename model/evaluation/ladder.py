@@ -50,8 +50,9 @@ def ladder_variants(entry: str, controls: Controls, *, route: bool) -> list[Vari
         return Variant(f"{name}{' + route' if route else ''}", "cf_vla", given, route, **changes)
 
     if entry == META_ACT:
+        no_branch = replace(controls, thinking="adaptive", think_threshold=None)
         return [
-            replace(variant("traj-only"), format="traj_only"),
+            replace(variant("traj-only"), format="traj_only", controls=no_branch),
             variant(META_ACT),
             variant(f"{META_ACT}, expert plan", expert_plan=True),
         ]

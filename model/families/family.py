@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 from looktwice.model.driving.mends import Mend
 from looktwice.model.driving.next_view import Motion
@@ -37,6 +37,10 @@ from looktwice.model.formats.pieces import (
 
 class FamilyError(ValueError):
     """A family that is unknown, cannot be loaded, or does not fit its own format; the text says which."""
+
+
+Thinking = Literal["adaptive", "always", "never"]
+"""Who decides whether there is a second look: the model, or the caller."""
 
 
 @dataclass(frozen=True)
@@ -421,6 +425,14 @@ class Family:
     def looks_twice(self) -> bool:
         """Whether it reflects upon a plan of its own, as counterfactual examples teach."""
         return self.first_plan is not None and self.reflection is not None
+
+    @cached_property
+    def thinking_choices(self) -> tuple[Thinking, ...]:
+        """What callers may ask of its thoughts; a think threshold takes a branch, as ``always`` does."""
+        if self.branch is not None:
+            return get_args(Thinking)
+        without = self.unthought or self.reflection is None
+        return ("adaptive", "never") if without else ("adaptive",)
 
     @property
     def bare(self) -> bool:

@@ -80,7 +80,7 @@ def engine(
         family = family_named(written)
         if camera is not None and family.imagination is None:
             raise ValueError(f"responses in format {written} imagine no pictures: leave --camera out")
-        modes: list[Any] = ["adaptive", "always", "never"] if family.branch else ["adaptive"]
+        modes: list[Any] = list(family.thinking_choices)
         if thinking is not None:
             modes = thinking.split(",")
         loads = tuple(
@@ -92,6 +92,9 @@ def engine(
         for load in loads:
             # Refused before the work begins.
             load.controls()
+            if load.thinking not in family.thinking_choices:
+                known = ", ".join(family.thinking_choices)
+                raise ValueError(f"--thinking can be {known} in format {written}, not {load.thinking}")
         names = tuple(engines.split(","))
         if unknown := set(names) - set(_ENGINES.split(",")):
             raise ValueError(f"unknown engine {', '.join(sorted(unknown))}; known are {_ENGINES}")

@@ -128,6 +128,10 @@ def drive(
         for seed in (seeds[0], seeds[-1]):
             split_of_seed(seed)
         cards = planner.models() if asks else []
+        if not drivers:
+            # By default, of the model's drivers those that its format can be asked for.
+            known = {each for card in cards for each in card.thinking_in(format)}
+            wanted = [each for each in wanted if each not in SERVICE_DRIVERS or each in known]
         models = [card.revision for card in cards]
         widths_px = [card.image_size[0] for card in cards]
         widths_px += [pilot.width_px for pilot in small_pilots.values()]

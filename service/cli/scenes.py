@@ -144,18 +144,27 @@ def _driver(
     if not pictures:
         raise ValueError("a served model looks at pictures: --no-pictures is for --small")
     with PlannerClient(service, access=Access.from_environment()) as planner:
-        name = ", ".join(f"{card.name} {card.revision}" for card in planner.models())
-    return name, partial(served_pilot, service, tracks=tracks)
+        cards = planner.models()
+    name = ", ".join(f"{card.name} {card.revision}" for card in cards)
+    thinks = not all("never" in card.thinking_in(None) for card in cards)
+    return name, partial(served_pilot, service, tracks=tracks, thinks=thinks)
 
 
-def served_pilot(service: str, *, tracks: bool) -> Pilot:
-    """A service's model, without second looks: those are taught by what comes of first plans."""
+def served_pilot(service: str, *, tracks: bool, thinks: bool = False) -> Pilot:
+    """A service's model, without second looks: those are taught by what comes of first plans.
+
+    Args:
+        service: its URL.
+        tracks: whether it is told them.
+        thinks: it cannot be asked to do without.
+    """
     from looktwice.clients import wire
     from looktwice.clients.metadrive.closed_loop import ServicePilot
     from looktwice.clients.planner import Access, PlannerClient, RetryPolicy
 
     planner = PlannerClient(service, RetryPolicy(timeout_s=120.0), access=Access.from_environment())
-    return ServicePilot(planner, "never", wire.Controls(n=6, thinking="never"), tracks=tracks)
+    thinking: wire.Thinking = "adaptive" if thinks else "never"
+    return ServicePilot(planner, thinking, wire.Controls(n=6, thinking=thinking), tracks=tracks)
 
 
 @app.command("follow")

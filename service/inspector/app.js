@@ -9,7 +9,8 @@ import { allowImagining, imagine, showImaginable } from "./imagination.js";
 import { showDraw } from "./timeline.js";
 import { averageError } from "./times.js";
 
-const state = { view: null, draws: [], chosen: 0, judged: null, running: null, opened: new Map(), inputs: [], refines: false };
+const state = { view: null, draws: [], chosen: 0, judged: null, running: null, opened: new Map(), inputs: [], refines: false,
+  thinking: ["adaptive", "always", "never"] };
 
 const say = (text) => { byId("status").textContent = text; };
 
@@ -130,14 +131,15 @@ async function openFile(file) {
   showView(views[0]);
 }
 
-const usesThreshold = () => byId("thinking").value === "adaptive" && byId("with-threshold").checked;
+// A threshold decides at the branch only where there is one, and the model may decide at all.
+const takesThreshold = () => byId("thinking").value === "adaptive" && state.thinking.includes("always");
+const usesThreshold = () => takesThreshold() && byId("with-threshold").checked;
 
-// A threshold decides at the branch only where the model may decide at all.
 function showThreshold() {
-  byId("with-threshold").disabled = byId("thinking").value !== "adaptive";
+  byId("with-threshold").disabled = !takesThreshold();
   byId("threshold").disabled = !usesThreshold();
   byId("threshold-value").textContent = usesThreshold() ? byId("threshold").valueAsNumber.toFixed(2)
-    : byId("thinking").value === "adaptive" ? "sampled" : "unused";
+    : takesThreshold() ? "sampled" : "unused";
 }
 
 let planSoon = 0;
@@ -363,6 +365,9 @@ async function showModel() {
   byId("deadline").disabled = !card.deadlines;
   if (!card.deadlines) byId("deadline").value = "";
   byId("look").hidden = card.reflects.length === 0;
+  state.thinking = card.thinking[card.formats[0]] ?? state.thinking;
+  for (const option of byId("thinking").options) option.disabled = !state.thinking.includes(option.value);
+  showThreshold();
   allowImagining(card);
   byId("model").textContent = `${card.name} ${card.revision} · ${card.engine} · ${card.cameras.length} cameras`;
 }

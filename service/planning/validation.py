@@ -94,6 +94,7 @@ def engine_request(
         raise at(MISSING_CAMERA, "/scene/clips", f"{card.name} also needs {', '.join(missing)}")
     if asked.scene.tracks is not None and "tracks" not in card.inputs:
         raise at(INVALID_TRACKS, "/scene/tracks", f"{card.name} takes none; leave them out")
+    _check_thinking(asked.controls, format)
     if isinstance(asked, wire.ReflectRequest):
         controls = _controls(asked.controls, plan_of(asked.plan, "/plan"))
     else:
@@ -109,6 +110,18 @@ def engine_request(
 def format_of(asked: wire.PlanRequest | wire.ReflectRequest, card: ModelCard) -> str:
     """The response format of what was ``asked``: the model's first where none is named."""
     return card.default_format if asked.format is None else asked.format
+
+
+def _check_thinking(asked: wire.ReflectControls, format: str) -> None:
+    """Raise `ProblemError` where a choice to think is made that a format cannot follow."""
+    family = family_named(format)
+    if asked.thinking not in family.thinking_choices:
+        known = " or ".join(family.thinking_choices)
+        problem = f"responses in {format} cannot be asked for {asked.thinking}; ask for {known}"
+        raise at(INVALID_CONTROLS, "/controls/thinking", problem)
+    if asked.think_threshold is not None and family.branch is None:
+        problem = f"{format} has no branch for it to decide; leave it out"
+        raise at(INVALID_CONTROLS, "/controls/think_threshold", problem)
 
 
 def _check_imagining(asked: wire.Controls, format: str) -> None:

@@ -65,6 +65,7 @@ def model_card(card: ModelCard) -> wire.ModelCard:
         refines=[name for name in card.formats if family_named(name).refines],
         imagines=[name for name in card.formats if family_named(name).imagination is not None],
         paints=card.paints,
+        thinking={name: list(family_named(name).thinking_choices) for name in card.formats},
         deadlines=card.deadlines,
         cameras=list(card.cameras),
         image_size=list(card.image_size),

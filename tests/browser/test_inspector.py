@@ -29,7 +29,7 @@ from tests.browser.pages import (
     plan,
 )
 from tests.service.scenes import labelled
-from tests.service.scripted_engine import KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
+from tests.service.scripted_engine import CARD, KEEP_ON, REASONING, SLOW_DOWN, ScriptedEngine
 from tests.service.serving import Served, serve
 
 
@@ -150,6 +150,17 @@ def test_the_threshold_slider_plans_again(inspector: Page, engine: ScriptedEngin
     inspector.get_by_label("Thinking", exact=True).select_option("never")
     expect(slider).to_be_disabled()
     expect(inspector.locator("#threshold-value")).to_have_text("unused")
+
+
+def test_only_thinking_that_the_format_can_be_asked_for_is_offered(
+    page: Page, served: Served, engine: ScriptedEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "card_shown", replace(CARD, formats=("vla_world",)))
+    page.goto(served.url)
+    offered = page.locator("#thinking option:enabled")
+    expect(offered).to_have_text(["adaptive", "never"])
+    expect(page.get_by_label("Use a think threshold")).to_be_disabled()
+    expect(page.locator("#threshold-value")).to_have_text("unused")
 
 
 def test_a_draft_is_shown_beside_what_came_of_the_second_look(

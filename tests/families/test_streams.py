@@ -17,9 +17,18 @@ from looktwice.model.families.registry import OURS, family_named
 from looktwice.model.network.vla_settings import VlaSettings
 from looktwice.service.operations.settings import Settings
 from tests.checkpoints import noisy_scene, write_untrained
+from tests.service.http.test_problem_documents import problem
 from tests.service.serving import Served, serve
 
-FORMATS: Final = (*OURS, "toy")
+THINKING: Final[dict[str, tuple[str, ...]]] = {
+    "cf_vla": ("adaptive", "always", "never"),
+    "traj_only": ("adaptive", "never"),
+    "elf_vla": ("adaptive",),
+    "elf_vla_refine": ("adaptive",),
+    "vla_world": ("adaptive", "never"),
+    "toy": ("adaptive", "always", "never"),
+}
+"""What `thinking` may be in each format."""
 SCENE: Final = noisy_scene(1, route=True)
 
 
@@ -28,7 +37,7 @@ def served(
     request: pytest.FixtureRequest, toy_family: None, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Served[TorchEngine]]:
     """An untrained checkpoint that writes all formats, in either language of reflections."""
-    settings = VlaSettings(name="all", formats=FORMATS, reflection=request.param)
+    settings = VlaSettings(name="all", formats=tuple(THINKING), reflection=request.param)
     checkpoint = write_untrained(Path(tmp_path_factory.mktemp("all")) / "all", narrow=True, settings=settings)
     with serve(TorchEngine(checkpoint, TorchSettings(rows=8, products=None)), Settings()) as running:
         yield running
@@ -71,8 +80,13 @@ def answered(draw: wire.Draw, told: dict[str, Any]) -> dict[str, Any]:
     return plans | fields | draw.model_dump(include=names)
 
 
-@pytest.mark.parametrize("thinking", ["always", "adaptive"])
-@pytest.mark.parametrize("format", FORMATS)
+def test_all_formats_are_known() -> None:
+    assert THINKING.keys() == {*OURS, "toy"}
+
+
+@pytest.mark.parametrize(
+    ("format", "thinking"), [(format, each) for format, choices in THINKING.items() for each in choices]
+)
 def test_the_parts_are_the_whole(served: Served[TorchEngine], format: str, thinking: str) -> None:
     request = asked(format, thinking=thinking, temperature=1.2)
     plain = served.http.post("/v1/plan", json=request.model_dump())
@@ -87,3 +101,27 @@ def test_the_parts_are_the_whole(served: Served[TorchEngine], format: str, think
     for draw in draws:
         told = told_of(draw.index, events)
         assert told == answered(draw, told)
+        if thinking != "adaptive":
+            assert (draw.thinking is not None) == (thinking == "always")
+
+
+@pytest.mark.parametrize("format", THINKING)
+def test_thinking_that_a_format_cannot_follow_is_refused_by_name(
+    served: Served[TorchEngine], format: str
+) -> None:
+    choices = THINKING[format]
+    [card] = served.http.get("/v1/models").json()["models"]
+    assert card["thinking"][format] == list(choices)
+    wrong: list[dict[str, Any]] = [
+        {"thinking": each} for each in get_args(wire.Thinking) if each not in choices
+    ]
+    wrong += [{"think_threshold": 0.5}] * ("always" not in choices)
+    for controls in wrong:
+        answer = served.http.post("/v1/plan", json=asked(format, **controls).model_dump())
+        [fault] = problem(answer, "invalid-controls").errors
+        assert [fault.pointer] == [f"/controls/{name}" for name in controls]
+        assert format in fault.detail
+    if "always" in choices:
+        answer = served.http.post("/v1/plan", json=asked(format, think_threshold=0.0).model_dump())
+        draws = wire.PlanResponse.model_validate_json(answer.content).draws
+        assert all(draw.thinking is not None for draw in draws)

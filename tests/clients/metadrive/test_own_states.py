@@ -42,11 +42,11 @@ from looktwice.model.driving.trajectory import path_length, present_speed, speed
 from looktwice.model.network.checkpoint import load
 from looktwice.model.network.small_planner import SmallPlanner
 from looktwice.service.cli.commands import app
-from looktwice.service.cli.scenes import served_pilot
+from looktwice.service.cli.scenes import _driver, served_pilot
 from looktwice.service.cli.small_pilot import SmallPilot
 from looktwice.service.operations.settings import Settings
 from tests.clients.metadrive.conftest import SEED
-from tests.service.scripted_engine import ScriptedEngine
+from tests.service.scripted_engine import CARD, ScriptedEngine
 from tests.service.serving import serve
 
 CONFIG = DriveConfig(duration_s=12.0)
@@ -192,6 +192,16 @@ def test_a_served_model_s_own_drives_become_scenes(tmp_path: Path) -> None:
             assert {Image.open(io.BytesIO(image)).size for image in clip.images} == {(112, 56)}
     with pytest.raises(ReplayError, match="scripted 1 drove these episodes, not the expert"):
         redriver(setting_of(tmp_path), None)
+
+
+def test_a_served_model_drives_as_its_format_can_be_asked_for() -> None:
+    engine = ScriptedEngine()
+    with serve(engine, Settings()) as served:
+        for formats, name in ((("cf_vla", "elf_vla"), "never"), (("elf_vla", "cf_vla"), "adaptive")):
+            engine.card_shown = replace(CARD, formats=formats)
+            _, makes = _driver(served.url, None, by="tracks", tracks=False, pictures=True)
+            assert makes is not None
+            assert makes().name == name
 
 
 class Steady(ConstantVelocity):

@@ -6,6 +6,11 @@ from looktwice.model.bench.rounding import measure
 from tests.checkpoints import noisy_scene
 
 
+def test_a_format_without_a_branch_is_measured_as_it_is(refining_checkpoint: Path) -> None:
+    single, half = measure(refining_checkpoint, [noisy_scene()], n=1)
+    assert single.responses == half.responses == 1
+
+
 def test_rounding_changes_close_decisions_only(untrained_checkpoint: Path) -> None:
     single, half = measure(untrained_checkpoint, [noisy_scene(k) for k in range(4)], n=3)
     assert (single.name, half.name) == ("float32", "bfloat16")

@@ -140,6 +140,11 @@ async def bad_requests_fail_alone(engine: Engine, scene: Scene) -> None:
         (asked("b", replace(scene, clips=scene.clips[1:])), f"lacks camera {camera}"),
         (PlanRequest("c", scene, "nobody"), "unknown format"),
         (asked("d", scene, imagine="always"), "imagine no pictures"),
+        (
+            PlanRequest("e", scene, "traj_only", Controls(thinking="always")),
+            "thinking: .* adaptive, never, not always",
+        ),
+        (PlanRequest("f", scene, "traj_only", Controls(think_threshold=0.5)), "have no branch"),
     ):
         with pytest.raises((RequestError, ImageError), match=message):
             await plan(engine, bad)

@@ -101,7 +101,8 @@ def arrivals(draw: st.DrawFn) -> list[Arrival]:
         format = draw(st.sampled_from(["cf_vla"] * len(NAMES) + list(NAMES)))
         family = family_named(format)
         scene = draw(st.sampled_from(SCENES))
-        thinking: Thinking = draw(st.sampled_from(["adaptive", "adaptive", "always", "never"]))
+        thinking: Thinking = draw(st.sampled_from(["adaptive", *family.thinking_choices]))
+        thresholds = [None, 0.3, 0.6] if family.branch is not None and thinking == "adaptive" else [None]
         prefill = None
         if format == "cf_vla" and draw(st.integers(0, 3)) == 0:
             bins = np.zeros((3, 64), np.int8)
@@ -110,7 +111,7 @@ def arrivals(draw: st.DrawFn) -> list[Arrival]:
         controls = Controls(
             n=draw(st.integers(1, 5)),
             thinking=thinking,
-            think_threshold=draw(st.sampled_from([None, 0.3, 0.6])) if thinking == "adaptive" else None,
+            think_threshold=draw(st.sampled_from(thresholds)),
             prefill=prefill,
             temperature=draw(st.sampled_from([0.0, 0.2, 0.7, 1.0, 1.5])),
             top_p=draw(st.sampled_from([1.0, 0.9, 0.5])),

@@ -60,6 +60,17 @@ def test_drives_are_compared_and_kept(tmp_path: Path) -> None:
         assert len(engine.submitted) == planned, "drives that are kept are not driven again"
 
 
+def test_by_default_nobody_drives_whom_the_format_cannot_be_asked_for() -> None:
+    engine = ScriptedEngine()
+    engine.card_shown = replace(CARD, formats=("elf_vla",))
+    with serve(engine, Settings()) as served:
+        told = drove("--service", served.url, "--n", "1")
+        assert [driver["name"] for driver in told["drivers"]] == ["expert", "constant velocity", "adaptive"]
+        never = CliRunner().invoke(app, ["drive", *ONE_EPISODE, "--service", served.url, "--driver", "never"])
+        assert never.exit_code != 0
+        assert "cannot be asked for never; ask for adaptive" in never.output
+
+
 @pytest.fixture
 def planners(tmp_path: Path) -> list[Path]:
     """Folders of blind planners: two of different names, and one more of the first name."""

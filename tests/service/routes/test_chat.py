@@ -324,6 +324,11 @@ def test_what_was_assumed_is_said(client: openai.OpenAI, engine: ScriptedEngine)
         ({"looktwice": {"speed": 3}}, "unknown-field", "looktwice.speed"),
         ({"looktwice": {"thinking": "never", "think_threshold": 0.5}}, "invalid-controls", "looktwice"),
         ({"looktwice": {"format": "haiku"}}, "unknown-format", "looktwice.format"),
+        (
+            {"looktwice": {"format": "traj_only", "thinking": "always"}},
+            "invalid-controls",
+            "looktwice.thinking",
+        ),
         ({"looktwice": {"history": [[9.0, 0.0, 0.0, 0.0]] * 16}}, "invalid-history", "looktwice.history"),
     ],
 )

@@ -332,7 +332,8 @@ SECTIONS = dict.fromkeys(FeedbackSections.model_fields, "Brake.")
         ({"threshold": 1.01}, "invalid-request", "/threshold"),
         ({"controls": {"n": 0}}, "invalid-controls", "/controls/n"),
         ({"controls": {"prefill": "x"}}, "unknown-field", "/controls/prefill"),
-        ({"controls": {"thinking": "never", "think_threshold": 0.5}}, "invalid-controls", "/controls"),
+        ({"controls": {"thinking": "never"}}, "invalid-controls", "/controls/thinking"),
+        ({"controls": {"think_threshold": 0.5}}, "invalid-controls", "/controls/think_threshold"),
         (
             {"scene": asked()["scene"] | {"tracks": [TRACK | {"speed_ms": 151.0}]}},
             "invalid-tracks",

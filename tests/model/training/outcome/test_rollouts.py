@@ -56,7 +56,8 @@ def beginning(loaded: Loaded, format: str = "cf_vla") -> Cursor:
 def test_the_learner_computes_what_the_engine_tells(
     loaded: Loaded, controls: dict[str, Any], format: str
 ) -> None:
-    asked = [request(f"{scene}", scene, format, n=3, logprobs=True, **controls) for scene in range(2)]
+    asks = {name: value for name, value in controls.items() if format == "cf_vla" or name != "thinking"}
+    asked = [request(f"{scene}", scene, format, n=3, logprobs=True, **asks) for scene in range(2)]
     draws = [drawn(loaded, each) for each in asked]
     samples = [
         sample
