@@ -80,8 +80,9 @@ def start_cursor(
 
 
 def _check_thinking(request: PlanRequest, family: Family) -> None:
-    controls, known = request.controls, ", ".join(family.thinking_choices)
+    controls = request.controls
     if controls.thinking not in family.thinking_choices:
+        known = ", ".join(family.thinking_choices)
         raise RequestError(
             f"thinking: in format {request.format!r} it can be {known}, not {controls.thinking}"
         )

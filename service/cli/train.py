@@ -219,6 +219,8 @@ def train(
         if recipe == RESPOND:
             if format_name is None:
                 raise ValueError("give the format to teach: --format NAME")
+            if paper:
+                raise ValueError(f"{recipe} takes no --paper: no paper tells how other formats are taught")
             recipes[RESPOND] = responding(format_name, _weights(weigh or ()))
         elif format_name is not None or weigh:
             raise ValueError(f"{recipe} takes no --format and no --weigh: it has its own")

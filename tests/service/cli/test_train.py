@@ -101,6 +101,7 @@ def test_options_that_a_recipe_would_ignore_are_refused(
     ("given", "told"),
     [
         ([], "give the format to teach"),
+        (["--format", "traj_only", "--paper"], "respond takes no --paper"),
         (
             ["--format", "traj_only", "--weigh", "trajectory"],
             "SECTION=WEIGHT, not 'trajectory'",
