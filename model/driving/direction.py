@@ -11,7 +11,7 @@ import re
 from itertools import accumulate
 from typing import Final, Literal, get_args
 
-from looktwice.model.driving.plan import GROUPS, TICKS, Group, Plan, Track
+from looktwice.model.driving.plan import GROUPS, TICKS, Group, Plan, Track, plan_from_bins
 
 Change = Literal["slower", "faster", "left", "right", "straight", "lane_left", "lane_right", "keep_lane"]
 CHANGES: Final[tuple[Change, ...]] = get_args(Change)
@@ -162,10 +162,17 @@ def changed(before: Plan, after: Plan, change: Change) -> bool:
 
     Who slows down is not half a second ahead of the other plan in speeding up first, who picks up speed not
     behind. Who stays in the lane leaves it nowhere, and who moves to one side moves to the other only later.
+    Who steers straight where the other plan turns does not put that turn off for too long (`puts_off`).
     """
     if done(after, change) < needed(before, change):
         return False
     group = group_of(change)
+    if group == "lateral":
+        todo, gained = needed(before, change), counted(after.lateral, change)
+        return not any(
+            puts_off(change, before.lateral, each.word, each.start, each.end, todo - gained[each.start])
+            for each in plan_from_bins(after.bins()).lateral or ()
+        )
     if group == "longitudinal":
         both = zip(counted(before.track(group), change), counted(after.track(group), change), strict=True)
         return all(other > one - MIN_TICKS for one, other in both)
@@ -173,6 +180,25 @@ def changed(before: Plan, after: Plan, change: Change) -> bool:
     if change == "keep_lane":
         return move is None
     return change not in OTHER_LANE or move != OTHER_LANE[change]
+
+
+def puts_off(change: Change, before: Track | None, word: str, start: int, end: int, todo: int) -> bool:
+    """Whether a meta-action of a revised plan puts a turn of the first plan off for too long.
+
+    Who is to steer straight for longer where the first plan turns can turn for less long, begin to turn
+    later, or not turn at all. A turn that begins when it is too late to cut the first one short is none of
+    these.
+
+    Args:
+        change: that is asked for.
+        before: the first plan's track.
+        word, start, end: the meta-action, from tick to tick.
+        todo: how much of the change is left to do at ``start``, in ticks.
+    """
+    if change != "straight" or gain(change, word) < 1 or end == TICKS:
+        return False
+    turns = any(action.start <= start < action.end and action.word != word for action in before or ())
+    return turns and TICKS - end < todo
 
 
 def _first_move(plan: Plan) -> str | None:

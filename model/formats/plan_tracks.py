@@ -18,6 +18,7 @@ from looktwice.model.driving.direction import (
     gain,
     group_of,
     needed,
+    puts_off,
 )
 from looktwice.model.driving.phrases import Facts, PhraseError, agrees, read_facts
 from looktwice.model.driving.plan import (
@@ -159,6 +160,8 @@ class Aim:
     def allows(self, word: str, start: int, end: int, segments_left: int) -> bool:
         """Whether the aim can be reached behind a word from tick to tick, in so many further meta-actions."""
         if word == self.barred or end > self._holds_until(word, start):
+            return False
+        if puts_off(self.change, self.first, word, start, end, self.ticks):
             return False
         rest, left = self._behind(word, end - start), TICKS - end
         if _most(self.change, word, left, segments_left) < rest.ticks:

@@ -164,6 +164,30 @@ def test_who_slows_down_does_not_speed_up_first(first: str, revised: str, change
     assert track_changes(of(first), of(revised), "longitudinal") == changes
 
 
+@pytest.mark.parametrize(
+    ("first", "revised", "goes_straight"),
+    [
+        ("5.3 Right Turn|1.1 Straight", "4.7 Right Turn|1.7 Straight", True),
+        ("5.3 Right Turn|1.1 Straight", "4.0 Straight|2.4 Right Turn", True),
+        ("5.3 Right Turn|1.1 Straight", "6.4 Straight", True),
+        ("5.3 Right Turn|1.1 Straight", "5.0 Straight|1.4 Right Turn", False),
+        ("5.3 Right Turn|1.1 Straight", "2.0 Straight|3.0 Straight|1.4 Right Turn", False),
+        ("5.3 Right Turn|1.1 Straight", "1.0 Straight|1.0 Right Turn|4.0 Straight|0.4 Right Turn", False),
+        ("2.8 Straight|3.6 Right Turn", "3.3 Straight|3.1 Right Turn", True),
+    ],
+)
+def test_who_steers_straight_for_longer_turns_in_time_or_not_at_all(
+    first: str, revised: str, goes_straight: bool
+) -> None:
+    def of(text: str) -> Plan:
+        parts = [part.split(" ", 1) for part in text.split("|")]
+        return Plan(
+            lateral=track_from_words([word for took, word in parts for _ in range(round(10 * float(took)))])
+        )
+
+    assert ("straight" in track_changes(of(first), of(revised), "lateral")) == goes_straight
+
+
 def test_who_moves_over_already_is_not_told_to() -> None:
     moves = Plan(lane=track_from_words(["Keep Lane"] * 30 + ["Left Lane Change"] * 34))
     longer = Plan(lane=track_from_words(["Keep Lane"] * 10 + ["Left Lane Change"] * 54))
