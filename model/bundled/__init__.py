@@ -10,4 +10,4 @@ CHECKPOINTS: Final = {name: _HERE / name for name in ("looktwice-nano", "elf-nan
 """Their folders, by the names that commands take; the first one is the default."""
 CHECKPOINT: Final = CHECKPOINTS["looktwice-nano"]
 SCENES: Final = _HERE / "scenes.parquet"
-"""Labelled scenes for the demo: of validation seed 500112, and of test seeds (600000 and up)."""
+"""Labelled scenes for the demo: of validation seed 500123, and of test seeds (600000 and up)."""

@@ -1,8 +1,8 @@
 """`make pictures`: the README's pictures, of the bundled checkpoint, each with its name and revision inside.
 
 They show what `make plan` shows: the first bundled scene, and the draw to drive by. It is a validation scene
-where a second look pays: the first plan ends in the car ahead when the simulator follows it, and the revised
-one holds.
+where a second look pays: the first plan leaves the road when the simulator follows it, and the revised one
+stays on it.
 
 Its argument may be the sheet that `looktwice evaluate --preset imagination --checkpoint world-nano --plots`
 wrote: then it keeps that one instead, with the name and revision inside.
