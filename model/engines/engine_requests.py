@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from looktwice.model.driving.images import ImageError
 from looktwice.model.driving.plan import Plan
 from looktwice.model.driving.scene import Scene
-from looktwice.model.driving.trajectory import GeometryError, check_trajectory
+from looktwice.model.driving.trajectory import FloatArray, GeometryError, check_trajectory
 from looktwice.model.engines.engine import (
     CodesWritten,
     Draw,
@@ -22,13 +22,12 @@ from looktwice.model.engines.engine import (
 from looktwice.model.engines.reason_mask import ReasonMask
 from looktwice.model.engines.response import Response, SectionText
 from looktwice.model.families.family import Attempt, Branch, Family, PictureRequest
-from looktwice.model.formats.cursor import CompiledFormat, Cursor
+from looktwice.model.formats.cursor import CompiledFormat, Cursor, FormatVocabulary
 from looktwice.model.formats.fixed import FixedValues
 from looktwice.model.formats.pieces import NOTHING, FormatError
 from looktwice.model.formats.text import parse
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.model_card import ModelCard
-from looktwice.model.network.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
     # Scheduling imports this module, and needs no torch.
@@ -145,7 +144,7 @@ def events_of(
     response: Response,
     finished: Sequence[SectionText],
     draws: Iterable[int],
-    vocabulary: Vocabulary,
+    vocabulary: FormatVocabulary,
 ) -> list[Event]:
     """What draws have to tell when their response has grown: all of them have written it alike.
 
@@ -200,11 +199,13 @@ def read(
     response: Response,
     passes: int,
     draws: Iterable[int],
-    vocabulary: Vocabulary,
-    codec: TrajectoryCodec,
+    vocabulary: FormatVocabulary,
+    codec: TrajectoryCodec | None,
     reason_mask: ReasonMask | None = None,
 ) -> list[Draw]:
     """The draws that wrote ``response``: all the same, but for their index.
+
+    ``codec`` is None where the checkpoint writes no trajectory codes.
 
     Raises:
         FormatError: the text is no response of the format.
@@ -213,7 +214,13 @@ def read(
     ids = tuple(token.id for token in response.tokens)
     text = vocabulary.decode(ids)
     values = parse(response.cursor.compiled, text, given_plans(request, family))
-    reading = family.read(values, lambda codes: codec.decode(request.scene.history[None], [codes])[0])
+
+    def decode(codes: Sequence[int]) -> FloatArray:
+        if codec is None:
+            raise FormatError("the checkpoint has no codec for trajectory codes")
+        return codec.decode(request.scene.history[None], [codes])[0]
+
+    reading = family.read(values, decode)
     thinking = family.reflected(values)
     counts = dict(Counter(token.section for token in response.tokens))
     return [

@@ -62,7 +62,7 @@ class LeastError:
     def expected(self, allowed: Allowed, controls: Controls) -> Expected | None:
         """The expected error of choosing each allowed id; None where the next token is drawn."""
         if allowed.ranks is not None:
-            return partial(_steps_off, allowed.ranks) if controls.numbers == "least_error" else None
+            return expected_number_error(allowed, controls)
         if controls.codes == "drawn":
             return None
         first, count = int(allowed.ids[0]), len(allowed.ids)
@@ -72,6 +72,13 @@ class LeastError:
             return None
         stage = self._stages.get(first)
         return None if stage is None else partial(_metres_off, self._codes_apart_m[stage])
+
+
+def expected_number_error(allowed: Allowed, controls: Controls) -> Expected | None:
+    """As `LeastError.expected`, of numbers alone, whose steps are the same in every checkpoint."""
+    if allowed.ranks is None or controls.numbers == "drawn":
+        return None
+    return partial(_steps_off, allowed.ranks)
 
 
 def least_error(logits: Array, expected: Expected, left: npt.NDArray[np.bool_] | None = None) -> int:

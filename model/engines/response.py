@@ -8,10 +8,9 @@ from typing import Final, NamedTuple
 
 from looktwice.model.driving.plan import Plan
 from looktwice.model.engines.engine import Cut
-from looktwice.model.formats.cursor import Cursor, Token
+from looktwice.model.formats.cursor import Cursor, FormatVocabulary, Token
 from looktwice.model.formats.pieces import Values
 from looktwice.model.formats.text import parse_beginning
-from looktwice.model.network.vocabulary import Vocabulary
 
 _HALF_A_CHARACTER: Final = "\ufffd"
 
@@ -45,7 +44,9 @@ class Response:
     cut: Cut | None = field(default=None, kw_only=True)
     streamed: int = field(default=0, kw_only=True)
 
-    def append(self, token: int, vocabulary: Vocabulary, logprob: float | None = None) -> list[SectionText]:
+    def append(
+        self, token: int, vocabulary: FormatVocabulary, logprob: float | None = None
+    ) -> list[SectionText]:
         """Write one token, chosen with a log-probability; returns the section that it finishes, if any.
 
         Raises:
@@ -57,7 +58,7 @@ class Response:
         self.logprobs.append(logprob)
         return self._finished(before, self.cursor.section, vocabulary)
 
-    def append_forced(self, vocabulary: Vocabulary) -> list[SectionText]:
+    def append_forced(self, vocabulary: FormatVocabulary) -> list[SectionText]:
         """Write the run that is forced from here; returns the sections that it finishes."""
         run, self.cursor = self.cursor.forced()
         finished: list[SectionText] = []
@@ -68,7 +69,7 @@ class Response:
             finished += self._finished(token.section, then, vocabulary)
         return finished
 
-    def new_text(self, vocabulary: Vocabulary) -> SectionText | None:
+    def new_text(self, vocabulary: FormatVocabulary) -> SectionText | None:
         """What a free text has grown by since this was last asked; None outside of free text."""
         count = self.cursor.text_tokens
         if count is None:
@@ -82,7 +83,7 @@ class Response:
         new, self.streamed = text[self.streamed :], len(text)
         return SectionText(self.cursor.section, new)
 
-    def values(self, vocabulary: Vocabulary, given: Mapping[str, Plan]) -> Values:
+    def values(self, vocabulary: FormatVocabulary, given: Mapping[str, Plan]) -> Values:
         """The values of the sections that are finished; of others there may be some.
 
         Args:
@@ -91,7 +92,7 @@ class Response:
         text = vocabulary.decode([token.id for token in self.tokens])
         return parse_beginning(self.cursor.compiled, text, given)
 
-    def _finished(self, section: str, then: str, vocabulary: Vocabulary) -> list[SectionText]:
+    def _finished(self, section: str, then: str, vocabulary: FormatVocabulary) -> list[SectionText]:
         """``section``, when the next token belongs to another."""
         if section == then:
             return []

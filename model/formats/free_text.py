@@ -7,7 +7,7 @@ characters. The text may still turn out to go on, as in ``speed < 5`` before ``<
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -166,7 +166,7 @@ class TextRules:
         ids = self._encode(text)
         if len(ids) <= self._most and all(map(self.alphabet.holds, ids)) and self._spells(ids, text):
             return ids
-        shortest = self._shortest(text)
+        shortest = shortest_spelling(text, self.alphabet.spellings)
         if shortest is None:
             raise FormatError(f"free text holds characters that no allowed token has: {text!r}")
         if len(shortest) > self._most:
@@ -175,28 +175,6 @@ class TextRules:
 
     def _spells(self, ids: tuple[int, ...], text: str) -> bool:
         return self.alphabet.decode(ids) == text
-
-    def _shortest(self, text: str) -> tuple[int, ...] | None:
-        spellings = self.alphabet.spellings
-        longest = max(map(len, spellings), default=0)
-        # For each end the last token of the shortest spelling up to there, and how many tokens it takes.
-        best: list[tuple[int, int, int] | None] = [(0, 0, -1)]
-        for end in range(1, len(text) + 1):
-            ways = []
-            for start in range(max(0, end - longest), end):
-                before, token = best[start], spellings.get(text[start:end])
-                if before is not None and token is not None:
-                    ways.append((before[0] + 1, start, token))
-            best.append(min(ways, default=None))
-        ids: list[int] = []
-        place = len(text)
-        while place:
-            way = best[place]
-            if way is None:
-                return None
-            _, place, token = way
-            ids.append(token)
-        return tuple(reversed(ids))
 
     def _chain(self, matched: int) -> list[int]:
         """``matched``, and all shorter beginnings of the stop that the tokens end with, down to none."""
@@ -229,6 +207,29 @@ class TextRules:
                     moves[token] = now
             self._seen[seen] = moves
         return self._seen[seen]
+
+
+def shortest_spelling(text: str, spellings: Mapping[str, int]) -> tuple[int, ...] | None:
+    """The fewest tokens that spell ``text``, of tokens by what they spell; None where none do."""
+    longest = max(map(len, spellings), default=0)
+    # For each end the last token of the shortest spelling up to there, and how many tokens it takes.
+    best: list[tuple[int, int, int] | None] = [(0, 0, -1)]
+    for end in range(1, len(text) + 1):
+        ways = []
+        for start in range(max(0, end - longest), end):
+            before, token = best[start], spellings.get(text[start:end])
+            if before is not None and token is not None:
+                ways.append((before[0] + 1, start, token))
+        best.append(min(ways, default=None))
+    ids: list[int] = []
+    place = len(text)
+    while place:
+        way = best[place]
+        if way is None:
+            return None
+        _, place, token = way
+        ids.append(token)
+    return tuple(reversed(ids))
 
 
 def _borders(pattern: Sequence[object]) -> list[int]:

@@ -142,7 +142,7 @@ def save(
     before = model.config.dtype
     model.config.dtype = dtype or before
     try:
-        with _without_progress_bars():
+        with without_progress_bars():
             model.save_pretrained(folder, state_dict=state)
     finally:
         model.config.dtype = before
@@ -404,7 +404,7 @@ def _load_model(
 ) -> LookTwiceVla:
     weight_files(folder)
     try:
-        with _without_progress_bars():
+        with without_progress_bars():
             loader: Any = LookTwiceVla
             model, report = loader.from_pretrained(
                 folder,
@@ -427,7 +427,7 @@ def _load_model(
 
 
 @contextlib.contextmanager
-def _without_progress_bars() -> Iterator[None]:
+def without_progress_bars() -> Iterator[None]:
     """A service's log is no place for them."""
     logging: Any = transformers_logging
     shown = logging.is_progress_bar_enabled()

@@ -18,6 +18,7 @@ from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_token
 from transformers import PreTrainedTokenizerFast
 
 from looktwice.model.families.trajectory_codes import CODES, TRAJECTORY
+from looktwice.model.network.token_bytes import byte_level, is_text
 
 END_OF_TEXT: Final = "<|endoftext|>"
 IM_START: Final = "<|im_start|>"
@@ -254,21 +255,8 @@ def _add(tokenizer: Any, tokens: Iterable[str], *, special: bool) -> None:
     tokenizer.add_tokens(added, special_tokens=special)
 
 
-def _byte_of_character() -> dict[str, int]:
-    """GPT-2's spelling of bytes: printable Latin-1 as itself, the others from U+0100 on."""
-    printable = [*range(0x21, 0x7F), *range(0xA1, 0xAD), *range(0xAE, 0x100)]
-    hidden = [byte for byte in range(256) if byte not in printable]
-    return {chr(byte): byte for byte in printable} | {
-        chr(0x100 + place): byte for place, byte in enumerate(hidden)
-    }
-
-
-_BYTE_OF: Final = _byte_of_character()
-
-
 def _is_printable(token: str, multiline: bool) -> bool:
     try:
-        text = bytes(_BYTE_OF[character] for character in token).decode("utf-8")
-        return (text.replace("\n", "") if multiline else text).isprintable()
-    except (KeyError, UnicodeDecodeError):
+        return is_text(byte_level(token), multiline=multiline)
+    except KeyError:
         return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -47,8 +48,13 @@ def _check_same_but_weights(mine: Loaded, other: Loaded, folder: Path) -> None:
             np.array_equal(value, getattr(other.codec, name)) for name, value in vars(mine.codec).items()
         ),
         "codes of pictures": _same_codes(mine.visual_codes, other.visual_codes),
-        "network": _sizes(mine.model.config.to_dict()) == _sizes(other.model.config.to_dict()),
+        "network": sizes_of(mine.model.config.to_dict()) == sizes_of(other.model.config.to_dict()),
     }
+    refuse_differing(same, folder)
+
+
+def refuse_differing(same: Mapping[str, bool], folder: Path) -> None:
+    """Raise `CheckpointError` where a part of the checkpoint in ``folder`` is not the same, by its name."""
     if differing := [name for name, is_same in same.items() if not is_same]:
         raise CheckpointError(
             f"{folder} differs from the checkpoint that runs in its {', '.join(differing)}: "
@@ -65,8 +71,8 @@ def _same_codes(mine: VisualCodes | None, other: VisualCodes | None) -> bool:
     )
 
 
-def _sizes(config: Any) -> Any:
+def sizes_of(config: Any) -> Any:
     """A configuration without `_NO_SIZES`, at any depth."""
     if not isinstance(config, dict):
         return config
-    return {name: _sizes(value) for name, value in config.items() if name not in _NO_SIZES}
+    return {name: sizes_of(value) for name, value in config.items() if name not in _NO_SIZES}

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -20,26 +20,20 @@ from looktwice.model.engines.engine import (
     RequestError,
     Started,
 )
-from looktwice.model.engines.engine_requests import (
-    PictureCodes,
-    events_of,
-    inputs_of,
-    painted,
-    prompt_tokens,
-    read,
-    start_cursor,
-)
+from looktwice.model.engines.engine_requests import PictureCodes, events_of, read, start_cursor
 from looktwice.model.engines.gate import Gate
 from looktwice.model.engines.picture_threads import PictureThreads
+from looktwice.model.engines.transformers.foreign_network import ForeignNetwork
+from looktwice.model.engines.transformers.network import Network
+from looktwice.model.engines.transformers.own_network import OwnNetwork
 from looktwice.model.engines.transformers.plain_decoder import PlainDecoder, Prepared
 from looktwice.model.engines.warm_up import warm_up
-from looktwice.model.families.registry import families_of
-from looktwice.model.formats.cursor import CompiledFormat, Cursor
+from looktwice.model.formats.cursor import Cursor
+from looktwice.model.network.card import CheckpointError
 from looktwice.model.network.checkpoint import load
-from looktwice.model.network.inputs import ModelInputs
+from looktwice.model.network.foreign_checkpoint import is_foreign, load_foreign
 from looktwice.model.network.model_card import ModelCard
 from looktwice.model.network.visual_codes import Frame
-from looktwice.model.network.weights import load_weights
 
 _Tell = Callable[[Event | Exception], bool]
 """Hands an event on; False where nobody waits for more."""
@@ -55,20 +49,22 @@ class TransformersEngine:
         checkpoint: its folder.
         rows: draws that may be asked for at once; more are refused by the service.
         dtype: of the network.
+        formats: that a foreign checkpoint is to write, the default first. LookTwice's own name theirs.
 
     Raises:
-        CheckpointError: the folder is no usable checkpoint.
+        CheckpointError: the folder is no usable checkpoint, or cannot write a format.
+        FamilyError: there is no such format.
     """
 
-    def __init__(self, checkpoint: Path, rows: int = 24, dtype: torch.dtype = torch.float32) -> None:
-        self._loaded, self._rows = load(checkpoint, dtype), rows
-        self._card = replace(self._loaded.card, engine="transformers", deadlines=False)
-        self._families = families_of(self._card.formats, self._loaded.settings.reflection)
-        self._formats = {
-            name: CompiledFormat(family.format, self._loaded.vocabulary)
-            for name, family in self._families.items()
-        }
-        self._decoding = PlainDecoder(self._loaded)
+    def __init__(
+        self,
+        checkpoint: Path,
+        rows: int = 24,
+        dtype: torch.dtype = torch.float32,
+        formats: Sequence[str] = (),
+    ) -> None:
+        self._network, self._rows = _network(checkpoint, dtype, formats), rows
+        self._decoding = PlainDecoder(self._network)
         self._pictures, self._gate = PictureThreads(), Gate()
         self._thread: ThreadPoolExecutor | None = None
         self._ended: asyncio.Event | None = None
@@ -77,7 +73,7 @@ class TransformersEngine:
     @property
     def card(self) -> ModelCard:
         """What is loaded."""
-        return self._card
+        return self._network.card
 
     @property
     def load(self) -> EngineLoad:
@@ -114,8 +110,7 @@ class TransformersEngine:
         async with self._gate.change():
             if self._thread is None:
                 raise EngineError("the engine is not running")
-            taking = self._thread.submit(load_weights, self._loaded, checkpoint)
-            self._card = replace(await asyncio.wrap_future(taking), engine="transformers", deadlines=False)
+            await asyncio.wrap_future(self._thread.submit(self._network.load_weights, checkpoint))
 
     async def submit(self, request: PlanRequest) -> AsyncGenerator[Event]:
         """Queue a request and iterate over its events; see `Engine.submit`."""
@@ -123,7 +118,8 @@ class TransformersEngine:
             raise EngineError("the engine is not running")
         if request.request_id in self._running:
             raise RequestError(f"request id {request.request_id} is in use")
-        start = start_cursor(request, self._card, self._families, self._formats)
+        start = self._start(request)
+        self._network.check(request)
         if request.controls.deadline_ms is not None:
             raise RequestError("deadline_ms needs the torch engine: this one makes no drafts")
         events: asyncio.Queue[Event | Exception] = asyncio.Queue()
@@ -132,10 +128,10 @@ class TransformersEngine:
         try:
             async with self._gate.request():
                 inputs, expected = await self._pictures.run(
-                    partial(self._inputs, request), request.scene.pictures
+                    partial(self._network.inputs, request), request.scene.pictures
                 )
                 if expected is not None:
-                    start = start_cursor(request, self._card, self._families, self._formats, expected)
+                    start = self._start(request, expected)
                 loop = asyncio.get_running_loop()
 
                 def tell(event: Event | Exception) -> bool:
@@ -160,11 +156,11 @@ class TransformersEngine:
 
     def prompt_tokens(self, request: PlanRequest) -> int:
         """See `Engine.prompt_tokens`."""
-        return prompt_tokens(self._loaded.inputs, request)
+        return self._network.prompt_tokens(request)
 
     def paint(self, request: PlanRequest, codes: Sequence[int]) -> Frame:
         """An imagined picture; see `Engine.paint`."""
-        return painted(self._loaded.visual_codes, request, codes)
+        return self._network.paint(request, codes)
 
     def cancel(self, request_id: str) -> None:
         """Drop a request; unknown ids are ignored."""
@@ -175,17 +171,16 @@ class TransformersEngine:
         _, events = self._running.pop(request_id)
         events.put_nowait(error)
 
-    def _inputs(self, request: PlanRequest) -> tuple[ModelInputs, PictureCodes]:
-        scene, format, view = request.scene, request.format, request.controls.view
-        inputs = inputs_of(self._loaded.inputs, scene, format, request.attempt, view)
-        return inputs, self._loaded.inputs.expected(scene, view)
+    def _start(self, request: PlanRequest, expected: PictureCodes = None) -> Cursor:
+        network = self._network
+        return start_cursor(request, network.card, network.families, network.formats, expected)
 
-    def _write(self, request: PlanRequest, start: Cursor, inputs: ModelInputs, tell: _Tell) -> None:
+    def _write(self, request: PlanRequest, start: Cursor, inputs: Any, tell: _Tell) -> None:
         """Write all draws, in the thread; ends where nobody waits for them any more."""
         tell(Started())
         try:
             with torch.inference_mode():
-                asked = self._decoding.begin(request, self._families[request.format], start, inputs)
+                asked = self._decoding.begin(request, self._network.families[request.format], start, inputs)
                 for index in range(request.controls.n):
                     if not all(map(tell, self._draw(asked, index))):
                         return
@@ -193,21 +188,20 @@ class TransformersEngine:
             tell(EngineError.because("decoding failed", error))
 
     def _draw(self, asked: Prepared, index: int) -> Iterator[Event]:
-        passes = 0
+        request, family, vocabulary = asked.request, asked.family, self._network.vocabulary
         for step in self._decoding.write(asked, index):
-            passes += 1
-            yield from events_of(
-                asked.request, asked.family, step.response, step.finished, (index,), self._loaded.vocabulary
-            )
-        yield DrawFinished(
-            *read(
-                asked.request,
-                asked.family,
-                step.response,
-                passes,
-                (index,),
-                self._loaded.vocabulary,
-                self._loaded.codec,
-                asked.reason_mask,
-            )
+            yield from events_of(request, family, step.response, step.finished, (index,), vocabulary)
+        parts = vocabulary, self._network.codec, asked.reason_mask
+        yield DrawFinished(*read(request, family, step.response, step.run.passes, (index,), *parts))
+
+
+def _network(checkpoint: Path, dtype: torch.dtype, formats: Sequence[str]) -> Network:
+    if is_foreign(checkpoint):
+        return ForeignNetwork(load_foreign(checkpoint, formats, dtype))
+    own = OwnNetwork(load(checkpoint, dtype))
+    if formats:
+        written = ", ".join(own.card.formats)
+        raise CheckpointError(
+            f"{checkpoint} is a checkpoint of LookTwice, which writes {written}; leave out --format"
         )
+    return own

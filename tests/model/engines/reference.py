@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from looktwice.model.engines.engine import Draw, PlanRequest
 from looktwice.model.engines.engine_requests import decided, fixed_values, given_plans, read
 from looktwice.model.engines.sampling import probabilities
+from looktwice.model.engines.transformers.own_network import OwnNetwork
 from looktwice.model.engines.transformers.plain_decoder import PlainDecoder
 from looktwice.model.families.family import Family
 from looktwice.model.families.registry import families_of
@@ -70,7 +71,7 @@ def reference(
 
 
 def _draw(loaded: Loaded, request: PlanRequest, family: Family, index: int) -> tuple[Draw, Shares]:
-    controls, decoding = request.controls, PlainDecoder(loaded)
+    controls, decoding = request.controls, PlainDecoder(OwnNetwork(loaded))
     inputs = loaded.inputs.build(request.scene, request.format, request.attempt, controls.view)
     compiled = CompiledFormat(family.format, loaded.vocabulary)
     expected = loaded.inputs.expected(request.scene, controls.view)
