@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -64,14 +65,26 @@ def refining_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def toy_family(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """The family `toy` is there, as an installed package declares it."""
+    with _installed(tmp_path_factory.mktemp("installed"), "toy", "tests.families.toy:TOY"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def spoken_family(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The family `spoken` is there, likewise."""
+    with _installed(tmp_path_factory.mktemp("installed"), "spoken", "tests.families.spoken:SPOKEN"):
+        yield
+
+
+@contextmanager
+def _installed(folder: Path, name: str, value: str) -> Iterator[None]:
     from looktwice.model.families.registry import GROUP, family_named
 
-    installed = tmp_path_factory.mktemp("installed")
-    about = installed / "toy-1.0.dist-info"
+    about = folder / f"{name}-1.0.dist-info"
     about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: toy\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(f"[{GROUP}]\ntoy = tests.families.toy:TOY\n")
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[{GROUP}]\n{name} = {value}\n")
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(installed)
+        patch.syspath_prepend(folder)
         yield
     family_named.cache_clear()

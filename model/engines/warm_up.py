@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from looktwice.model.driving.images import encode_jpeg
-from looktwice.model.driving.scene import CLIP_FRAMES, Clip, Scene
+from looktwice.model.driving.scene import CLIP_FRAMES, FRONT_WIDE, Clip, Scene
 from looktwice.model.driving.trajectory import HISTORY_STEPS
 from looktwice.model.engines.engine import Controls, Engine, PlanRequest
 from looktwice.model.families.family import Attempt
@@ -17,7 +17,7 @@ def grey_scene(card: ModelCard) -> Scene:
     """A standing ego that sees nothing but grey, through the cameras of a checkpoint."""
     width, height = card.image_size
     picture = encode_jpeg(np.full((height, width, 3), 128, np.uint8))
-    clips = tuple(Clip(camera, (picture,) * CLIP_FRAMES) for camera in card.cameras)
+    clips = tuple(Clip(camera, (picture,) * CLIP_FRAMES) for camera in card.cameras or (FRONT_WIDE,))
     return Scene("grey", clips, np.zeros((HISTORY_STEPS, 4), np.float32))
 
 

@@ -72,6 +72,11 @@ def read_card(folder: Path) -> dict[str, Any]:
     return card
 
 
+def is_foreign(folder: Path) -> bool:
+    """Whether a folder is a checkpoint for `transformers` that LookTwice did not write."""
+    return (folder / "config.json").is_file() and not (folder / CARD_FILE).is_file()
+
+
 def weight_files(folder: Path) -> list[Path]:
     """The files with a folder's weights, one or several shards; raises `CheckpointError` for none."""
     files = sorted(folder.glob("model*.safetensors"))

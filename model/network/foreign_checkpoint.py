@@ -28,7 +28,7 @@ from looktwice.model.families.registry import OURS, families_of
 from looktwice.model.formats.contents import contents
 from looktwice.model.formats.cursor import CompiledFormat
 from looktwice.model.formats.pieces import Codes, FormatError
-from looktwice.model.network.card import CARD_FILE, CheckpointError, files_revision, weight_files
+from looktwice.model.network.card import CheckpointError, files_revision, is_foreign, weight_files
 from looktwice.model.network.checkpoint import without_progress_bars
 from looktwice.model.network.foreign_inputs import ForeignInputBuilder
 from looktwice.model.network.foreign_prompt import PICTURES
@@ -38,11 +38,6 @@ from looktwice.model.network.vocabulary import VocabularyError
 from looktwice.model.network.weights import refuse_differing, sizes_of
 
 _LOCAL: Final[dict[str, Any]] = {"local_files_only": True, "trust_remote_code": False}
-
-
-def is_foreign(folder: Path) -> bool:
-    """Whether a folder is a checkpoint for `transformers`, and none of LookTwice."""
-    return (folder / "config.json").is_file() and not (folder / CARD_FILE).is_file()
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +126,7 @@ def load_foreign(folder: Path, formats: Sequence[str], dtype: torch.dtype) -> Fo
         deadlines=False,
         details={
             "model_type": config.model_type,
-            "pictures": "as text only" if not sees else "own processor",
+            "pictures": "by its own processor" if sees else "none",
         },
     )
     return ForeignCheckpoint(model, vocabulary, families, compiled, inputs, card)

@@ -9,7 +9,7 @@ from typing import Final
 from looktwice.model.network.card import CheckpointError
 
 _NAME: Final = re.compile(r"[\w.-]+/[\w.-]+(@[\w./-]+)?")
-_FILES: Final = ("*.json", "*.safetensors", "*.jinja", "*.md")
+_FILES: Final = ("*.json", "*.safetensors", "*.jinja", "*.md", "*.txt")
 """What a checkpoint takes. Code is not among it: ours comes with this package."""
 
 

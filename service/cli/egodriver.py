@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from looktwice.service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
+from looktwice.service.cli.engines import Device, EngineName, Formats, Rows, VllmArguments, make_engine
 from looktwice.service.cli.options import DEFAULT_CHECKPOINT, Checkpoint, reported_errors
 
 if TYPE_CHECKING:
@@ -64,6 +64,7 @@ def egodriver(
     ] = "json",
     rows: Rows = 64,
     engine: EngineName = "torch",
+    format: Formats = None,
     device: Device = "cpu",
     vllm_arguments: VllmArguments = "{}",
 ) -> None:
@@ -87,7 +88,9 @@ def egodriver(
         )
         made = None
         if service is None:
-            made = make_engine(checkpoint, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
+            made = make_engine(
+                checkpoint, rows, name=engine, device=device, vllm_arguments=vllm_arguments, formats=format
+            )
 
         configure_logging(Settings().log_format)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,7 +15,18 @@ if TYPE_CHECKING:
 
 EngineName = Annotated[
     Literal["torch", "vllm", "transformers"],
-    typer.Option("--engine", help="torch is built in; vllm for large ones; transformers has no shortcuts."),
+    typer.Option(
+        "--engine",
+        help="torch is built in; vllm for large ones; transformers for foreign ones, without shortcuts.",
+    ),
+]
+Formats = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--format",
+        help="Response format that a foreign checkpoint is to write; again for more, the first by default. "
+        "Not for LookTwice's own.",
+    ),
 ]
 Device = Annotated[Literal["cpu", "cuda"], typer.Option(help="Where the torch engine runs.")]
 VllmArguments = Annotated[
@@ -48,16 +60,25 @@ def make_engine(
     vllm_arguments: str = "{}",
     cache_mb: int = 256,
     reproducible: bool | None = None,
+    formats: Sequence[str] | None = None,
 ) -> Engine:
     """An engine over a checkpoint, not started yet.
 
     ``cache_mb`` is for the vision tokens that the torch engine keeps, and as much for keys and values;
-    ``reproducible`` None is what suits the device.
+    ``reproducible`` None is what suits the device; a foreign checkpoint writes ``formats``.
 
     Raises:
-        CheckpointError: the folder is no usable checkpoint.
+        CheckpointError: the folder is no usable checkpoint, or another engine runs it.
+        FamilyError: there is no such format.
         ValueError: ``vllm_arguments`` are no JSON object.
     """
+    from looktwice.model.network.card import CheckpointError, is_foreign
+
+    if name != "transformers" and (formats or is_foreign(checkpoint)):
+        raise CheckpointError(
+            f"{checkpoint}: the {name} engine runs LookTwice's own checkpoints, which name their formats; "
+            "foreign ones need --engine transformers and --format NAME"
+        )
     if name == "vllm":
         from looktwice.model.engines.vllm.engine import VllmEngine, VllmSettings
 
@@ -71,7 +92,7 @@ def make_engine(
     if name == "transformers":
         from looktwice.model.engines.transformers.engine import TransformersEngine
 
-        return TransformersEngine(checkpoint, rows)
+        return TransformersEngine(checkpoint, rows, formats=formats or ())
     import torch
 
     from looktwice.model.engines.torch.engine import TorchEngine, TorchSettings

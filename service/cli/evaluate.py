@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
-from looktwice.service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
+from looktwice.service.cli.engines import Device, EngineName, Formats, Rows, VllmArguments, make_engine
 from looktwice.service.cli.options import (
     DEFAULT_CHECKPOINT,
     DEFAULT_SCENES,
@@ -69,6 +69,7 @@ def evaluate(
     ] = "in_view",
     rows: Rows = 96,
     engine: EngineName = "torch",
+    format: Formats = None,
     device: Device = "cpu",
     vllm_arguments: VllmArguments = "{}",
     preset: Annotated[
@@ -150,7 +151,9 @@ def evaluate(
             return
 
         def engine_of(folder: Path) -> Engine:
-            made = make_engine(folder, rows, name=engine, device=device, vllm_arguments=vllm_arguments)
+            made = make_engine(
+                folder, rows, name=engine, device=device, vllm_arguments=vllm_arguments, formats=format
+            )
             return made if keep is None else DrawStore(made, keep)
 
         if outcomes:

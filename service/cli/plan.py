@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from looktwice.service.cli.engines import EngineName, make_engine
 from looktwice.service.cli.options import (
     DEFAULT_CHECKPOINT,
     DEFAULT_SCENES,
@@ -22,11 +23,13 @@ from looktwice.service.cli.options import (
 if TYPE_CHECKING:
     import looktwice.clients.wire as wire
     from looktwice.model.driving.scene import LabelledScene
-    from looktwice.model.engines.engine import Draw, PlanRequest
+    from looktwice.model.engines.engine import Draw, Engine, PlanRequest
     from looktwice.model.network.model_card import ModelCard
 
-_BESIDE_REQUESTS: Final = ("scenes", "checkpoint", "limit", "skip", "out", "as_json")
+_BESIDE_REQUESTS: Final = ("scenes", "checkpoint", "engine", "limit", "skip", "out", "as_json")
 """What a request does not say itself."""
+_ROWS: Final = 96
+"""Draws decoded at once."""
 
 
 def plan(
@@ -36,15 +39,17 @@ def plan(
         typer.Argument(
             help="Scene files, or requests for /v1/plan as .json; the bundled scenes without any. "
             "A request is planned for as the service would, by its own controls, format and attempt; "
-            "beside one, only --checkpoint, --out, --limit, --skip and --json are taken."
+            "beside one, only --checkpoint, --engine, --out, --limit, --skip and --json are taken."
         ),
     ] = None,
     checkpoint: Checkpoint = DEFAULT_CHECKPOINT,
+    engine: EngineName = "torch",
     limit: Annotated[int, typer.Option(help="Scenes to plan for, of each file.", min=1)] = 1,
     skip: Annotated[int, typer.Option(help="Scenes to pass over first.", min=0)] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
     format: Annotated[
-        str | None, typer.Option(help="Response format; the checkpoint's first without it.")
+        str | None,
+        typer.Option(help="Response format; the checkpoint's first without it. Foreign ones have none."),
     ] = None,
     thinking: Annotated[str, typer.Option(help="adaptive, always or never.")] = "adaptive",
     n: Annotated[int, typer.Option(help="Draws per scene.", min=1)] = 6,
@@ -67,7 +72,7 @@ def plan(
         asyncio.run(
             _plan(
                 found,
-                checkpoint,
+                _engine(found, checkpoint, engine, format),
                 out,
                 as_json,
                 format,
@@ -128,9 +133,24 @@ def _requested(
         raise ValueError(f"{found.scene.scene_id} cannot be planned for: {error}") from None
 
 
+def _engine(
+    found: Sequence[LabelledScene | wire.PlanRequest],
+    checkpoint: Path,
+    name: EngineName,
+    format: str | None,
+) -> Engine:
+    """The engine, not started yet; a foreign checkpoint writes the formats that are asked for."""
+    from looktwice.model.driving.scene import LabelledScene
+    from looktwice.model.network.card import is_foreign
+
+    asked = (format if isinstance(each, LabelledScene) else each.format for each in found)
+    formats = [each for each in dict.fromkeys(asked) if each is not None] if is_foreign(checkpoint) else None
+    return make_engine(checkpoint, _ROWS, name=name, formats=formats)
+
+
 async def _plan(
     found: list[LabelledScene | wire.PlanRequest],
-    checkpoint: Path,
+    engine: Engine,
     out: Path,
     as_json: bool,
     format: str | None,
@@ -142,10 +162,8 @@ async def _plan(
     from looktwice.model.driving.scene import LabelledScene
     from looktwice.model.driving.trajectory import agreed
     from looktwice.model.engines.engine import DrawFinished
-    from looktwice.model.engines.torch.engine import TorchEngine
     from looktwice.model.evaluation.pictures import plan_picture
 
-    engine = TorchEngine(checkpoint)
     await engine.start()
     try:
         for each in found:

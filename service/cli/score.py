@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from looktwice.service.cli.engines import Device, EngineName, Rows, VllmArguments, make_engine
+from looktwice.service.cli.engines import Device, EngineName, Formats, Rows, VllmArguments, make_engine
 from looktwice.service.cli.evaluate import evenly, run_started
 from looktwice.service.cli.options import DEFAULT_SCENES, Json, OptionalCheckpoint, ScenePath, reported_errors
 
@@ -41,6 +41,7 @@ def score(
     ] = False,
     rows: Rows = 96,
     engine: EngineName = "torch",
+    format: Formats = None,
     device: Device = "cpu",
     vllm_arguments: VllmArguments = "{}",
     as_json: Json = False,
@@ -56,7 +57,12 @@ def score(
             planners = {}
             if checkpoint is not None:
                 made = make_engine(
-                    checkpoint, rows, name=engine, device=device, vllm_arguments=vllm_arguments
+                    checkpoint,
+                    rows,
+                    name=engine,
+                    device=device,
+                    vllm_arguments=vllm_arguments,
+                    formats=format,
                 )
                 agreed = _agreed_draws(made, labelled, Controls(n=n), rows, route=route, quiet=as_json)
                 planners[made.card.name] = by_scene(labelled, agreed)

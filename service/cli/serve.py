@@ -16,6 +16,7 @@ from looktwice.service.cli.engines import (
     CacheMb,
     Device,
     EngineName,
+    Formats,
     Reproducible,
     Rows,
     VllmArguments,
@@ -38,6 +39,7 @@ def serve(
     ] = 8000,
     rows: Rows = 64,
     engine: EngineName = "torch",
+    format: Formats = None,
     device: Device = "cpu",
     vllm_arguments: VllmArguments = "{}",
     cache_mb: CacheMb = 256,
@@ -70,6 +72,7 @@ def serve(
             name=engine,
             device=device,
             vllm_arguments=vllm_arguments,
+            formats=format,
             cache_mb=cache_mb,
             reproducible=reproducible,
         )

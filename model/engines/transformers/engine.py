@@ -24,14 +24,14 @@ from looktwice.model.engines.engine_requests import PictureCodes, events_of, rea
 from looktwice.model.engines.gate import Gate
 from looktwice.model.engines.picture_threads import PictureThreads
 from looktwice.model.engines.transformers.foreign_network import ForeignNetwork
-from looktwice.model.engines.transformers.network import Network
 from looktwice.model.engines.transformers.own_network import OwnNetwork
 from looktwice.model.engines.transformers.plain_decoder import PlainDecoder, Prepared
+from looktwice.model.engines.transformers.plain_network import Network
 from looktwice.model.engines.warm_up import warm_up
 from looktwice.model.formats.cursor import Cursor
-from looktwice.model.network.card import CheckpointError
+from looktwice.model.network.card import CheckpointError, is_foreign
 from looktwice.model.network.checkpoint import load
-from looktwice.model.network.foreign_checkpoint import is_foreign, load_foreign
+from looktwice.model.network.foreign_checkpoint import load_foreign
 from looktwice.model.network.model_card import ModelCard
 from looktwice.model.network.visual_codes import Frame
 

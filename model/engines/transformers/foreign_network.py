@@ -18,7 +18,7 @@ from looktwice.model.engines.engine import Controls, PlanRequest, RequestError
 from looktwice.model.engines.engine_requests import PictureCodes, painted
 from looktwice.model.engines.least_error import Expected, expected_number_error
 from looktwice.model.engines.reason_mask import reason_mask_of
-from looktwice.model.engines.transformers.network import Begun, Logits, Run
+from looktwice.model.engines.transformers.plain_network import Logits, ReadPrompt, Run
 from looktwice.model.families.family import Family
 from looktwice.model.formats.cursor import Allowed
 from looktwice.model.network.foreign_checkpoint import ForeignCheckpoint, load_foreign_weights
@@ -58,7 +58,7 @@ class ForeignNetwork:
         """See `LeastError.expected`; there are no codes."""
         return expected_number_error(allowed, controls)
 
-    def begin(self, request: PlanRequest, family: Family, inputs: Mapping[str, Tensor]) -> Begun:
+    def begin(self, request: PlanRequest, family: Family, inputs: Mapping[str, Tensor]) -> ReadPrompt:
         """Read the prompt, whose keys and values each draw copies."""
         model = self._loaded.model
         last = (
@@ -66,7 +66,7 @@ class ForeignNetwork:
         )
         output = model(**inputs, **last, use_cache=True)
         mask = reason_mask_of(request, family, self.vocabulary, None)
-        return Begun(lambda: _ForeignRun(model, output), reason_mask=mask)
+        return ReadPrompt(lambda: _ForeignRun(model, output), reason_mask=mask)
 
     def prompt_tokens(self, request: PlanRequest) -> int:
         """See `Engine.prompt_tokens`."""

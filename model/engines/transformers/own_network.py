@@ -17,7 +17,7 @@ from looktwice.model.engines.engine import Controls, PlanRequest
 from looktwice.model.engines.engine_requests import PictureCodes, inputs_of, painted, prompt_tokens
 from looktwice.model.engines.least_error import Expected, LeastError
 from looktwice.model.engines.reason_mask import reason_mask_of
-from looktwice.model.engines.transformers.network import Begun, Logits, Run
+from looktwice.model.engines.transformers.plain_network import Logits, ReadPrompt, Run
 from looktwice.model.families.family import Family
 from looktwice.model.families.registry import families_of
 from looktwice.model.formats.cursor import Allowed, CompiledFormat
@@ -58,12 +58,12 @@ class OwnNetwork:
         """See `LeastError.expected`."""
         return self._least_error.expected(allowed, controls)
 
-    def begin(self, request: PlanRequest, family: Family, inputs: ModelInputs) -> Begun:
+    def begin(self, request: PlanRequest, family: Family, inputs: ModelInputs) -> ReadPrompt:
         """What all draws of a request share; each reads the prompt anew."""
         model, vocabulary = self._model, self.vocabulary
         prompt = model.encode_prompt_embeddings(inputs)
         facts = model.read_facts(prompt.embeddings[inputs.prompt.ids == model.config.video_token_id])
-        return Begun(
+        return ReadPrompt(
             lambda: _OwnRun(model, prompt),
             binding_of(request, self.codec, vocabulary),
             reason_mask_of(request, family, vocabulary, facts),

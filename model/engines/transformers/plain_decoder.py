@@ -16,7 +16,7 @@ from looktwice.model.engines.logprobs import reported
 from looktwice.model.engines.reason_mask import ReasonMask
 from looktwice.model.engines.response import Response, SectionText
 from looktwice.model.engines.sampling import choose, probabilities, uniform
-from looktwice.model.engines.transformers.network import Begun, Logits, Network, Run
+from looktwice.model.engines.transformers.plain_network import Logits, Network, ReadPrompt, Run
 from looktwice.model.families.family import Family
 from looktwice.model.formats.cursor import Allowed, Cursor
 
@@ -28,18 +28,18 @@ class Prepared:
     Attributes:
         request, family: what is asked, and of whom.
         start: where its responses begin.
-        begun: its prompt.
+        prompt: what is asked of the model.
     """
 
     request: PlanRequest
     family: Family
     start: Cursor
-    begun: Begun
+    prompt: ReadPrompt
 
     @property
     def reason_mask(self) -> ReasonMask | None:
         """What its reflections may state."""
-        return self.begun.reason_mask
+        return self.prompt.reason_mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class PlainDecoder:
 
     def write(self, asked: Prepared, index: int) -> Iterator[DecodingStep]:
         """Write draw ``index``, token by token."""
-        run, response = asked.begun.run(), Response(asked.start)
+        run, response = asked.prompt.run(), Response(asked.start)
         while not response.cursor.done:
             allowed = response.cursor.allowed()
             scores = run.scores(allowed.ids)
@@ -117,8 +117,8 @@ class PlainDecoder:
             decided = controls.second_look(response.think_probability)
             if decided is not None:
                 left = thinks == decided
-        if asked.begun.binding is not None:
-            bound = asked.begun.binding.leaves(allowed.ids, response.tokens, family.plans)
+        if asked.prompt.binding is not None:
+            bound = asked.prompt.binding.leaves(allowed.ids, response.tokens, family.plans)
             left = left if bound is None else bound
         if asked.reason_mask is not None:
             named = asked.reason_mask.leaves(cursor, response.tokens)

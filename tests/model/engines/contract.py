@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
-from looktwice.model.bundled import CHECKPOINT
 from looktwice.model.driving.images import ImageError
 from looktwice.model.driving.plan import parse_plan
 from looktwice.model.driving.scene import Clip, Scene
@@ -45,12 +44,13 @@ async def plan(engine: Engine, request: PlanRequest) -> list[Draw]:
     return sorted(draws, key=lambda draw: draw.index)
 
 
-def asked(name: str, scene: Scene, *, live: bool = False, **controls: Any) -> PlanRequest:
-    return PlanRequest(name, scene, "cf_vla", Controls(**controls), live=live)
+def asked(engine: Engine, name: str, scene: Scene, *, live: bool = False, **controls: Any) -> PlanRequest:
+    """A request in the engine's first format, which plans and may look twice."""
+    return PlanRequest(name, scene, engine.card.default_format, Controls(**controls), live=live)
 
 
 async def what_a_draw_says_is_told_before_it(engine: Engine, scene: Scene) -> None:
-    events = await events_of(engine, asked("told", scene, n=2, thinking="always", live=True))
+    events = await events_of(engine, asked(engine, "told", scene, n=2, thinking="always", live=True))
     assert isinstance(events[0], Started)
     assert sorted(event.draw.index for event in events if isinstance(event, DrawFinished)) == [0, 1]
     for index in range(2):
@@ -67,22 +67,23 @@ async def what_a_draw_says_is_told_before_it(engine: Engine, scene: Scene) -> No
                 assert place < end
             if isinstance(event, SectionFinished) and event.index == index:
                 told[event.section] = event.values
-        assert told["plan"] == (finished.draw.plan,)
-        assert told["revised_plan"] == (finished.draw.revised_plan,)
+        family = family_named(engine.card.default_format)
+        assert told[str(family.first_plan)] == (finished.draw.plan,)
+        assert told[str(family.revised_plan)] == (finished.draw.revised_plan,)
 
 
 async def the_branch_is_the_callers(engine: Engine, scene: Scene) -> None:
     for thinking, looked in (("always", True), ("never", False)):
-        draws = await plan(engine, asked(f"{thinking} thinks", scene, n=2, thinking=thinking))
+        draws = await plan(engine, asked(engine, f"{thinking} thinks", scene, n=2, thinking=thinking))
         assert [draw.looked_twice for draw in draws] == [looked, looked]
         assert all(0.0 <= (draw.think_probability or 0.0) <= 1.0 for draw in draws)
     for threshold, looked in ((0.0, True), (1.0, False)):
-        [draw] = await plan(engine, asked("threshold", scene, n=1, think_threshold=threshold))
+        [draw] = await plan(engine, asked(engine, "threshold", scene, n=1, think_threshold=threshold))
         assert draw.looked_twice == looked
 
 
 async def the_prompt_is_counted(engine: Engine, scene: Scene) -> None:
-    request = asked("counted", scene, n=1)
+    request = asked(engine, "counted", scene, n=1)
     assert engine.prompt_tokens(replace(request, scene=replace(scene, route=None))) > 0
     assert engine.prompt_tokens(replace(request, scene=replace(scene, route=None))) <= engine.prompt_tokens(
         request
@@ -90,19 +91,19 @@ async def the_prompt_is_counted(engine: Engine, scene: Scene) -> None:
 
 
 async def a_given_plan_is_kept(engine: Engine, scene: Scene) -> None:
-    [draw] = await plan(engine, asked("given", scene, n=1, prefill=GIVEN, thinking="never"))
+    [draw] = await plan(engine, asked(engine, "given", scene, n=1, prefill=GIVEN, thinking="never"))
     assert draw.plan == GIVEN
 
 
 async def the_same_seed_draws_the_same(engine: Engine, scene: Scene) -> None:
     # Behind the same words codes of least expected error are the same, and a model may be sure of its words.
     first, again, other = [
-        await plan(engine, asked("seed", scene, n=3, seed=seed, logprobs=True, temperature=2.0))
+        await plan(engine, asked(engine, "seed", scene, n=3, seed=seed, logprobs=True, temperature=2.0))
         for seed in (7, 7, 8)
     ]
     for one, two in zip(first, again, strict=True):
         assert (one.text, one.ids) == (two.text, two.ids)
-        assert one.trajectory.shape == (len(family_named("cf_vla").times_s), 4)
+        assert one.trajectory.shape == (len(family_named(engine.card.default_format).times_s), 4)
         assert len(one.logprobs) == len(one.ids)
         assert all(logprob is None or logprob <= 0 for logprob in one.logprobs)
     assert any(
@@ -111,40 +112,45 @@ async def the_same_seed_draws_the_same(engine: Engine, scene: Scene) -> None:
 
 
 async def who_leaves_early_frees_the_engine(engine: Engine, scene: Scene) -> None:
-    async for _ in (events := engine.submit(asked("early", scene, n=2, thinking="always"))):
+    async for _ in (events := engine.submit(asked(engine, "early", scene, n=2, thinking="always"))):
         break
     await events.aclose()
-    assert len(await plan(engine, asked("early", scene, n=1))) == 1
+    assert len(await plan(engine, asked(engine, "early", scene, n=1))) == 1
     assert engine.load.rows_used == 0
 
 
 async def cancelling_tells_who_waits(engine: Engine, scene: Scene) -> None:
-    waiting = asyncio.create_task(plan(engine, asked("slow", scene, n=4, thinking="always")))
+    waiting = asyncio.create_task(plan(engine, asked(engine, "slow", scene, n=4, thinking="always")))
     while not engine.load.rows_used:
         await asyncio.sleep(0.001)
     engine.cancel("slow")
     engine.cancel("unknown")
     with pytest.raises(EngineError, match="cancelled"):
         await waiting
-    assert len(await plan(engine, asked("slow", scene, n=1))) == 1
+    assert len(await plan(engine, asked(engine, "slow", scene, n=1))) == 1
 
 
 async def bad_requests_fail_alone(engine: Engine, scene: Scene) -> None:
-    camera = scene.clips[0].camera
+    # The engine's second format has no branch.
+    camera, plain = scene.clips[0].camera, engine.card.formats[1]
     damaged = replace(scene, clips=(Clip(camera, (b"\xff\xd8no",) * 4), *scene.clips[1:]))
-    good = asyncio.create_task(plan(engine, asked("good", scene, n=2)))
+    good = asyncio.create_task(plan(engine, asked(engine, "good", scene, n=2)))
     await asyncio.sleep(0)
     for bad, message in (
-        (asked("good", scene), "in use"),
-        (asked("a", damaged), "picture"),
-        (asked("b", replace(scene, clips=scene.clips[1:])), f"lacks camera {camera}"),
-        (PlanRequest("c", scene, "nobody"), "unknown format"),
-        (asked("d", scene, imagine="always"), "imagine no pictures"),
-        (
-            PlanRequest("e", scene, "traj_only", Controls(thinking="always")),
-            "thinking: .* adaptive, never, not always",
+        (asked(engine, "good", scene), "in use"),
+        (asked(engine, "a", damaged), "picture"),
+        *(
+            [(asked(engine, "b", replace(scene, clips=scene.clips[1:])), f"lacks camera {camera}")]
+            if engine.card.cameras
+            else []
         ),
-        (PlanRequest("f", scene, "traj_only", Controls(think_threshold=0.5)), "have no branch"),
+        (PlanRequest("c", scene, "nobody"), "unknown format"),
+        (asked(engine, "d", scene, imagine="always"), "imagine no pictures"),
+        (
+            PlanRequest("e", scene, plain, Controls(thinking="always")),
+            "thinking: .* adaptive.*, not always",
+        ),
+        (PlanRequest("f", scene, plain, Controls(think_threshold=0.5)), "have no branch"),
     ):
         with pytest.raises((RequestError, ImageError), match=message):
             await plan(engine, bad)
@@ -153,7 +159,7 @@ async def bad_requests_fail_alone(engine: Engine, scene: Scene) -> None:
 
 async def who_stops_is_told_and_may_start_again(engine: Engine, scene: Scene) -> None:
     # Enough work that some is left when a busy machine comes to the stop late.
-    slow = (plan(engine, asked(f"slow-{each}", scene, n=4, thinking="always")) for each in range(8))
+    slow = (plan(engine, asked(engine, f"slow-{each}", scene, n=4, thinking="always")) for each in range(8))
     waiting = asyncio.gather(*slow)
     while not engine.load.rows_used:
         await asyncio.sleep(0.001)
@@ -163,26 +169,27 @@ async def who_stops_is_told_and_may_start_again(engine: Engine, scene: Scene) ->
         await waiting
     await watching
     with pytest.raises(EngineError, match="not running"):
-        await plan(engine, asked("late", scene, n=1))
+        await plan(engine, asked(engine, "late", scene, n=1))
     await engine.start()
-    assert len(await plan(engine, asked("again", scene, n=1))) == 1
+    assert len(await plan(engine, asked(engine, "again", scene, n=1))) == 1
 
 
 async def new_weights_are_taken_between_requests(
-    engine: Engine, scene: Scene, other: Path, fresh: Callable[[Path], Engine]
+    engine: Engine, scene: Scene, first: Path, other: Path, fresh: Callable[[Path], Engine]
 ) -> None:
     """Nothing is left of the old ones, nor, when these are back, of the new ones.
 
     Args:
-        engine: runs, over the bundled checkpoint.
+        engine: runs.
         scene: that it can see.
+        first: its checkpoint folder.
         other: a checkpoint folder that differs in its weights alone.
         fresh: makes such an engine over a folder.
     """
     revision = engine.card.revision
 
     def greedy(name: str) -> PlanRequest:
-        return asked(name, scene, n=2, thinking="always", temperature=0.0, prefill=GIVEN)
+        return asked(engine, name, scene, n=2, thinking="always", temperature=0.0, prefill=GIVEN)
 
     async def drawn(name: str, by: Engine = engine) -> list[str]:
         return [draw.text for draw in await plan(by, greedy(name))]
@@ -206,13 +213,13 @@ async def new_weights_are_taken_between_requests(
         assert await drawn("fresh", another) == new
     finally:
         await another.stop()
-    await engine.load_weights(CHECKPOINT)
+    await engine.load_weights(first)
     assert engine.card.revision == revision
     assert await drawn("old again") == old
 
 
 async def weights_of_another_network_are_refused(engine: Engine, scene: Scene, unlike: Path) -> None:
-    before, card = await plan(engine, asked("before", scene, n=1)), engine.card
+    before, card = await plan(engine, asked(engine, "before", scene, n=1)), engine.card
     for folder, message in (
         (unlike, "in its settings, tokenizer"),
         (unlike / "none", "not a LookTwice"),
@@ -220,7 +227,7 @@ async def weights_of_another_network_are_refused(engine: Engine, scene: Scene, u
         with pytest.raises(CheckpointError, match=message):
             await engine.load_weights(folder)
     assert engine.card == card
-    [draw] = await plan(engine, asked("after", scene, n=1))
+    [draw] = await plan(engine, asked(engine, "after", scene, n=1))
     assert draw.text == before[0].text
 
 

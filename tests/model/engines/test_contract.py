@@ -56,7 +56,7 @@ def test_new_weights(
     loop: asyncio.AbstractEventLoop, engine: Engine, untrained_checkpoint: Path, tmp_path: Path
 ) -> None:
     other, fresh = write_shaken(tmp_path / "shaken", CHECKPOINT), ENGINES[engine.card.engine]
-    loop.run_until_complete(new_weights_are_taken_between_requests(engine, SCENE, other, fresh))
+    loop.run_until_complete(new_weights_are_taken_between_requests(engine, SCENE, CHECKPOINT, other, fresh))
     loop.run_until_complete(weights_of_another_network_are_refused(engine, SCENE, untrained_checkpoint))
 
 
@@ -75,7 +75,7 @@ def test_the_engines_write_the_same(loop: asyncio.AbstractEventLoop) -> None:
     async def drawn(engine: Engine) -> list[str]:
         await engine.start()
         try:
-            return [draw.text for draw in await plan(engine, asked("same", SCENE, n=3, seed=3))]
+            return [draw.text for draw in await plan(engine, asked(engine, "same", SCENE, n=3, seed=3))]
         finally:
             await engine.stop()
 
@@ -89,7 +89,7 @@ def test_an_engine_without_drafts_refuses_deadlines(loop: asyncio.AbstractEventL
         await engine.start()
         try:
             with pytest.raises(RequestError, match="deadline_ms needs the torch engine"):
-                await plan(engine, asked("late", SCENE, deadline_ms=300))
+                await plan(engine, asked(engine, "late", SCENE, deadline_ms=300))
         finally:
             await engine.stop()
 

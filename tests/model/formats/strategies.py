@@ -14,7 +14,7 @@ from looktwice.model.driving.plan import GROUPS, TICKS, WORDS, Group, MetaAction
 from looktwice.model.families.cf_vla.format import ACTION, BRANCH, THINKING
 from looktwice.model.families.trajectory_codes import CODES, TRAJECTORY
 from looktwice.model.formats.compounds import Number, Repeat
-from looktwice.model.formats.cursor import CompiledFormat
+from looktwice.model.formats.cursor import CompiledFormat, FormatVocabulary
 from looktwice.model.formats.pieces import (
     Choice,
     Codes,
@@ -164,12 +164,12 @@ class Fewer(Narrowing):
 class _Pieces:
     """Draws pieces; ``named`` pieces have names of their own, as records need them."""
 
-    def __init__(self, draw: st.DrawFn) -> None:
-        self._draw, self._names = draw, 0
+    def __init__(self, draw: st.DrawFn, *, codes: bool = True) -> None:
+        self._draw, self._names, self._with_codes = draw, 0, codes
 
     def piece(self, depth: int, *, sections: bool, named: bool = False) -> Piece:
         draw = self._draw
-        kinds = ["literal", "text", "codes", "number", "plan"]
+        kinds = ["literal", "text", *(["codes"] if self._with_codes else []), "number", "plan"]
         if depth:
             kinds += ["choice", "maybe", "sequence", "repeat", "record", "quoted", "listed", "fewer"]
             kinds += ["section"] * (2 * sections)
@@ -198,7 +198,7 @@ class _Pieces:
                 only = draw(st.none() | st.tuples(*[code] * count))
                 return Codes(alphabet, count, draw(st.sampled_from([None, size])), name, only=only)
             case "number":
-                if draw(st.booleans()):
+                if self._with_codes and draw(st.booleans()):
                     return Number(-1.0, 1.0, 2 / (TENTHS - 1), "tenth", name)
                 low, step = draw(st.integers(-12, 12)), draw(st.sampled_from([1, 0.5, 0.25, 5]))
                 return Number(low, low + step * draw(st.integers(0, 30)), step, name=name)
@@ -256,9 +256,12 @@ class _Pieces:
 
 
 @st.composite
-def compiled_formats(draw: st.DrawFn) -> CompiledFormat:
-    """Formats made of all pieces, among them only those that can be read without doubt."""
-    pieces = _Pieces(draw)
+def compiled_formats(draw: st.DrawFn, vocabulary: FormatVocabulary = VOCABULARY) -> CompiledFormat:
+    """Formats made of all pieces, among them only those that can be read without doubt.
+
+    Codes are among the pieces where the vocabulary has any.
+    """
+    pieces = _Pieces(draw, codes=bool(vocabulary.alphabets))
     parts = [
         pieces.narrowed()
         if draw(st.integers(0, 2)) == 2
@@ -267,7 +270,7 @@ def compiled_formats(draw: st.DrawFn) -> CompiledFormat:
     ]
     try:
         body = Sequence((*parts, Literal("<|im_end|>")))
-        return CompiledFormat(Format("made up", body), VOCABULARY)
+        return CompiledFormat(Format("made up", body), vocabulary)
     except FormatError:
         assume(False)
         raise

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -133,8 +135,8 @@ def test_a_changed_text_parses_only_if_the_cursor_can_write_it(
     assert cursor.done
 
 
-def can_write(compiled: CompiledFormat, text: str) -> bool:
-    """Whether any tokens that the cursor allows spell ``text``."""
+def can_write(compiled: CompiledFormat, text: str, texts: Sequence[str] = VOCABULARY.texts) -> bool:
+    """Whether any tokens that the cursor allows spell ``text``; ``texts`` are those of the tokens."""
     # Tokens of one text lead to few different states; those that failed are not tried again.
     failed: set[tuple[int, object, object]] = set()
 
@@ -145,7 +147,7 @@ def can_write(compiled: CompiledFormat, text: str) -> bool:
         if key in failed:
             return False
         for token in cursor.allowed().ids.tolist():
-            spelt = VOCABULARY.texts[token]
+            spelt = texts[token]
             if text.startswith(spelt, place) and from_(cursor.advance(token), place + len(spelt)):
                 return True
         failed.add(key)

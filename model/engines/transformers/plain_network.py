@@ -45,7 +45,7 @@ class Run(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Begun:
+class ReadPrompt:
     """A prompt that was read.
 
     Attributes:
@@ -103,7 +103,7 @@ class Network(Protocol):
         """See `LeastError.expected`."""
         ...
 
-    def begin(self, request: PlanRequest, family: Family, inputs: Any) -> Begun:
+    def begin(self, request: PlanRequest, family: Family, inputs: Any) -> ReadPrompt:
         """Read the prompt of a request. Draws of an earlier request must be finished."""
         ...
 
