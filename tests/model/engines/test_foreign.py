@@ -116,7 +116,8 @@ def test_the_prompt_tells_the_scene(engine: TransformersEngine, folder: Path) ->
     ):
         assert told in text
     assert text.strip().startswith("[user]")
-    assert text.endswith(f"{END}[assistant] ")
+    # Tokenizers as sentencepiece's put a space behind a marker.
+    assert text.replace(f"{END} ", END).endswith(f"{END}[assistant] ")
     seen = folder.name == "pictures"
     assert ("Camera front_tele_30, 0.5 s ago: <image>" in text) == seen
     assert ("pixel_values" in inputs) == seen
