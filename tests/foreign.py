@@ -115,7 +115,8 @@ def write_vlm(folder: Path, seed: int = 0) -> Path:
         image_seq_length=4,
     )
     side = {"height": 28, "width": 28}
-    processor = LlavaProcessor(
+    processor_class: Any = LlavaProcessor
+    processor = processor_class(
         CLIPImageProcessorPil(size={"shortest_edge": 28}, crop_size=side),
         tokenizer,
         patch_size=14,

@@ -218,7 +218,8 @@ def read(
     def decode(codes: Sequence[int]) -> FloatArray:
         if codec is None:
             raise FormatError("the checkpoint has no codec for trajectory codes")
-        return codec.decode(request.scene.history[None], [codes])[0]
+        trajectory: FloatArray = codec.decode(request.scene.history[None], [codes])[0]
+        return trajectory
 
     reading = family.read(values, decode)
     thinking = family.reflected(values)

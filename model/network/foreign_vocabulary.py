@@ -41,7 +41,7 @@ class ForeignVocabulary:
     """
 
     def __init__(self, tokenizer: Any) -> None:
-        self._backend = getattr(tokenizer, "backend_tokenizer", None)
+        self._backend: Any = getattr(tokenizer, "backend_tokenizer", None)
         if self._backend is None:
             raise VocabularyError("it has no tokenizer.json: a fast tokenizer is needed")
         self._added: dict[int, str] = {
