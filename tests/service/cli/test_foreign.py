@@ -52,7 +52,8 @@ def test_it_is_evaluated(llm: Path) -> None:
         run("evaluate", "--checkpoint", str(llm), *FOREIGN, "--limit", "1", "--n", "1", "--json")
     )
     planned = {row["name"]: row["agreed_ade_m"] for row in told["rows"] if row["output_tokens"]}
-    assert planned and all(ade_m > 0 for ade_m in planned.values())
+    assert planned
+    assert all(ade_m > 0 for ade_m in planned.values())
 
 
 def test_it_is_served_with_pictures(tmp_path: Path) -> None:
