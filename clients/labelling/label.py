@@ -32,7 +32,7 @@ from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import read_scenes
 from looktwice.model.driving.view import Surroundings
 
-CHECKS_VERSION: Final = 4
+CHECKS_VERSION: Final = 5
 """Of `looktwice.clients.labelling.checks` and what they are made of; raised when they ask for something
 else."""
 

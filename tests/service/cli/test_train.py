@@ -64,7 +64,7 @@ def test_a_stock_backbone_is_trained_by_the_papers_recipe(
     assert stage["vision_rate"] == 1.0, "unlike the nano recipe, the paper's trains the tower too"
     logged = json.loads((target / "log.jsonl").read_text())
     assert (logged["stage"], logged["step"]) == (f"1 {recipe}", 2)
-    assert 0 < logged["train_loss"] < 50
+    assert 0 < logged["train_loss"] < 100
 
 
 def test_what_is_no_backbone_is_refused_by_name(tmp_path: Path) -> None:
