@@ -164,11 +164,12 @@ def changed(before: Plan, after: Plan, change: Change) -> bool:
     behind. Who stays in the lane leaves it nowhere, and who moves to one side moves to the other only later.
     Who steers straight where the other plan turns does not put that turn off for too long (`puts_off`).
     """
-    if done(after, change) < needed(before, change):
+    todo = needed(before, change)
+    if done(after, change) < todo:
         return False
     group = group_of(change)
-    if group == "lateral":
-        todo, gained = needed(before, change), counted(after.lateral, change)
+    if change == "straight":
+        gained = counted(after.lateral, change)
         return not any(
             puts_off(change, before.lateral, each.word, each.start, each.end, todo - gained[each.start])
             for each in plan_from_bins(after.bins()).lateral or ()

@@ -36,6 +36,9 @@ class ForeignNetwork:
 
     def __init__(self, loaded: ForeignCheckpoint) -> None:
         self._loaded = loaded
+        # Of a prompt only the last token's logits count; not every network can leave the others out.
+        takes = inspect.signature(loaded.model.forward).parameters
+        self._last_alone = {"logits_to_keep": 1} if "logits_to_keep" in takes else {}
         self.card, self.vocabulary = loaded.card, loaded.vocabulary
         self.families, self.formats = loaded.families, loaded.formats
 
@@ -61,10 +64,7 @@ class ForeignNetwork:
     def begin(self, request: PlanRequest, family: Family, inputs: Mapping[str, Tensor]) -> ReadPrompt:
         """Read the prompt, whose keys and values each draw copies."""
         model = self._loaded.model
-        last = (
-            {"logits_to_keep": 1} if "logits_to_keep" in inspect.signature(model.forward).parameters else {}
-        )
-        output = model(**inputs, **last, use_cache=True)
+        output = model(**inputs, **self._last_alone, use_cache=True)
         mask = reason_mask_of(request, family, self.vocabulary, None)
         return ReadPrompt(lambda: _ForeignRun(model, output), reason_mask=mask)
 
