@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,14 @@ from tests.model.engines.reference import exactly
 def exact(untrained_checkpoint: Path) -> Loaded:
     """In float64, so that rounding cannot flip a draw."""
     return exactly(load(untrained_checkpoint, dtype=torch.float64))
+
+
+@pytest.fixture(scope="module")
+def loop() -> Iterator[asyncio.AbstractEventLoop]:
+    """One loop for all tests of a module: an engine belongs to the loop that it was started in."""
+    loop = asyncio.new_event_loop()
+    yield loop
+    loop.close()
 
 
 @pytest.fixture

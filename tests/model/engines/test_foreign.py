@@ -41,13 +41,6 @@ KINDS: dict[str, Callable[[Path, int], Path]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def loop() -> Iterator[asyncio.AbstractEventLoop]:
-    loop = asyncio.new_event_loop()
-    yield loop
-    loop.close()
-
-
 @pytest.fixture(scope="module", params=KINDS)
 def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return KINDS[request.param](tmp_path_factory.mktemp("foreign") / request.param, 0)

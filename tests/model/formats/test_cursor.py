@@ -27,7 +27,7 @@ from looktwice.model.formats.pieces import (
 from looktwice.model.formats.plan_tracks import MAX_SEGMENTS
 from looktwice.model.formats.text import parse
 from tests.model.formats.strategies import VOCABULARY, branching_formats, cf_vla_values, plans
-from tests.model.formats.test_laws import walk
+from tests.model.formats.test_laws import assert_writable, walk
 
 COMPILED = CompiledFormat(CF_VLA.format, VOCABULARY)
 FORMATS = {family.name: family.format for family in (CF_VLA, TRAJ_ONLY)}
@@ -43,12 +43,7 @@ def test_rendered_values_parse_to_themselves(values: Values) -> None:
 
 @given(cf_vla_values())
 def test_rendered_tokens_can_be_written_one_by_one(values: Values) -> None:
-    cursor = COMPILED.start()
-    for token in COMPILED.render(values):
-        assert token.id in cursor.allowed().ids
-        assert token.section == cursor.section
-        cursor = cursor.advance(token.id)
-    assert cursor.done
+    assert_writable(COMPILED, COMPILED.render(values))
 
 
 @given(st.sampled_from(sorted(FORMATS)), st.integers(0, 2**32 - 1))

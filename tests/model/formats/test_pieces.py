@@ -32,7 +32,7 @@ from looktwice.model.formats.plan_tracks import PlanTracks
 from looktwice.model.formats.text import parse
 from tests.model.formats.phrases import PHRASES
 from tests.model.formats.strategies import VOCABULARY, Fewer, Listed, Quoted, values_of
-from tests.model.formats.test_laws import can_write, ids_of, walk
+from tests.model.formats.test_laws import assert_writable, can_write, ids_of, walk
 
 END = Literal("<|im_end|>")
 PHRASED = CompiledFormat(PHRASES, VOCABULARY)
@@ -108,11 +108,7 @@ def test_phrases_parse_to_what_was_rendered(data: st.DataObject) -> None:
     values = data.draw(values_of(PHRASED))
     tokens = PHRASED.render(values)
     assert parse(PHRASED, VOCABULARY.decode(ids_of(tokens))) == values
-    cursor = PHRASED.start()
-    for token in tokens:
-        assert token.section == cursor.section
-        cursor = cursor.advance(token.id)
-    assert cursor.done
+    assert_writable(PHRASED, tokens)
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -15,7 +15,7 @@ from looktwice.model.network.foreign_vocabulary import ForeignVocabulary
 from looktwice.model.network.vocabulary import VocabularyError
 from tests.foreign import END, IMAGE, byte_level_tokenizer, sentencepiece_tokenizer, wordpiece_tokenizer
 from tests.model.formats.strategies import compiled_formats, values_of
-from tests.model.formats.test_laws import can_write, ids_of, walk
+from tests.model.formats.test_laws import assert_writable, can_write, ids_of, walk
 
 VOCABULARIES = {
     "byte-level": ForeignVocabulary(byte_level_tokenizer()),
@@ -70,11 +70,7 @@ def test_what_is_rendered_parses_and_can_be_written(data: st.DataObject, kind: s
     values = data.draw(values_of(compiled))
     tokens = compiled.render(values)
     assert parse(compiled, vocabulary.decode(ids_of(tokens))) == values
-    cursor = compiled.start()
-    for token in tokens:
-        assert token.section == cursor.section
-        cursor = cursor.advance(token.id)
-    assert cursor.done
+    assert_writable(compiled, tokens)
 
 
 @given(st.data(), kinds, st.integers(0, 2**32 - 1))

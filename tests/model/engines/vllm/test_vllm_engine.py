@@ -57,14 +57,6 @@ BUNDLED = [labelled.scene for labelled in read_scenes(SCENES)]
 
 
 @pytest.fixture(scope="module")
-def loop() -> Iterator[asyncio.AbstractEventLoop]:
-    """One loop for all: vLLM belongs to the loop that it was started in."""
-    loop = asyncio.new_event_loop()
-    yield loop
-    loop.close()
-
-
-@pytest.fixture(scope="module")
 def vllm(loop: asyncio.AbstractEventLoop) -> Iterator[VllmEngine]:
     arguments = {"enforce_eager": True, "block_size": 32}
     engine = VllmEngine(CHECKPOINT, VllmSettings(rows=48, dtype="float32", arguments=arguments))
