@@ -47,6 +47,17 @@ def place_attempts(
     return PlacedAttempts(places[kept], [_attempt(told[number], times_s) for number in kept])
 
 
+def fails(examples: Examples, rows: Iterable[FeedbackRow]) -> npt.NDArray[np.bool_]:
+    """In which examples a model gave a wrong answer, bool [N].
+
+    Raises:
+        ValueError: a scene is missing.
+    """
+    failed = np.zeros(len(examples), np.bool_)
+    failed[places_of(examples, (row.scene_id for row in rows if not row.correct), "feedback")] = True
+    return failed
+
+
 def _attempt(row: FeedbackRow, times_s: Sequence[float]) -> JudgedAttempt:
     if row.correct and not row.think:
         raise ValueError(

@@ -41,7 +41,8 @@ def check_files(
     if bool(followed) != (recipe.goal == "judge"):
         wants = "takes no followed trajectories" if followed else "needs followed trajectories"
         raise ValueError(f"recipe {recipe.name} {wants}")
-    if failures is not None and recipe.attempting is None:
+    refines = recipe.outcome is not None and recipe.outcome.refining is not None
+    if failures is not None and recipe.attempting is None and not refines:
         raise ValueError(f"recipe {recipe.name} takes no failures")
 
 

@@ -283,6 +283,7 @@ NANO: Final[Mapping[str, Recipe]] = (
             name="elf-rl",
             batch_size=8,
             tasks={"elf_vla": 1.0},
+            route_share=1.0,  # the paper's prompts always say where to go
             weights=elf_vla.WEIGHTS,
             error_weight=0.0,
             outcome=OutcomeSettings(

@@ -44,7 +44,7 @@ from looktwice.model.network.visual_codes import load_visual_codes
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.network.vla_settings import EXPANDED_SETTINGS, NANO_SETTINGS
 from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
-from looktwice.model.training.attempts import PlacedAttempts, place_attempts
+from looktwice.model.training.attempts import PlacedAttempts, fails, place_attempts
 from looktwice.model.training.batches import collate, stacked
 from looktwice.model.training.critics import (
     CriticLearner,
@@ -185,7 +185,8 @@ def run(
             while another process trains the language.
         reflections: file of the reflections that the recipe asks for.
         visual_codes: folder of codes of pictures, which the checkpoint gets; without it, it keeps its own.
-        failures: file of a model's own answers with feedback, for recipes that can learn from them.
+        failures: file of a model's own answers with feedback: ``elf-sft`` learns to refine them, and
+            ``elf-rl`` keeps to the scenes in which they are wrong.
         followed: files of trajectories that were followed, which ``critic`` learns from.
 
     Raises:
@@ -243,6 +244,10 @@ def run(
     if failures is not None and recipe.attempting is not None:
         times_s = family_named(recipe.attempting).times_s
         tried = place_attempts(examples, read_feedback(failures), times_s, taught)
+    if failures is not None and recipe.outcome is not None:
+        taught &= fails(examples, read_feedback(failures))
+        if not taught.any():
+            raise ValueError(f"no answer of {failures} is wrong, so there is nothing to learn from")
     judged = place_verdicts(examples, chain.from_iterable(map(read_followed, followed))) if followed else None
     learner, dataset, sampler, collator = _prepare(
         recipe, loaded, scenes, examples, taught, on_examples, tried, judged, settings

@@ -60,7 +60,10 @@ def train(
     ] = None,
     failures: Annotated[
         Path | None,
-        typer.Option(help="File that `looktwice failures` wrote, for elf-sft: it learns to refine, too."),
+        typer.Option(
+            help="File that `looktwice failures` wrote: elf-sft learns to refine, too, and elf-rl keeps to "
+            "the scenes whose answers are wrong."
+        ),
     ] = None,
     followed: Annotated[
         list[Path] | None,

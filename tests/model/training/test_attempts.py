@@ -22,39 +22,13 @@ from looktwice.model.training.recipes import NANO
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.run import RunSettings, run
 from looktwice.model.training.sampler import Item, TaskSampler
-from tests.model.driving.test_thoughts import SOME
+from tests.model.training.feedback_rows import EIGHT, SOME, feedback_row
 from tests.model.training.scenes import training_scene
 
 SCENES = [training_scene(index) for index in range(6)]
 EXAMPLES = Examples.from_scenes(SCENES, (FRONT_WIDE,))
-EIGHT = [[4.0 * step, 0.5, 0.02] for step in range(1, 9)]
-SECTIONS = "<feedback>\n**1. Meta action analysis:** It\u2019s too fast.\n</feedback>"
 FORMATS = ("elf_vla", "elf_vla_refine")
 ALL = np.ones(len(EXAMPLES), np.bool_)
-
-
-def row(scene_id: str, *, correct: bool = False, think: str | None = str(SOME)) -> FeedbackRow:
-    return FeedbackRow(
-        scene_id=scene_id,
-        draw=1,
-        plan=None,
-        think=think,
-        trajectory=EIGHT,
-        version="v1.1",
-        score=0.9 if correct else 0.1,
-        is_partial=False,
-        threshold=0.8,
-        correct=correct,
-        feedback="The driving score is 0.9." if correct else SECTIONS,
-        facts="[]",
-        model="nano",
-        model_revision="r",
-        teacher="rules",
-        teacher_revision="1",
-        attempts=0,
-        key="key",
-        written_at="now",
-    )
 
 
 @pytest.fixture(scope="module")
@@ -80,26 +54,29 @@ def dataset(elf: Loaded, rows: list[FeedbackRow]) -> ResponseDataset:
 def test_answers_find_their_scenes_and_times() -> None:
     dense = [[0.8 * step, 0.5, 0.02] for step in range(1, 65)]
     found = place_attempts(
-        EXAMPLES, [row("scene-4"), replace(row("scene-0"), trajectory=dense)], HALF_SECONDS_S, ALL
+        EXAMPLES,
+        [feedback_row("scene-4"), replace(feedback_row("scene-0"), trajectory=dense)],
+        HALF_SECONDS_S,
+        ALL,
     )
     assert found.examples.tolist() == [4, 0]
     for each in found.attempts:
         np.testing.assert_allclose(each.attempt.trajectory[:, [0, 1, 3]], EIGHT, rtol=1e-6)
         assert "It's too fast." in each.attempt.feedback
     with pytest.raises(ValueError, match="feedback on scene nowhere, which is not among"):
-        place_attempts(EXAMPLES, [row("nowhere")], HALF_SECONDS_S, ALL)
+        place_attempts(EXAMPLES, [feedback_row("nowhere")], HALF_SECONDS_S, ALL)
     with pytest.raises(ValueError, match="draw 1 in scene scene-4 is right and has no thoughts"):
-        place_attempts(EXAMPLES, [row("scene-4", correct=True, think=None)], HALF_SECONDS_S, ALL)
+        place_attempts(EXAMPLES, [feedback_row("scene-4", correct=True, think=None)], HALF_SECONDS_S, ALL)
 
 
 def test_wrong_answers_are_left_out_where_the_expert_tells_no_thoughts() -> None:
-    rows = [row("scene-4"), row("scene-4", correct=True), row("scene-0")]
+    rows = [feedback_row("scene-4"), feedback_row("scene-4", correct=True), feedback_row("scene-0")]
     found = place_attempts(EXAMPLES, rows, HALF_SECONDS_S, np.arange(len(EXAMPLES)) != 4)
     assert [(int(place), each.correct) for place, each in zip(*found, strict=True)] == [(4, True), (0, False)]
 
 
 def test_what_was_wrong_is_corrected_and_what_was_right_is_said_again(elf: Loaded) -> None:
-    data = dataset(elf, [row("scene-4"), row("scene-4", correct=True)])
+    data = dataset(elf, [feedback_row("scene-4"), feedback_row("scene-4", correct=True)])
     expert = data[Item(4, "elf_vla", True)].responses[0]
     samples = [data[Item(4, "elf_vla_refine", True, attempt=place)] for place in range(2)]
     wrong, right = (elf.vocabulary.decode(sample.responses[0].ids) for sample in samples)
@@ -113,7 +90,7 @@ def test_what_was_wrong_is_corrected_and_what_was_right_is_said_again(elf: Loade
 
 
 def test_training_reads_the_prompts_that_the_engine_reads(elf: Loaded) -> None:
-    rows = [row("scene-4")]
+    rows = [feedback_row("scene-4")]
     [tried] = place_attempts(EXAMPLES, rows, HALF_SECONDS_S, ALL).attempts
     built = elf.inputs.build(SCENES[4].scene, "elf_vla_refine", tried.attempt)
     assert dataset(elf, rows)[Item(4, "elf_vla_refine", True, attempt=0)].prompt == built.prompt.ids.tolist()
@@ -122,8 +99,8 @@ def test_training_reads_the_prompts_that_the_engine_reads(elf: Loaded) -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (replace(row("scene-1"), feedback="too long " * 1100), "attempt 0 cannot be learned.*1024"),
-        (row("scene-1", correct=True, think="I brake."), "attempt 0 cannot be learned.*no thoughts"),
+        (replace(feedback_row("scene-1"), feedback="too long " * 1100), "attempt 0 cannot be learned.*1024"),
+        (feedback_row("scene-1", correct=True, think="I brake."), "attempt 0 cannot be learned.*no thoughts"),
     ],
 )
 def test_what_no_prompt_or_answer_holds_is_refused_before_training(
@@ -165,7 +142,15 @@ def test_every_attempt_is_learned_once_an_epoch_beside_all_examples() -> None:
 def test_a_run_learns_to_refine_and_tells_so(resampling_checkpoint: Path, tmp_path: Path) -> None:
     scenes, file = tmp_path / "scenes", tmp_path / "feedback.parquet"
     write_scenes(scenes / "a.parquet", SCENES)
-    write_feedback(file, [row("scene-1"), row("scene-2"), row("scene-2", correct=True), row("scene-3")])
+    write_feedback(
+        file,
+        [
+            feedback_row("scene-1"),
+            feedback_row("scene-2"),
+            feedback_row("scene-2", correct=True),
+            feedback_row("scene-3"),
+        ],
+    )
     recipe = replace(NANO["elf-sft"], steps=4, batch_size=2, warmup_steps=1)
     settings = RunSettings(tmp_path / "cache", bf16=False)
 
@@ -180,7 +165,7 @@ def test_a_run_learns_to_refine_and_tells_so(resampling_checkpoint: Path, tmp_pa
     assert (stage["failures_count"], stage["right_answers_count"]) == (3, 1)
     with pytest.raises(ValueError, match="recipe meta-act takes no failures"):
         trained("meta-act")
-    write_feedback(file, [row("scene-99")])
+    write_feedback(file, [feedback_row("scene-99")])
     with pytest.raises(ValueError, match="scene-99, which is not among"):
         trained()
     write_scenes(file, SCENES[:1])
@@ -189,6 +174,6 @@ def test_a_run_learns_to_refine_and_tells_so(resampling_checkpoint: Path, tmp_pa
 
 
 def test_a_right_answer_is_told_as_it_was(elf: Loaded) -> None:
-    [tried] = place_attempts(EXAMPLES, [row("scene-4", correct=True)], HALF_SECONDS_S, ALL).attempts
+    [tried] = place_attempts(EXAMPLES, [feedback_row("scene-4", correct=True)], HALF_SECONDS_S, ALL).attempts
     assert isinstance(tried, JudgedAttempt)
     assert tried.thinking == str(SOME)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from looktwice.model.driving.feedback_store import write_feedback
 from looktwice.model.driving.pdm.judging import SceneJudge
 from looktwice.model.driving.perceived import Perceived
 from looktwice.model.driving.plan import parse_plan
@@ -42,6 +43,7 @@ from looktwice.model.training.sampler import Item
 from tests.checkpoints import write_untrained
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
 from tests.model.evaluation.fakes import draw_of
+from tests.model.training.feedback_rows import feedback_row
 from tests.model.training.scenes import training_scene
 
 BRAKES = labelled_scene(np.maximum(0, 12 - 4 * np.maximum(MIDDLES_S, 0)), agents=(agent(26.0, 0.0),))
@@ -292,6 +294,31 @@ def test_below_no_threshold_nothing_is_refined_and_nobody_needs_to_refine(
     assert ELF[1] not in load(tmp_path / "rl").card.formats
     with pytest.raises(ValueError, match="recipe cf-rl refines no draws"):
         refining_with(NANO["cf-rl"], threshold=0.5)
+
+
+def test_scenes_whose_answers_failed_are_the_only_ones_to_learn_from(
+    resampling_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes, file = tmp_path / "scenes", tmp_path / "feedback.parquet"
+    write_scenes(scenes / "a.parquet", [training_scene(index) for index in range(4)])
+    write_feedback(file, [feedback_row("scene-0", correct=True), feedback_row("scene-2")])
+    learned: set[int] = set()
+    plain = OutcomeLearner._answered
+
+    def answering(self: OutcomeLearner, places: torch.Tensor) -> Any:
+        learned.update(places.tolist())
+        return plain(self, places)
+
+    monkeypatch.setattr(OutcomeLearner, "_answered", answering)
+    recipe = refining_with(elf_recipe(), threshold=0.0)
+    settings = RunSettings(tmp_path / "cache", bf16=False)
+    run(recipe, scenes, resampling_checkpoint, tmp_path / "rl", settings, failures=file)
+    assert learned == {2}
+    [stage] = load(tmp_path / "rl").card.details["stages"]
+    assert stage["examples"] == 1
+    write_feedback(file, [feedback_row("scene-0", correct=True)])
+    with pytest.raises(ValueError, match="is wrong, so there is nothing to learn from"):
+        run(recipe, scenes, resampling_checkpoint, tmp_path / "rl", settings, failures=file)
 
 
 def test_feedback_by_rule_is_the_verdict_and_what_the_expert_did(
