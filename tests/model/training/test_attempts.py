@@ -22,7 +22,8 @@ from looktwice.model.training.recipes import NANO
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.run import RunSettings, run
 from looktwice.model.training.sampler import Item, TaskSampler
-from tests.model.training.feedback_rows import EIGHT, SOME, feedback_row
+from tests.model.driving.test_thoughts import SOME
+from tests.model.training.feedback_rows import EIGHT, feedback_row
 from tests.model.training.scenes import training_scene
 
 SCENES = [training_scene(index) for index in range(6)]
