@@ -328,6 +328,7 @@ class AsyncPlannerClient:
         transport: httpx.AsyncBaseTransport | None = None,
         access: Access = Access(),
     ) -> None:
+        self.base_url = base_url
         self._retries, self._body = retries, partial(body_of, packed=access.packed)
         self._http = httpx.AsyncClient(
             base_url=base_url, timeout=retries.timeout_s, transport=transport, headers=headers_of(access)

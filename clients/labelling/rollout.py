@@ -14,6 +14,7 @@ import numpy as np
 from looktwice.clients import wire
 from looktwice.clients.answers import (
     BadAnswer,
+    PlannerError,
     PlannerProblem,
     PlannerUnreachable,
     PlanResult,
@@ -23,7 +24,7 @@ from looktwice.clients.answers import (
 from looktwice.clients.labelling.ledger import Record, StageRun
 from looktwice.clients.labelling.pipeline import CannotBeDone, Job, StageStopped
 from looktwice.clients.planner import AsyncPlannerClient, RetryPolicy
-from looktwice.clients.retries import TryLater
+from looktwice.clients.retries import TryLater, with_retries
 from looktwice.model.driving.hashing import hash_of, scene_hash
 from looktwice.model.driving.labeller import expert_plan
 from looktwice.model.driving.metrics import displacement_errors
@@ -111,6 +112,26 @@ async def roll_out(
         "free": _draws(free, labelled, expert),
         "prefilled": _draws(given, labelled, None),
     }
+
+
+async def served_model(planner: AsyncPlannerClient, give_up_after_s: float) -> wire.ModelName:
+    """The model that a service runs, which may still be loading.
+
+    Raises:
+        StageStopped: nobody answers, or the service is not ready after so many seconds.
+    """
+
+    async def ask() -> list[wire.ModelCard]:
+        try:
+            return await planner.models()
+        except ServiceBusy as error:
+            raise TryLater(str(error), error.retry_after_s) from error
+
+    try:
+        (card, *_) = await with_retries(ask, give_up_after_s)
+    except (TryLater, PlannerError) as error:
+        raise StageStopped(f"no service answers at {planner.base_url}: {error}") from error
+    return wire.ModelName(name=card.name, revision=card.revision)
 
 
 @contextmanager

@@ -66,9 +66,15 @@ def rollout(
 ) -> None:
     """Roll a served model out over scenes: what it plans alone, and with the expert's plan given."""
     from looktwice.clients.labelling.pipeline import StageLimits
-    from looktwice.clients.labelling.rollout import RETRY_POLICY, Sampling, config_of, jobs, roll_out
-    from looktwice.clients.planner import Access, AsyncPlannerClient, PlannerError
-    from looktwice.clients.wire import ModelName
+    from looktwice.clients.labelling.rollout import (
+        RETRY_POLICY,
+        Sampling,
+        config_of,
+        jobs,
+        roll_out,
+        served_model,
+    )
+    from looktwice.clients.planner import Access, AsyncPlannerClient
 
     sampling, access = Sampling(n, temperature, top_p, seed, route, tracks), Access.from_environment()
     limits = StageLimits(at_once, give_up_after, max_error_rate, dry_run or limit)
@@ -76,11 +82,7 @@ def rollout(
 
     async def roll(ledger: Ledger) -> tuple[StageRun, Tally]:
         async with AsyncPlannerClient(service, RETRY_POLICY, access=access) as planner:
-            try:
-                (card, *_) = await planner.models()
-            except PlannerError as error:
-                raise RuntimeError(f"no service answers at {service}: {error}") from error
-            model = ModelName(name=card.name, revision=card.revision)
+            model = await served_model(planner, give_up_after)
             run = ledger.run("rollout", config_of(model, sampling))
             if retry_dead:
                 ledger.forget_dead(run)

@@ -92,16 +92,11 @@ async def _infer(
     quiet: bool,
 ) -> tuple[StageRun, Tally]:
     from looktwice.clients.labelling.feedback_set import infer, inference_config
-    from looktwice.clients.labelling.rollout import RETRY_POLICY, jobs
-    from looktwice.clients.planner import Access, AsyncPlannerClient, PlannerError
-    from looktwice.clients.wire import ModelName
+    from looktwice.clients.labelling.rollout import RETRY_POLICY, jobs, served_model
+    from looktwice.clients.planner import Access, AsyncPlannerClient
 
     async with AsyncPlannerClient(service, RETRY_POLICY, access=Access.from_environment()) as planner:
-        try:
-            (card, *_) = await planner.models()
-        except PlannerError as error:
-            raise RuntimeError(f"no service answers at {service}: {error}") from error
-        model = ModelName(name=card.name, revision=card.revision)
+        model = await served_model(planner, limits.give_up_after_s)
         run = ledger.run("inference", inference_config(model, inference))
         if retry_dead:
             ledger.forget_dead(run)

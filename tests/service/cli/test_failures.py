@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,23 @@ def test_responses_are_judged_sampled_and_written_once(
         assert isinstance(parse_feedback(row.feedback), Feedback)
         assert (row.teacher, row.threshold, row.version, len(row.trajectory)) == ("rules", 1.0, "v1.1", 64)
         assert json.loads(row.facts)
+
+
+def test_a_service_that_is_loading_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LOOKTWICE_TEACHER_KIND", raising=False)
+    engine = ScriptedEngine()
+    engine.may_start.clear()
+    asked = ["failures", str(tmp_path / "failures"), str(scenes(tmp_path, 1))]
+    with serve(engine, Settings(bundled_scenes=tmp_path / "none"), wait=False) as served:
+        asked += ["--service", served.url]
+        given_up = CliRunner().invoke(app, [*asked, "--give-up-after", "0.5"])
+        assert given_up.exit_code == 2
+        assert "the model is loading" in given_up.output
+        waiting = threading.Timer(0.5, served.in_loop, [engine.may_start.set])
+        waiting.start()
+        result = CliRunner().invoke(app, asked)
+        waiting.join()
+    assert result.exit_code == 0, result.output
 
 
 def test_nobody_answers_is_one_line(tmp_path: Path) -> None:
