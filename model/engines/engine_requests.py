@@ -80,11 +80,8 @@ def start_cursor(
 
 def _check_thinking(request: PlanRequest, family: Family) -> None:
     controls = request.controls
-    if controls.thinking not in family.thinking_choices:
-        known = ", ".join(family.thinking_choices)
-        raise RequestError(
-            f"thinking: in format {request.format!r} it can be {known}, not {controls.thinking}"
-        )
+    if refused := family.thinking_refused(controls.thinking):
+        raise RequestError(f"thinking: {refused}")
     if controls.think_threshold is not None and family.branch is None:
         raise RequestError(f"think_threshold: responses in format {request.format!r} have no branch")
 

@@ -434,6 +434,13 @@ class Family:
         without = self.unthought or self.reflection is None
         return ("adaptive", "never") if without else ("adaptive",)
 
+    def thinking_refused(self, thinking: Thinking) -> str | None:
+        """Why responses cannot be asked to think so; None where they can."""
+        if thinking in self.thinking_choices:
+            return None
+        known = " or ".join(self.thinking_choices)
+        return f"responses in {self.name} cannot be asked for {thinking}; ask for {known}"
+
     @property
     def bare(self) -> bool:
         """Whether its responses are a trajectory and nothing else."""

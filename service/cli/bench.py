@@ -92,9 +92,8 @@ def engine(
         for load in loads:
             # Refused before the work begins.
             load.controls()
-            if load.thinking not in family.thinking_choices:
-                known = ", ".join(family.thinking_choices)
-                raise ValueError(f"--thinking can be {known} in format {written}, not {load.thinking}")
+            if refused := family.thinking_refused(load.thinking):
+                raise ValueError(f"--thinking: {refused}")
         names = tuple(engines.split(","))
         if unknown := set(names) - set(_ENGINES.split(",")):
             raise ValueError(f"unknown engine {', '.join(sorted(unknown))}; known are {_ENGINES}")

@@ -115,10 +115,8 @@ def format_of(asked: wire.PlanRequest | wire.ReflectRequest, card: ModelCard) ->
 def _check_thinking(asked: wire.ReflectControls, format: str) -> None:
     """Raise `ProblemError` where a choice to think is made that a format cannot follow."""
     family = family_named(format)
-    if asked.thinking not in family.thinking_choices:
-        known = " or ".join(family.thinking_choices)
-        problem = f"responses in {format} cannot be asked for {asked.thinking}; ask for {known}"
-        raise at(INVALID_CONTROLS, "/controls/thinking", problem)
+    if refused := family.thinking_refused(asked.thinking):
+        raise at(INVALID_CONTROLS, "/controls/thinking", refused)
     if asked.think_threshold is not None and family.branch is None:
         problem = f"{format} has no branch for it to decide; leave it out"
         raise at(INVALID_CONTROLS, "/controls/think_threshold", problem)
