@@ -7,12 +7,22 @@ from typing import Annotated
 
 import typer
 
-from looktwice.service.cli.options import reported_errors
+from looktwice.service.cli.options import folder_along, reported_errors
 
 
 def blend(
-    before: Annotated[Path, typer.Argument(help="Checkpoint folder that training began with.")],
-    after: Annotated[Path, typer.Argument(help="Checkpoint folder that came of it.")],
+    before: Annotated[
+        Path,
+        typer.Argument(
+            help="Checkpoint folder that training began with, or one that comes along.", callback=folder_along
+        ),
+    ],
+    after: Annotated[
+        Path,
+        typer.Argument(
+            help="Checkpoint folder that came of it, or one that comes along.", callback=folder_along
+        ),
+    ],
     to: Annotated[Path, typer.Option(help="Folder for the checkpoint between them.")],
     share: Annotated[float, typer.Option(min=0, max=1, help="Of the second checkpoint.")] = 0.5,
 ) -> None:
