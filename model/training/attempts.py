@@ -58,6 +58,23 @@ def fails(examples: Examples, rows: Iterable[FeedbackRow]) -> npt.NDArray[np.boo
     return failed
 
 
+def half_failed(learned: npt.NDArray[np.bool_], failed: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """The places of the examples that are learned from, those that failed so often that they are half.
+
+    Failures alone would teach to brake whatever comes: most of them end in a collision.
+
+    Args:
+        learned, failed: bool [N], which examples are.
+
+    Raises:
+        ValueError: none of them failed.
+    """
+    often, once = np.flatnonzero(learned & failed), np.flatnonzero(learned & ~failed)
+    if not len(often):
+        raise ValueError("no answer in a scene that can be learned from is wrong")
+    return np.concatenate([once, np.repeat(often, max(1, round(len(once) / len(often))))])
+
+
 def _attempt(row: FeedbackRow, times_s: Sequence[float]) -> JudgedAttempt:
     if row.correct and not row.think:
         raise ValueError(

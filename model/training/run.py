@@ -44,7 +44,7 @@ from looktwice.model.network.visual_codes import load_visual_codes
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.network.vla_settings import EXPANDED_SETTINGS, NANO_SETTINGS
 from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
-from looktwice.model.training.attempts import PlacedAttempts, fails, place_attempts
+from looktwice.model.training.attempts import PlacedAttempts, fails, half_failed, place_attempts
 from looktwice.model.training.batches import collate, stacked
 from looktwice.model.training.critics import (
     CriticLearner,
@@ -186,7 +186,7 @@ def run(
         reflections: file of the reflections that the recipe asks for.
         visual_codes: folder of codes of pictures, which the checkpoint gets; without it, it keeps its own.
         failures: file of a model's own answers with feedback: ``elf-sft`` learns to refine them, and
-            ``elf-rl`` keeps to the scenes in which they are wrong.
+            ``elf-rl`` takes every second scene from those in which they are wrong.
         followed: files of trajectories that were followed, which ``critic`` learns from.
 
     Raises:
@@ -244,13 +244,12 @@ def run(
     if failures is not None and recipe.attempting is not None:
         times_s = family_named(recipe.attempting).times_s
         tried = place_attempts(examples, read_feedback(failures), times_s, taught)
+    failed = None
     if failures is not None and recipe.outcome is not None:
-        taught &= fails(examples, read_feedback(failures))
-        if not taught.any():
-            raise ValueError(f"no answer of {failures} is wrong, so there is nothing to learn from")
+        failed = fails(examples, read_feedback(failures))
     judged = place_verdicts(examples, chain.from_iterable(map(read_followed, followed))) if followed else None
     learner, dataset, sampler, collator = _prepare(
-        recipe, loaded, scenes, examples, taught, on_examples, tried, judged, settings
+        recipe, loaded, scenes, examples, taught, on_examples, tried, failed, judged, settings
     )
     if isinstance(learner, IntentLearner | FactLearner) and validation:
         held_out = Examples.from_scenes(validation, loaded.settings.cameras)
@@ -296,7 +295,7 @@ def run(
             loaded.vocabulary,
             loaded.codec,
             dtype=torch.bfloat16,
-            details={"stages": [*stages, _about(recipe, examples, taught, on_examples, tried)]},
+            details={"stages": [*stages, _about(recipe, examples, taught, on_examples, tried, failed)]},
             visual_codes=loaded.visual_codes,
         )
     # gloo's threads drop what they gathered a moment later, and need the interpreter for it: a process that
@@ -355,6 +354,7 @@ def _prepare(
     taught: npt.NDArray[np.bool_],
     on_examples: PlacedReflections | None,
     tried: PlacedAttempts | None,
+    failed: npt.NDArray[np.bool_] | None,
     judged: PlacedVerdicts | None,
     settings: RunSettings,
 ) -> tuple[nn.Module, Dataset[Any], TaskSampler | None, Callable[[list[Any]], dict[str, torch.Tensor]]]:
@@ -453,10 +453,11 @@ def _prepare(
             tracks_share=recipe.tracks_share if loaded.settings.with_tracks else 0.0,
         )
         # Where nobody knows the road, a draw that leaves it would count as one that holds.
-        places = np.flatnonzero(examples.pictured & taught & examples.tell("perceived")).tolist()
-        if not places:
+        judged_there = examples.pictured & taught & examples.tell("perceived")
+        if not judged_there.any():
             raise ValueError(f"recipe {recipe.name} judges draws, and no scene with pictures tells the road")
-        return judging, ScenePlaces(places), None, collate_places
+        places = np.flatnonzero(judged_there) if failed is None else half_failed(judged_there, failed)
+        return judging, ScenePlaces(places.tolist()), None, collate_places
     sampler = TaskSampler(
         examples.has_route,
         recipe.batch_size,
@@ -490,6 +491,7 @@ def _about(
     taught: npt.NDArray[np.bool_],
     on_examples: PlacedReflections | None,
     tried: PlacedAttempts | None,
+    failed: npt.NDArray[np.bool_] | None,
 ) -> Mapping[str, Any]:
     about = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     about |= {"tasks": dict(recipe.tasks), "weights": dict(recipe.weights)}
@@ -500,5 +502,7 @@ def _about(
     if tried is not None:
         right = sum(each.correct for each in tried.attempts)
         about |= {"failures_count": len(tried.attempts) - right, "right_answers_count": right}
+    if failed is not None:
+        about |= {"failed_scenes_count": int(failed.sum())}
     episodes = len(np.unique(examples.episode[taught]))
     return about | {"examples": int(taught.sum()), "episodes": episodes}

@@ -61,8 +61,8 @@ def train(
     failures: Annotated[
         Path | None,
         typer.Option(
-            help="File that `looktwice failures` wrote: elf-sft learns to refine, too, and elf-rl keeps to "
-            "the scenes whose answers are wrong."
+            help="File that `looktwice failures` wrote: elf-sft learns to refine, too, and elf-rl takes "
+            "every second scene from those whose answers are wrong."
         ),
     ] = None,
     followed: Annotated[

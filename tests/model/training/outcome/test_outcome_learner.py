@@ -296,29 +296,29 @@ def test_below_no_threshold_nothing_is_refined_and_nobody_needs_to_refine(
         refining_with(NANO["cf-rl"], threshold=0.5)
 
 
-def test_scenes_whose_answers_failed_are_the_only_ones_to_learn_from(
+def test_half_of_the_scenes_are_those_whose_answers_failed(
     resampling_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scenes, file = tmp_path / "scenes", tmp_path / "feedback.parquet"
     write_scenes(scenes / "a.parquet", [training_scene(index) for index in range(4)])
     write_feedback(file, [feedback_row("scene-0", correct=True), feedback_row("scene-2")])
-    learned: set[int] = set()
+    learned: list[int] = []
     plain = OutcomeLearner._answered
 
     def answering(self: OutcomeLearner, places: torch.Tensor) -> Any:
-        learned.update(places.tolist())
+        learned.extend(places.tolist())
         return plain(self, places)
 
     monkeypatch.setattr(OutcomeLearner, "_answered", answering)
-    recipe = refining_with(elf_recipe(), threshold=0.0)
+    # Six places: an epoch.
+    recipe = replace(refining_with(elf_recipe(), threshold=0.0), steps=3)
     settings = RunSettings(tmp_path / "cache", bf16=False)
     run(recipe, scenes, resampling_checkpoint, tmp_path / "rl", settings, failures=file)
-    assert learned == {2}
-    [stage] = load(tmp_path / "rl").card.details["stages"]
-    assert stage["examples"] == 1
+    assert sorted(learned) == [0, 1, 2, 2, 2, 3]
+    assert load(tmp_path / "rl").card.details["stages"][-1]["failed_scenes_count"] == 1
     write_feedback(file, [feedback_row("scene-0", correct=True)])
-    with pytest.raises(ValueError, match="is wrong, so there is nothing to learn from"):
-        run(recipe, scenes, resampling_checkpoint, tmp_path / "rl", settings, failures=file)
+    with pytest.raises(ValueError, match="no answer in a scene that can be learned from is wrong"):
+        run(recipe, scenes, resampling_checkpoint, tmp_path / "no", settings, failures=file)
 
 
 def test_feedback_by_rule_is_the_verdict_and_what_the_expert_did(
