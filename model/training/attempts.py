@@ -61,7 +61,7 @@ def fails(examples: Examples, rows: Iterable[FeedbackRow]) -> npt.NDArray[np.boo
 def half_failed(learned: npt.NDArray[np.bool_], failed: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
     """The places of the examples that are learned from, those that failed so often that they are half.
 
-    Failures alone would teach to brake whatever comes: most of them end in a collision.
+    Failures alone would teach to brake whatever comes: most of them are collisions, or nearly.
 
     Args:
         learned, failed: bool [N], which examples are.
