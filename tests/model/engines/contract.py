@@ -149,7 +149,7 @@ async def bad_requests_fail_alone(engine: Engine, scene: Scene) -> None:
         (asked(engine, "d", scene, imagine="always"), "imagine no pictures"),
         (
             PlanRequest("e", scene, plain, Controls(thinking="always")),
-            "thinking: .* adaptive.*, not always",
+            "thinking: .* cannot be asked for always; ask for adaptive",
         ),
         (PlanRequest("f", scene, plain, Controls(think_threshold=0.5)), "have no branch"),
     ):
