@@ -37,7 +37,10 @@ def test_vllm_arguments_must_be_an_object(untrained_checkpoint: Path, arguments:
         (["--at-once", "1,0"], "'0' is no positive number"),
         (["--draws", "65"], "n must be a whole number in 1..64"),
         (["--thinking", "sometimes"], "thinking must be"),
-        (["--format", "traj_only", "--thinking", "always"], "asked for always; ask for adaptive or never"),
+        (
+            ["--format", "traj_only", "--thinking", "always"],
+            "traj_only cannot be asked for always; ask for adaptive or never",
+        ),
         (["--camera", "front_wide_120"], "cf_vla imagine no pictures"),
         (["--format", "prose"], "no model family 'prose'"),
         (["--preset", "cf-vla-3b"], "say --random-weights"),
