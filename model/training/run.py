@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -27,8 +27,6 @@ from looktwice.model.network.attention import MATMUL_ATTENTION
 from looktwice.model.network.card import LOG_FILE
 from looktwice.model.network.checkpoint import (
     Loaded,
-    create_nano,
-    expand_stock,
     load,
     save,
     with_fine_vision,
@@ -37,13 +35,10 @@ from looktwice.model.network.checkpoint import (
     with_sketches,
     with_visual_codes,
 )
-from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.intent import IntentReader
-from looktwice.model.network.nano_corpus import nano_corpus, nano_phrases
 from looktwice.model.network.visual_codes import load_visual_codes
 from looktwice.model.network.vla import LookTwiceVla
-from looktwice.model.network.vla_settings import EXPANDED_SETTINGS, NANO_SETTINGS
-from looktwice.model.network.vocabulary import Vocabulary, build_nano_tokenizer
+from looktwice.model.network.vla_settings import NANO_SETTINGS
 from looktwice.model.training.attempts import PlacedAttempts, fails, half_failed, place_attempts
 from looktwice.model.training.batches import collate, stacked
 from looktwice.model.training.critics import (
@@ -122,38 +117,6 @@ class RunSettings:
         if self.use_cpu or not torch.cuda.is_available():
             return torch.device("cpu")
         return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
-
-
-def create(
-    scenes: Path,
-    cache: Path,
-    target: Path,
-    backbone: Path | None = None,
-    *,
-    codec_size: int = 512,
-    seed: int = 0,
-) -> dict[str, float]:
-    """Write a checkpoint to begin with, whose codec is fitted to ``scenes``; returns the codec's error.
-
-    Args:
-        scenes: file or folder of training scenes.
-        cache: for scenes brought into arrays.
-        target: checkpoint folder to write.
-        backbone: a stock Qwen2.5-VL folder, which is expanded; without one a nano network is made.
-        codec_size: trajectory codes a stage.
-        seed: of the codec and of new weights.
-
-    Raises:
-        CheckpointError: ``backbone`` is no Qwen2.5-VL.
-    """
-    examples = load_examples(scenes, cache, NANO_SETTINGS.cameras)
-    codec = TrajectoryCodec.fit(examples.history, examples.future, size=codec_size, seed=seed)
-    if backbone is not None:
-        expand_stock(backbone, target, codec, replace(EXPANDED_SETTINGS, name=target.name), seed=seed)
-    else:
-        vocabulary = Vocabulary(build_nano_tokenizer(nano_corpus(), codec_size, phrases=nano_phrases()))
-        create_nano(target, codec, vocabulary, seed, replace(NANO_SETTINGS, codec_size=codec_size))
-    return codec.reconstruction_error(examples.history, examples.future)
 
 
 def run(

@@ -167,6 +167,7 @@ def train(
     from looktwice.model.training.branch import NAME as BRANCH
     from looktwice.model.training.branch import train_branch
     from looktwice.model.training.composer import train_composer
+    from looktwice.model.training.first_checkpoint import create
     from looktwice.model.training.recipes import (
         COMPOSER,
         NANO,
@@ -177,7 +178,7 @@ def train(
         refining_with,
         responding,
     )
-    from looktwice.model.training.run import RunSettings, create, run
+    from looktwice.model.training.run import RunSettings, run
     from looktwice.model.training.small import SmallSettings
     from looktwice.model.training.visual_codes import train_visual_codes
     from looktwice.service.cli.ladder import LadderScenes, climb
