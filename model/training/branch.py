@@ -33,7 +33,7 @@ from looktwice.model.training.recipes import NANO
 from looktwice.model.training.reflections import PlacedReflections, place_reflections
 from looktwice.model.training.response_targets import Target
 from looktwice.model.training.responses import ResponseDataset
-from looktwice.model.training.run import RunSettings
+from looktwice.model.training.run_settings import RunSettings
 from looktwice.model.training.sampler import Item
 from looktwice.model.training.trainer import inherit_log
 from looktwice.model.training.vision_cache import VisionCache, open_vision

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,34 +16,34 @@ from looktwice.model.training.recipes import Recipe
 from looktwice.model.training.reflections import PlacedReflections
 
 
-def check_files(
-    recipe: Recipe,
-    loaded: Loaded,
-    *,
-    reflections: Path | None,
-    failures: Path | None,
-    followed: Collection[Path],
-) -> None:
-    """Raise ValueError unless a recipe is given the files that it learns from, and no others.
+@dataclass(frozen=True)
+class TrainingFiles:
+    """Files that a recipe may ask for beside scenes.
 
-    Args:
-        recipe: what to do.
-        loaded: the checkpoint to start from.
-        reflections: file of a build's reflections.
-        failures: file of a model's own answers with feedback.
-        followed: files of trajectories that were followed.
+    Attributes:
+        reflections: a build's verified plans.
+        failures: a model's own answers with feedback.
+        followed: trajectories that were followed.
     """
+
+    reflections: Path | None = None
+    failures: Path | None = None
+    followed: Sequence[Path] = ()
+
+
+def check_files(recipe: Recipe, loaded: Loaded, files: TrainingFiles) -> None:
+    """Raise ValueError unless a recipe is given the files that it learns from, and no others."""
     # What second sketches change is learned from all scenes, and no reflection of a build tells it.
     told = recipe.sketched and loaded.settings.second_sketch
-    if (reflections is None) != (recipe.reflections is None or told):
-        wants = "needs reflections" if reflections is None else "takes no reflections"
+    if (files.reflections is None) != (recipe.reflections is None or told):
+        wants = "needs reflections" if files.reflections is None else "takes no reflections"
         why = f": {loaded.card.name} tells in the prompt what else might be driven" if told else ""
         raise ValueError(f"recipe {recipe.name} {wants}{why}")
-    if bool(followed) != (recipe.goal == "judge"):
-        wants = "takes no followed trajectories" if followed else "needs followed trajectories"
+    if bool(files.followed) != (recipe.goal == "judge"):
+        wants = "takes no followed trajectories" if files.followed else "needs followed trajectories"
         raise ValueError(f"recipe {recipe.name} {wants}")
     refines = recipe.outcome is not None and recipe.outcome.refining is not None
-    if failures is not None and recipe.attempting is None and not refines:
+    if files.failures is not None and recipe.attempting is None and not refines:
         raise ValueError(f"recipe {recipe.name} takes no failures")
 
 

@@ -178,7 +178,8 @@ def train(
         refining_with,
         responding,
     )
-    from looktwice.model.training.run import RunSettings, run
+    from looktwice.model.training.run import run
+    from looktwice.model.training.run_settings import RunSettings
     from looktwice.model.training.small import SmallSettings
     from looktwice.model.training.visual_codes import train_visual_codes
     from looktwice.service.cli.ladder import LadderScenes, climb

@@ -20,7 +20,8 @@ from looktwice.model.training.attempts import place_attempts
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.recipes import NANO
 from looktwice.model.training.responses import ResponseDataset
-from looktwice.model.training.run import RunSettings, run
+from looktwice.model.training.run import run
+from looktwice.model.training.run_settings import RunSettings
 from looktwice.model.training.sampler import Item, TaskSampler
 from tests.model.driving.test_thoughts import SOME
 from tests.model.training.feedback_rows import EIGHT, feedback_row

@@ -24,7 +24,7 @@ from looktwice.model.network.second_sketch import LOOK_GAIN, CurveSpace, Known, 
 from looktwice.model.training.branch import train_branch
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.own_plans import OwnPlans
-from looktwice.model.training.run import RunSettings
+from looktwice.model.training.run_settings import RunSettings
 from looktwice.model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
 from tests.model.training.second_sketches import standing_still

@@ -18,7 +18,8 @@ from looktwice.model.training.batches import stacked
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.fact_reading import FactDataset, FactLearner, reading_errors
 from looktwice.model.training.recipes import NANO
-from looktwice.model.training.run import RunSettings, run
+from looktwice.model.training.run import run
+from looktwice.model.training.run_settings import RunSettings
 from looktwice.model.training.vision_cache import VisionCache, open_vision
 from tests.model.training.scenes import training_scene
 

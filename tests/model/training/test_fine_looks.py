@@ -35,7 +35,8 @@ from looktwice.model.training.fine_looks import (
     marked,
 )
 from looktwice.model.training.recipes import NANO
-from looktwice.model.training.run import RunSettings, run
+from looktwice.model.training.run import run
+from looktwice.model.training.run_settings import RunSettings
 from looktwice.model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
 

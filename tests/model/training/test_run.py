@@ -23,7 +23,8 @@ from looktwice.model.network.checkpoint import load, save, with_second_sketches,
 from looktwice.model.network.visual_codes import VisualCodes
 from looktwice.model.network.vla_settings import NANO_SETTINGS
 from looktwice.model.training.recipes import NANO, Recipe
-from looktwice.model.training.run import RunSettings, last_whole_state, run
+from looktwice.model.training.run import last_whole_state, run
+from looktwice.model.training.run_settings import RunSettings
 from tests.checkpoints import write_untrained
 from tests.model.training.scenes import training_scene
 
@@ -189,7 +190,8 @@ import sys
 from pathlib import Path
 from dataclasses import replace
 from looktwice.model.training.recipes import NANO
-from looktwice.model.training.run import RunSettings, run
+from looktwice.model.training.run import run
+from looktwice.model.training.run_settings import RunSettings
 scenes, source, target, cache = map(Path, sys.argv[1:])
 recipe = replace(NANO["language"], steps=12, batch_size=4, warmup_steps=1)
 run(recipe, scenes, source, target, RunSettings(cache, save_every=2, bf16=False))

@@ -11,7 +11,8 @@ from transformers import TrainerState
 
 from looktwice.model.driving.scene_store import write_scenes
 from looktwice.model.training.recipes import NANO
-from looktwice.model.training.run import RunSettings, run
+from looktwice.model.training.run import run
+from looktwice.model.training.run_settings import RunSettings
 from looktwice.model.training.sampler import TaskSampler
 from looktwice.model.training.trainer import _Epochs, draw_apart
 from tests.model.training.scenes import training_scene

@@ -38,7 +38,8 @@ from looktwice.model.training.outcome.draw_rewards import (
 )
 from looktwice.model.training.outcome.outcome_learner import OutcomeLearner
 from looktwice.model.training.recipes import NANO, OutcomeSettings, Recipe, RefineSettings, refining_with
-from looktwice.model.training.run import RunSettings, run
+from looktwice.model.training.run import run
+from looktwice.model.training.run_settings import RunSettings
 from looktwice.model.training.sampler import Item
 from tests.checkpoints import write_untrained
 from tests.model.driving.drives import MIDDLES_S, agent, labelled_scene
