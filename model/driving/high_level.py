@@ -1,4 +1,4 @@
-"""High-level planning: what a trajectory does in one word for speed and one for direction, and its accuracy.
+"""High-level planning: what a trajectory does in one word for speed and one for direction.
 
 ELF-VLA (supplement, section 9.1 and figure 9) tells four longitudinal states by "acceleration via a sliding
 window" and five lateral manoeuvres by "the alignment between the future path and the lane structure" of a
@@ -9,7 +9,7 @@ All is odd in left and right: the action of a mirrored trajectory on a mirrored 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -64,22 +64,6 @@ class HighLevelAction:
         return replace(self, lateral=_OTHER_SIDE.get(self.lateral, self.lateral))
 
 
-@dataclass(frozen=True)
-class HighLevelAccuracy:
-    """Shares of predictions, 0..1, whose class is the expert's.
-
-    Attributes:
-        count: of predictions.
-        longitudinal, lateral: of each dimension.
-        both: of those that are right in both.
-    """
-
-    count: int
-    longitudinal: float
-    lateral: float
-    both: float
-
-
 def action_of(
     trajectory: FloatArray, graph: LaneGraph, times_s: Sequence[float] = TEN_HZ_S
 ) -> HighLevelAction | None:
@@ -91,20 +75,6 @@ def action_of(
     poses = _poses(trajectory, times_s)
     way = graph.path_along(poses[:, :2])
     return None if way is None else HighLevelAction(_longitudinal(poses), _lateral(poses, way))
-
-
-def accuracy(pairs: Iterable[tuple[HighLevelAction, HighLevelAction]]) -> HighLevelAccuracy:
-    """The accuracy of pairs of a predicted and the expert's action; raises ValueError without any."""
-    right = np.array(
-        [
-            (predicted.longitudinal == expert.longitudinal, predicted.lateral == expert.lateral)
-            for predicted, expert in pairs
-        ]
-    )
-    if not len(right):
-        raise ValueError("accuracy needs at least one prediction")
-    longitudinal, lateral = right.mean(axis=0)
-    return HighLevelAccuracy(len(right), float(longitudinal), float(lateral), float(right.all(axis=1).mean()))
 
 
 def _poses(trajectory: FloatArray, times_s: Sequence[float]) -> Array:

@@ -9,7 +9,6 @@ from looktwice.model.driving.high_level import (
     HighLevelAction,
     Lateral,
     Longitudinal,
-    accuracy,
     action_of,
 )
 from looktwice.model.driving.lane_graph import LaneGraph
@@ -108,15 +107,6 @@ def test_off_all_lanes_nothing_is_told() -> None:
 def test_a_short_trajectory_is_refused() -> None:
     with pytest.raises(GeometryError, match="must reach 4 s to be judged, it ends at 3 s"):
         action_of(np.zeros((3, 4), np.float32), LaneGraph(THREE_LANES), (1.0, 2.0, 3.0))
-
-
-def test_accuracy_counts_both_dimensions() -> None:
-    expert = HighLevelAction("stop", "keep")
-    predicted = [expert, HighLevelAction("stop", "turn left"), HighLevelAction("maintain", "keep")]
-    found = accuracy((each, expert) for each in [*predicted, HighLevelAction("maintain", "turn right")])
-    assert (found.count, found.longitudinal, found.lateral, found.both) == (4, 0.5, 0.5, 0.25)
-    with pytest.raises(ValueError, match="at least one prediction"):
-        accuracy([])
 
 
 @given(ACTIONS)
