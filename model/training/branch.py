@@ -9,7 +9,7 @@ mean nothing anywhere else; their embeddings stay, since the head gets weights o
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -69,7 +69,12 @@ class _JudgedPlans(NamedTuple):
 
 
 def train_branch(
-    scenes: Path, source: Path, target: Path, reflections: Path | None, settings: RunSettings
+    scenes: Path,
+    source: Path,
+    target: Path,
+    reflections: Path | None,
+    settings: RunSettings,
+    on_done: Callable[[int, int], None] | None = None,
 ) -> Mapping[str, float]:
     """Write ``source`` to ``target`` with a branch that is learned alone.
 
@@ -79,6 +84,7 @@ def train_branch(
         reflections: of a build with outcomes, on these scenes: those that are judged count. None for a
             checkpoint with second sketches, whose critic judges a sketch for every scene.
         settings: ``cache``, ``bf16`` and ``workers`` count.
+        on_done: told how many of how many prompts are read, batch by batch.
 
     Returns:
         Figures of plans that were left out while the rest was learned from: ``auc`` of the think probability,
@@ -110,7 +116,7 @@ def train_branch(
     vision = open_vision(
         loaded, examples, settings.cache, mirrored=True, bf16=settings.bf16, workers=settings.workers
     )
-    plans = _judged_plans(loaded, options, examples, vision, placed)
+    plans = _judged_plans(loaded, options, examples, vision, placed, on_done)
     if plans.looks.all() or not plans.looks.any():
         raise ValueError(
             f"{loaded.card.name}'s critic judges all sketches alike, so nothing tells them apart"
@@ -158,6 +164,7 @@ def _judged_plans(
     examples: Examples,
     vision: VisionCache,
     placed: PlacedReflections | None,
+    on_done: Callable[[int, int], None] | None,
 ) -> _JudgedPlans:
     """All plans that are judged, as the model was told their scenes, and their mirror images behind them."""
     recipe = NANO["sketched" if placed is None else "counterfactual"]
@@ -181,6 +188,7 @@ def _judged_plans(
     # Prompts with pictures and those without share no batch.
     sorts = [[item for item in items if item.pictures == pictures] for pictures in (True, False)]
     batches = [sort[start : start + _BATCH] for sort in sorts for start in range(0, len(sort), _BATCH)]
+    done = 0
     for some in batches:
         samples = [responses[item] for item in some]
         branches = [
@@ -193,6 +201,9 @@ def _judged_plans(
         states.append(found[[taught for _, _, taught in branches]])
         looks += [looked for _, looked, taught in branches if taught]
         episodes += [int(episode) for episode, _, taught in branches if taught]
+        done += len(some)
+        if on_done is not None:
+            on_done(done, len(items))
     return _JudgedPlans(torch.cat(states).numpy(), np.array(looks, np.bool_), np.array(episodes, np.int64))
 
 

@@ -157,6 +157,8 @@ def train(
     from dataclasses import replace
 
     import torch
+    from rich.console import Console
+    from rich.progress import Progress
 
     from looktwice.model.driving.scene_store import count_scenes, read_scenes
     from looktwice.model.evaluation.curves import training_curves
@@ -206,7 +208,15 @@ def train(
             _refuse_others(context, recipe, "reflections cache bf16 workers")
             if source is None:
                 raise ValueError("give the checkpoint to start from: --from FOLDER")
-            _tell(train_branch(scenes, source, target, reflections, run_settings))
+            # Progress goes to stderr, so that stdout holds nothing but the figures.
+            with Progress(console=Console(stderr=True)) as progress:
+                reading = progress.add_task("prompts", total=None)
+
+                def show(done: int, total: int) -> None:
+                    progress.update(reading, completed=done, total=total)
+
+                told_apart = train_branch(scenes, source, target, reflections, run_settings, show)
+            _tell(told_apart)
             return
         if recipe == "ladder":
             if test is None:

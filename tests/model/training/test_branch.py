@@ -66,8 +66,13 @@ def test_who_is_to_look_twice_does_and_nothing_else_changes(
         [judged(each, WAIT, TEXT) for each in SCENES[:-6]] + [judged(each, KEEP, "") for each in SCENES[:-6]],
     )
     settings = RunSettings(tmp_path / "cache", bf16=False)
-    figures = train_branch(scenes, resampling_checkpoint, target, file, settings)
+    told: list[tuple[int, int]] = []
+    figures = train_branch(
+        scenes, resampling_checkpoint, target, file, settings, lambda *done: told.append(done)
+    )
     assert figures["auc"] > 0.95, "figures are of plans that were left out"
+    assert [total for _, total in told] == [told[-1][0]] * len(told)
+    assert told == sorted(set(told)), "progress goes on, to the last prompt"
     before = load(resampling_checkpoint).model.bfloat16().state_dict()
     learned = load(target, dtype=torch.bfloat16)
     moved = {
