@@ -12,7 +12,8 @@ from pathlib import Path
 def written_whole(path: Path) -> Generator[Path]:
     """A place to write to, which becomes ``path`` when the block ends well, and goes when it does not.
 
-    What a process that was killed left of an earlier try is taken away. The folder is made.
+    What a process that was killed left of an earlier try is taken away. The folder is made. Who may read the
+    file is up to the umask, whatever wrote it: safetensors writes files that nobody but their owner can read.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f".{path.name}.*.tmp"):
@@ -20,7 +21,10 @@ def written_whole(path: Path) -> Generator[Path]:
             left.unlink(missing_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
+        temporary.touch()
+        mode = temporary.stat().st_mode
         yield temporary
+        temporary.chmod(mode)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -146,6 +147,9 @@ def save(
             model.save_pretrained(folder, state_dict=state)
     finally:
         model.config.dtype = before
+    for weights in folder.glob("model*.safetensors"):
+        # safetensors writes files that nobody but their owner can read: a service may be somebody else.
+        shutil.copymode(folder / "config.json", weights)
     vocabulary.tokenizer.save_pretrained(folder)
     codec.save(folder)
     if visual_codes is not None:

@@ -20,6 +20,7 @@ from safetensors.numpy import save_file
 
 from looktwice.model.driving.scene import EGO_LENGTH_M
 from looktwice.model.driving.trajectory import FUTURE_STEPS, HORIZON_S, STEP_S, FloatArray
+from looktwice.model.driving.whole_files import written_whole
 from looktwice.model.network import quantiser
 from looktwice.model.network.splines import clamped_basis
 
@@ -161,7 +162,8 @@ class TrajectoryCodec:
         """Write ``trajectory_codec.safetensors`` into ``folder``."""
         tensors = {name: np.ascontiguousarray(getattr(self, name)) for name in ("mean", "axes", "books")}
         about = {"version": CODEC_VERSION, "kind": "spline residual vector quantisation"}
-        save_file(tensors, folder / CODEC_FILE, metadata={"looktwice": json.dumps(about)})
+        with written_whole(folder / CODEC_FILE) as temporary:
+            save_file(tensors, temporary, metadata={"looktwice": json.dumps(about)})
 
     @classmethod
     def load(cls, folder: Path) -> TrajectoryCodec:

@@ -22,6 +22,15 @@ def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
     assert list(path.parent.iterdir()) == [path]
 
 
+def test_who_may_read_it_is_up_to_the_umask(tmp_path: Path) -> None:
+    plain, path = tmp_path / "plain", tmp_path / "file"
+    plain.touch()
+    with written_whole(path) as temporary:
+        temporary.unlink()
+        temporary.touch(mode=0o600)
+    assert path.stat().st_mode == plain.stat().st_mode
+
+
 def _fail_halfway(path: Path) -> None:
     with written_whole(path) as temporary:
         temporary.write_text("half of the sec")

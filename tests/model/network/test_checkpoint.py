@@ -118,6 +118,8 @@ def test_saved_in_half_and_loaded(nano: Loaded, tmp_path: Path) -> None:
     again = load(tmp_path)
     assert again.card.details == {"recipe": "none"}
     assert (tmp_path / "model.safetensors").stat().st_size < 40e6
+    modes = {file.name: file.stat().st_mode for file in tmp_path.iterdir()}
+    assert set(modes.values()) == {modes["config.json"]}, "who may read one file may read all of them"
     # Stored and read back once more, nothing changes any more.
     save(tmp_path / "again", again.model, again.vocabulary, again.codec, dtype=torch.bfloat16)
     assert weights_revision(tmp_path) == weights_revision(tmp_path / "again")
