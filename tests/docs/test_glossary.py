@@ -15,7 +15,7 @@ OTHER_SENSES = frozenset(
         # What the glossary says itself in another row, such as a teacher, a lane or a reason.
         *("action", "control", "draft", "failure", "lane", "reason", "rollout", "row", "teacher"),
         # The field's words, and those of programming languages.
-        *("accuracy", "agents", "annotation", "cache", "command", "error", "fault", "frame", "generation"),
+        *("agents", "annotation", "cache", "command", "error", "fault", "frame", "generation"),
         *("grammar", "group", "job", "node", "page", "phase", "run", "runner", "sample", "sampling", "score"),
         *("sequence", "tick", "timeout", "tokenizer", "verdict", "version", "waypoints"),
         # Words of others: the OpenAI API's completion, NAVSIM's past motion, a tensor's layout.
