@@ -84,7 +84,7 @@ def train_branch(
         reflections: of a build with outcomes, on these scenes: those that are judged count. None for a
             checkpoint with second sketches, whose critic judges a sketch for every scene.
         settings: ``cache``, ``bf16`` and ``workers`` count.
-        on_done: told how many of how many prompts are read, batch by batch.
+        on_done: told how many of how many batches of prompts are read.
 
     Returns:
         Figures of plans that were left out while the rest was learned from: ``auc`` of the think probability,
@@ -188,8 +188,7 @@ def _judged_plans(
     # Prompts with pictures and those without share no batch.
     sorts = [[item for item in items if item.pictures == pictures] for pictures in (True, False)]
     batches = [sort[start : start + _BATCH] for sort in sorts for start in range(0, len(sort), _BATCH)]
-    done = 0
-    for some in batches:
+    for number, some in enumerate(batches, 1):
         samples = [responses[item] for item in some]
         branches = [
             (examples.episode[item.index], *_branch(response, options.tolist()))
@@ -201,9 +200,8 @@ def _judged_plans(
         states.append(found[[taught for _, _, taught in branches]])
         looks += [looked for _, looked, taught in branches if taught]
         episodes += [int(episode) for episode, _, taught in branches if taught]
-        done += len(some)
         if on_done is not None:
-            on_done(done, len(items))
+            on_done(number, len(batches))
     return _JudgedPlans(torch.cat(states).numpy(), np.array(looks, np.bool_), np.array(episodes, np.int64))
 
 

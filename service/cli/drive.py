@@ -11,6 +11,7 @@ from typing import Annotated, Final, cast
 import typer
 
 from looktwice.service.cli.options import Json, SmallBy, SmallPlanners, reported_errors
+from looktwice.service.cli.progress import progress_on_stderr
 
 SERVICE_DRIVERS: Final = ("adaptive", "never", "always")
 DRIVERS: Final = ("expert", "constant-velocity", *SERVICE_DRIVERS)
@@ -47,8 +48,6 @@ def drive(
         raise typer.BadParameter("it is for --small", param_hint="--by")
     if gif is not None and gif.suffix.lower() != ".gif":
         raise typer.BadParameter(f"{gif} does not end in .gif", param_hint="--gif")
-    from rich.console import Console
-    from rich.progress import Progress
 
     from looktwice.clients import wire
     from looktwice.clients.metadrive.closed_loop import (
@@ -141,8 +140,7 @@ def drive(
         film, config = Film(imagines=imagines), DriveConfig(seconds)
         store = drive_store(keep) if keep is not None else None
         found: dict[str, list[Drive]] = {}
-        # Progress goes to stderr, so that stdout holds nothing but the table.
-        with Progress(console=Console(stderr=True, quiet=as_json)) as progress:
+        with progress_on_stderr(quiet=as_json) as progress:
             task = progress.add_task("", total=len(seeds) * len(wanted))
             for seed in seeds:
                 for driver in wanted:

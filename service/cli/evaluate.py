@@ -22,11 +22,10 @@ from looktwice.service.cli.options import (
     reported_errors,
     small_names,
 )
+from looktwice.service.cli.progress import progress_on_stderr
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
-
-    from rich.progress import Progress
 
     from looktwice.model.driving.scene import LabelledScene
     from looktwice.model.driving.trajectory import FloatArray
@@ -386,7 +385,7 @@ async def run_started(
     check_variants(scenes, variants)
     await engine.start()
     try:
-        with _progress(quiet) as progress:
+        with progress_on_stderr(quiet=quiet) as progress:
             task = progress.add_task("scenes", total=len(scenes) * len(variants))
             return await evaluate(
                 engine,
@@ -397,11 +396,3 @@ async def run_started(
             )
     finally:
         await engine.stop()
-
-
-def _progress(quiet: bool) -> Progress:
-    from rich.console import Console
-    from rich.progress import Progress
-
-    # Progress goes to stderr, so that stdout holds nothing but the table.
-    return Progress(console=Console(stderr=True, quiet=quiet))

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import Progress
 
 from looktwice.clients.metadrive.outcomes import (
     DescribedPilot,
@@ -27,6 +25,7 @@ from looktwice.model.driving.scene_store import count_scenes, read_scenes
 from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.network.alternatives import ALTERNATIVES, alternatives
 from looktwice.model.network.route_line import RouteLine
+from looktwice.service.cli.progress import progress_on_stderr
 from looktwice.service.cli.small_pilot import SmallPilot
 
 _POSE = [0, 1, 3]
@@ -82,7 +81,7 @@ def follow_sketches(
     counts = Counter[str]()
     known = outcome_store(out.with_name(f"{out.name}.outcomes"))
     out.parent.mkdir(parents=True, exist_ok=True)
-    with Progress(console=Console(stderr=True, quiet=quiet)) as progress:
+    with progress_on_stderr(quiet=quiet) as progress:
         task = progress.add_task("scenes followed", total=count_scenes(scenes))
         for scene_id, outcomes in follow_unknown(asked(), setting, workers, known, drove):
             progress.advance(task)

@@ -7,9 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
-from rich.progress import Progress
-
 from looktwice.clients.metadrive.outcomes import (
     EpisodeSetting,
     FollowTask,
@@ -25,6 +22,7 @@ from looktwice.model.driving.trajectory import FloatArray
 from looktwice.model.engines.engine import Controls, Draw, EngineError
 from looktwice.model.evaluation.second_looks import FollowedDraw, OutcomeTable, outcome_table
 from looktwice.model.evaluation.variants import Variant
+from looktwice.service.cli.progress import progress_on_stderr
 
 MOST_UNPAIRED: Final = 0.02
 """Of all draws: sums of a batch of another shape differ in their last bits, and now and then a word does."""
@@ -149,8 +147,7 @@ def follow_pairs(
     Raises as `followed_table` does.
     """
     store = outcome_store(keep)
-    # Progress goes to stderr, so that stdout holds nothing but the table.
-    with Progress(console=Console(stderr=True, quiet=quiet)) as progress:
+    with progress_on_stderr(quiet=quiet) as progress:
         task = progress.add_task("plans followed", total=len(scenes) * len(pairs))
 
         def table(pair: Pair) -> OutcomeTable:

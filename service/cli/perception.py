@@ -6,15 +6,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import Progress
-
 from looktwice.model.driving.scene import LabelledScene
 from looktwice.model.driving.scene_store import count_scenes, read_scenes
 from looktwice.model.evaluation.perception import FactReadings, format_perception, perception_rows, read_facts
 from looktwice.model.network.checkpoint import load
 from looktwice.model.training.perception_gate import format_gate, perception_gate
 from looktwice.model.training.small import SmallSettings
+from looktwice.service.cli.progress import progress_on_stderr
 
 
 def tell_perception(
@@ -33,8 +31,7 @@ def tell_perception(
     loaded = load(checkpoint)
 
     def reading(what: str, of: Iterable[LabelledScene], count: int) -> FactReadings:
-        # Progress goes to stderr, so that stdout holds nothing but the table.
-        with Progress(console=Console(stderr=True, quiet=quiet)) as progress:
+        with progress_on_stderr(quiet=quiet) as progress:
             task = progress.add_task(what, total=count)
             return read_facts(loaded, of, lambda done: progress.update(task, completed=done))
 

@@ -13,6 +13,7 @@ from typer.core import TyperArgument, TyperCommand
 
 from looktwice.model.bundled import CHECKPOINT as BUNDLED_CHECKPOINT
 from looktwice.service.cli.options import folder_along, reported_errors
+from looktwice.service.cli.progress import progress_on_stderr
 
 _RECIPES: Final = (
     "create, {}; respond: a format of any family; branch: when to look twice, learned alone; "
@@ -157,8 +158,6 @@ def train(
     from dataclasses import replace
 
     import torch
-    from rich.console import Console
-    from rich.progress import Progress
 
     from looktwice.model.driving.scene_store import count_scenes, read_scenes
     from looktwice.model.evaluation.curves import training_curves
@@ -208,8 +207,7 @@ def train(
             _refuse_others(context, recipe, "reflections cache bf16 workers")
             if source is None:
                 raise ValueError("give the checkpoint to start from: --from FOLDER")
-            # Progress goes to stderr, so that stdout holds nothing but the figures.
-            with Progress(console=Console(stderr=True)) as progress:
+            with progress_on_stderr() as progress:
                 reading = progress.add_task("prompts", total=None)
 
                 def show(done: int, total: int) -> None:
