@@ -26,7 +26,6 @@ OTHERWISE = {
     "clients/wire": ("Action: Thinking: branch plan revised_plan thinking trajectory", "the HTTP contract"),
     "loadtests": ("plan", "a kind of work, and an event"),
     "model/bench/bench_report.py": ("thinking", "a control"),
-    "model/driving/followed_store.py": ("trajectory", "a column"),
     "model/driving/trajectory.py": ("trajectory", "what an error speaks of"),
     "model/evaluation/draw_store.py": ("plan revised_plan trajectory", "fields of a draw"),
     "model/evaluation/pictures.py": ("plan", "a caption"),

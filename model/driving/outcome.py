@@ -14,6 +14,15 @@ FailureName = Literal["collision", "off_road", "off_route", "comfort", "behind",
 Verdict = FailureName | Literal["holds"]
 VERDICTS: Final[tuple[Verdict, ...]] = ("holds", *get_args(FailureName))
 """What comes of a trajectory in a word: it holds, or at what it fails first."""
+BEHIND_RATIO: Final = 0.8
+"""Whoever drives less than this share of the expert's way falls behind ..."""
+AHEAD_RATIO: Final = 1.25
+"""... and whoever drives more than this share of it goes too far ..."""
+LEAST_GAP_M: Final = 5.0
+"""... if at least so many metres are between them, as in NAVSIM's progress."""
+OFF_ROUTE_M: Final = 2.75
+"""A car whose centre is farther from the middle of every lane of its route has left the route: a metre beyond
+the edge of a lane of 3.5 m, in the lane of those who come towards it or in a road that is not its own."""
 HitKind = Literal["standing vehicle", "moving vehicle", "oncoming vehicle", "pedestrian", "obstacle"]
 
 
@@ -85,6 +94,30 @@ def metres_behind(driven_m: float, expert_m: float) -> float:
     if driven_m < expert_m:
         return expert_m - driven_m
     return min(max(expert_m, 0.0) - driven_m, 0.0)
+
+
+def failures(
+    *, collided: bool, off_road: bool, off_route: bool, rough: bool, driven_m: float, expert_m: float
+) -> tuple[FailureName, ...]:
+    """At what a plan fails that was followed; empty where it holds.
+
+    Args:
+        collided: whether it ended in a collision.
+        off_road, off_route: whether it left the road, or the lanes of its route.
+        rough: whether it broke a bound of comfort that the expert's own way keeps.
+        driven_m, expert_m: along the route, by this plan and by the expert from the same moment.
+    """
+    behind_m = metres_behind(driven_m, expert_m)
+    found: dict[FailureName, bool] = {
+        "collision": collided,
+        "off_road": off_road,
+        "off_route": off_route,
+        "comfort": rough and not collided,
+        # A drive that a collision ended is shorter for that reason alone.
+        "behind": not collided and behind_m > LEAST_GAP_M and driven_m < BEHIND_RATIO * expert_m,
+        "ahead": not collided and -behind_m > LEAST_GAP_M and driven_m > AHEAD_RATIO * expert_m,
+    }
+    return tuple(name for name, failed in found.items() if failed)
 
 
 def in_words(outcome: Outcome) -> str:

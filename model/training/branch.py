@@ -43,7 +43,7 @@ SHARPNESS: Final = 4.0
 """How many times as far apart the options are written as they are likely. A branch is drawn like a word: who
 holds three of ten plans for failing would look twice by chance, as often at plans that hold. Written sharper,
 what is likelier than not is nearly always drawn, and the rest hardly ever."""
-_RIDGE: Final = 100.0
+_RIDGE: Final = 1.0
 _FOLDS: Final = 8
 _BATCH: Final = 16
 _STEPS: Final = 50

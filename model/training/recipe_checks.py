@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,12 +22,10 @@ class TrainingFiles:
     Attributes:
         reflections: a build's verified plans.
         failures: a model's own answers with feedback.
-        followed: trajectories that were followed.
     """
 
     reflections: Path | None = None
     failures: Path | None = None
-    followed: Sequence[Path] = ()
 
 
 def check_files(recipe: Recipe, loaded: Loaded, files: TrainingFiles) -> None:
@@ -39,9 +36,6 @@ def check_files(recipe: Recipe, loaded: Loaded, files: TrainingFiles) -> None:
         wants = "needs reflections" if files.reflections is None else "takes no reflections"
         why = f": {loaded.card.name} tells in the prompt what else might be driven" if told else ""
         raise ValueError(f"recipe {recipe.name} {wants}{why}")
-    if bool(files.followed) != (recipe.goal == "judge"):
-        wants = "takes no followed trajectories" if files.followed else "needs followed trajectories"
-        raise ValueError(f"recipe {recipe.name} {wants}")
     refines = recipe.outcome is not None and recipe.outcome.refining is not None
     if files.failures is not None and recipe.attempting is None and not refines:
         raise ValueError(f"recipe {recipe.name} takes no failures")

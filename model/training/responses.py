@@ -35,6 +35,7 @@ from looktwice.model.network.chat_prompt import motion_text
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.inputs import InputBuilder
 from looktwice.model.network.patches import patchify
+from looktwice.model.network.second_sketch import LOOK_GAIN
 from looktwice.model.network.visual_codes import Frame, VisualCodes, frame_of
 from looktwice.model.network.vocabulary import Vocabulary
 from looktwice.model.training.batches import Array, ResponseSample
@@ -239,6 +240,8 @@ class ResponseDataset(Dataset[ResponseSample]):
             if look is not None:
                 at_once = at_once._replace(branches=not look.judged)
                 return [at_once, _Taught(look.revised_plan or plan, second.vector, look, copied=True)]
+            # What would hold is there, and no words lead to it: neither branch is right.
+            at_once = at_once._replace(branches=second.gain < LOOK_GAIN)
         # Nobody knows whether it deserves a second look: behind it the trajectory alone is taught.
         behind, led_to, copied = plan, expert, False
         if sketch is None or self.random.random() >= _EXPERT_SHARE:

@@ -46,7 +46,6 @@ def run(
     reflections: Path | None = None,
     visual_codes: Path | None = None,
     failures: Path | None = None,
-    followed: Sequence[Path] = (),
 ) -> None:
     """Train ``source`` by a recipe and write the outcome to ``target``, weights in bfloat16.
 
@@ -66,11 +65,9 @@ def run(
         visual_codes: folder of codes of pictures, which the checkpoint gets; without it, it keeps its own.
         failures: file of a model's own answers with feedback: ``elf-sft`` learns to refine them, and
             ``elf-rl`` takes every second scene from those in which they are wrong.
-        followed: files of trajectories that were followed, which ``critic`` learns from.
 
     Raises:
         FeedbackFileError: ``failures`` is missing, damaged, or of another version.
-        FollowedFileError: one of ``followed`` is.
         ValueError: the recipe wants reflections and there are none, or the other way round, or they are on
             other scenes, or on plans made with tracks where ``source`` takes none; it learns from pictures or
             judges draws, and no scene can be learned from so; it takes no failures, and
@@ -78,7 +75,7 @@ def run(
             that scenes bring; it teaches sketches, and ``source`` has none; only one of ``source`` and
             ``vision_source`` writes sketches.
     """
-    files = TrainingFiles(reflections, failures, followed)
+    files = TrainingFiles(reflections, failures)
     loaded = load(source)
     check_files(recipe, loaded, files)
     check_checkpoint(recipe, loaded)

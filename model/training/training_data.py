@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from looktwice.model.driving.feedback_store import read_feedback
-from looktwice.model.driving.followed_store import read_followed
 from looktwice.model.driving.reflection_store import read_reflections
 from looktwice.model.families.registry import family_named
 from looktwice.model.network.checkpoint import Loaded
 from looktwice.model.training.attempts import PlacedAttempts, fails, place_attempts
-from looktwice.model.training.critics import PlacedVerdicts, place_verdicts
 from looktwice.model.training.examples import Examples, load_examples
 from looktwice.model.training.recipe_checks import (
     TrainingFiles,
@@ -40,7 +37,6 @@ class TrainingData:
         reflections: verified plans, by example.
         attempts: a model's own answers with feedback, to be refined, by example.
         failed: (examples,), in which of them a model's own answers are wrong.
-        verdicts: what came of trajectories that were followed, by example.
     """
 
     scenes: Path
@@ -49,7 +45,6 @@ class TrainingData:
     reflections: PlacedReflections | None
     attempts: PlacedAttempts | None
     failed: npt.NDArray[np.bool_] | None
-    verdicts: PlacedVerdicts | None
 
     @classmethod
     def read(
@@ -58,13 +53,13 @@ class TrainingData:
         """Read what ``recipe`` teaches ``loaded``; the files themselves were checked before.
 
         Raises:
-            FeedbackFileError, FollowedFileError: one is missing, damaged, or of another version.
+            FeedbackFileError: one is missing, damaged, or of another version.
             ValueError: no scene can be learned from so, or a file is on other scenes.
         """
         examples = load_examples(scenes, cache, loaded.settings.cameras)
         check_pictures(recipe, examples, loaded)
         taught = taught_by(recipe, examples)
-        reflections = attempts = failed = verdicts = None
+        reflections = attempts = failed = None
         if files.reflections is not None:
             reflections = place_reflections(examples, read_reflections(files.reflections))
             check_reflections(files.reflections, reflections, loaded)
@@ -74,9 +69,7 @@ class TrainingData:
                 attempts = place_attempts(examples, feedback, family_named(recipe.attempting).times_s, taught)
             if recipe.outcome is not None:
                 failed = fails(examples, feedback)
-        if files.followed:
-            verdicts = place_verdicts(examples, chain.from_iterable(map(read_followed, files.followed)))
-        return cls(scenes, examples, taught, reflections, attempts, failed, verdicts)
+        return cls(scenes, examples, taught, reflections, attempts, failed)
 
     def describe(self, recipe: Recipe) -> Mapping[str, Any]:
         """What a model card tells of the recipe, and of what it learned from."""

@@ -31,6 +31,7 @@ from looktwice.model.training.grounding import (
     looked_at,
 )
 from looktwice.model.training.intents import IntentDataset, IntentLearner, read_errors, read_facts
+from looktwice.model.training.judged_sketches import judge_sketches
 from looktwice.model.training.learner import ResponseLearner
 from looktwice.model.training.looks import LookLearner
 from looktwice.model.training.outcome.outcome_learner import OutcomeLearner, ScenePlaces, collate_places
@@ -94,7 +95,7 @@ def set_up(
         return _reading_facts(recipe, loaded, data, settings, vision, held_out)
     if recipe.goal == "judge":
         assert vision is not None, "facts are read from pictures"
-        return _judging(recipe, loaded, data, vision)
+        return _judging(recipe, loaded, data, settings, vision)
     if recipe.goal == "read":
         return _sketching(recipe, loaded, data, settings, vision, held_out)
     return _responding(recipe, loaded, data, settings, vision)
@@ -160,10 +161,12 @@ def _reading_facts(
     return TrainingSetup(learner, Subset(facts, places), validate=validate)
 
 
-def _judging(recipe: Recipe, loaded: Loaded, data: TrainingData, vision: VisionCache) -> TrainingSetup:
-    assert data.verdicts is not None, "critics learn from followed trajectories"
+def _judging(
+    recipe: Recipe, loaded: Loaded, data: TrainingData, settings: RunSettings, vision: VisionCache
+) -> TrainingSetup:
     read = read_facts(loaded.model, data.examples, vision, recipe.seed, recipe.misread_share)
-    dataset = VerdictDataset(data.examples, data.verdicts, read, recipe.route_share, recipe.seed)
+    judged = judge_sketches(loaded.model, loaded.codec, data.examples, read, data.scenes, settings.workers)
+    dataset = VerdictDataset(data.examples, judged, read, recipe.seed)
     learned, left_out = dataset.split()
     learner = CriticLearner(loaded.model)
     validate = partial(told_apart, learner, dataset, left_out) if left_out else None

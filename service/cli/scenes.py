@@ -167,44 +167,6 @@ def served_pilot(service: str, *, tracks: bool, thinks: bool = False) -> Pilot:
     return ServicePilot(planner, thinking, wire.Controls(n=6, thinking=thinking), tracks=tracks)
 
 
-@app.command("follow")
-def follow(
-    scenes: Annotated[
-        Path, typer.Argument(help="Generated scenes, with their manifest: a file or a folder.")
-    ],
-    out: Annotated[Path, typer.Argument(help="File to write.")],
-    small: Annotated[
-        Path, typer.Option(help="Folder of a small planner, or of a checkpoint whose small planners sketch.")
-    ],
-    by: SmallBy = "tracks",
-    also: Annotated[
-        int, typer.Option(help="Alternatives of each trajectory that are followed beside it.", min=0)
-    ] = 2,
-    drove: Annotated[
-        Path | None,
-        typer.Option(help="Folder of the small planner that drove when these scenes were generated, if any."),
-    ] = None,
-    drove_by: Annotated[
-        SmallInput, typer.Option(help="What that one planned from: tracks, pictures or facts.")
-    ] = "tracks",
-    workers: Annotated[int, typer.Option(help="Processes that follow trajectories.", min=1)] = 2,
-    as_json: Json = False,
-) -> None:
-    """Follow a small planner's trajectories, and others in their place, in the simulator: which hold?"""
-    from looktwice.service.cli.following import follow_sketches
-    from looktwice.service.cli.small_pilot import SmallPilot
-
-    with reported_errors():
-        makes = None if drove is None else partial(SmallPilot, drove, drove_by)
-        planner = SmallPilot(small, by)
-        counts = follow_sketches(scenes, out, planner, also, workers, makes, quiet=as_json)
-        if as_json:
-            typer.echo(json.dumps(counts))
-            return
-        for verdict, count in counts.most_common():
-            typer.echo(f"{verdict} {count}")
-
-
 @app.command("import")
 def import_(
     folder: Annotated[

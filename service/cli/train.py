@@ -66,10 +66,6 @@ def train(
             "every second scene from those whose answers are wrong."
         ),
     ] = None,
-    followed: Annotated[
-        list[Path] | None,
-        typer.Option(help="File that `looktwice scenes follow` wrote, for critic; again for more."),
-    ] = None,
     visual_codes: Annotated[
         Path | None,
         typer.Option(
@@ -284,7 +280,6 @@ def train(
             reflections,
             visual_codes,
             failures,
-            followed or (),
         )
         training_curves(target / LOG_FILE, target / "curves.png")
 

@@ -59,7 +59,6 @@ TRIED: Final = {
 HELP_ONLY: Final = {
     "plan": "the README's `make plan` runs it",
     "scenes generate": "it needs the simulator",
-    "scenes follow": "it needs the simulator",
     "scenes import": "docs/own-cameras.md runs it",
     "train": "minutes to hours",
     "train create": "minutes",

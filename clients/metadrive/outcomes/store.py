@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from looktwice.clients.metadrive.generation.redrive import DescribedPilot
 from looktwice.clients.metadrive.outcomes.replayed_worlds import EpisodeSetting, FollowTask
 from looktwice.clients.metadrive.outcomes.verdicts import MomentOutcomes
 from looktwice.clients.metadrive.outcomes.workers import follow_episodes
@@ -43,7 +42,6 @@ def follow_unknown(
     setting: EpisodeSetting,
     workers: int,
     store: ResultStore[MomentOutcomes],
-    makes: Callable[[], DescribedPilot] | None = None,
 ) -> Iterator[tuple[str, MomentOutcomes | str]]:
     """What comes of trajectories, of those that are known first; new outcomes are stored.
 
@@ -52,7 +50,6 @@ def follow_unknown(
         setting: of their episodes.
         workers: processes.
         store: of what is known.
-        makes: see `follow_episodes`.
 
     Yields:
         Scene ids, each with how its trajectories fared or why that cannot be said.
@@ -72,7 +69,7 @@ def follow_unknown(
             rest.append(task)
     rest.sort(key=lambda task: task.moment.seed)
     episodes = (list(episode) for _, episode in groupby(rest, lambda task: task.moment.seed))
-    for scene_id, outcomes in follow_episodes(episodes, setting, workers, makes):
+    for scene_id, outcomes in follow_episodes(episodes, setting, workers):
         if not isinstance(outcomes, str):
             store.store(keys[scene_id], outcomes)
         yield scene_id, outcomes

@@ -3,36 +3,23 @@
 A plan is followed by a car with a driver's limits while everybody else reacts
 (`looktwice.clients.metadrive.world.fork`), and is compared with the expert's own way on from the same moment,
 followed by the same car. Bounds of comfort are those of NAVSIM (`looktwice.model.driving.pdm.comfort`). All
-other thresholds are the constants here: chosen on training scenes, where the expert's own trajectories pass
-them (docs/labelling.md has the figures).
+other thresholds are those of `looktwice.model.driving.outcome`: chosen on training scenes, where the expert's
+own trajectories pass them (docs/labelling.md has the figures).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
 from looktwice.clients.metadrive.world.episode import EpisodeWorld
 from looktwice.clients.metadrive.world.fork import Forked, fork_along, fork_expert
-from looktwice.clients.metadrive.world.tracking import WHEELBASE_M
-from looktwice.model.driving.outcome import FailureName, Outcome, metres_behind
-from looktwice.model.driving.pdm import world as pdm
+from looktwice.model.driving.driven_car import CAR, ride_states
+from looktwice.model.driving.outcome import Outcome, failures
 from looktwice.model.driving.pdm.comfort import comfort
-from looktwice.model.driving.scene import EGO_LENGTH_M, EGO_WIDTH_M
 from looktwice.model.driving.trajectory import STEP_S, FloatArray
-
-BEHIND_RATIO: Final = 0.8
-"""Whoever drives less than this share of the expert's way falls behind ..."""
-AHEAD_RATIO: Final = 1.25
-"""... and whoever drives more than this share of it goes too far ..."""
-LEAST_GAP_M: Final = 5.0
-"""... if at least so many metres are between them, as in NAVSIM's progress."""
-
-_BODY: Final = pdm.EgoVehicle(EGO_WIDTH_M, EGO_LENGTH_M / 2, EGO_LENGTH_M / 2, WHEELBASE_M)
-"""Measured from its centre, as all our poses are."""
 
 
 @dataclass(frozen=True)
@@ -94,19 +81,16 @@ def judged(followed: Forked, expert_m: float, *, needs_comfort: bool = False) ->
             itself: a person who runs into the road leaves no comfortable way.
     """
     uncomfortable_s, uncomfortable = _discomfort(followed)
-    behind_m = metres_behind(followed.driven_m, expert_m)
-    collided = followed.collided_s is not None
-    found: dict[FailureName, bool] = {
-        "collision": collided,
-        "off_road": followed.off_road_s is not None,
-        "off_route": followed.off_route_s is not None,
-        "comfort": needs_comfort and uncomfortable is not None,
-        # A drive that a collision ended is shorter for that reason alone.
-        "behind": not collided and behind_m > LEAST_GAP_M and followed.driven_m < BEHIND_RATIO * expert_m,
-        "ahead": not collided and -behind_m > LEAST_GAP_M and followed.driven_m > AHEAD_RATIO * expert_m,
-    }
+    fails = failures(
+        collided=followed.collided_s is not None,
+        off_road=followed.off_road_s is not None,
+        off_route=followed.off_route_s is not None,
+        rough=needs_comfort and uncomfortable is not None,
+        driven_m=followed.driven_m,
+        expert_m=expert_m,
+    )
     return Outcome(
-        tuple(name for name, failed in found.items() if failed),
+        fails,
         _tenths(followed.collided_s),
         followed.hit,
         _tenths(followed.off_road_s),
@@ -122,28 +106,12 @@ def _discomfort(followed: Forked) -> tuple[float | None, str | None]:
     """When a ride first breaks a bound of comfort, and which; neither of one that ends in a collision."""
     if followed.collided_s is not None:
         return None, None
-    found = comfort(_states(followed)[None], _BODY, "v2.2")
+    poses, speeds_ms = followed.trajectory[:, [0, 1, 3]], followed.speeds_ms
+    states = ride_states(poses[None].astype(np.float64), speeds_ms[None].astype(np.float64))
+    found = comfort(states, CAR, "v2.2")
     if found.holds[0]:
         return None, None
     return _tenths((int(found.first_step[0]) + 1) * STEP_S), found.bound[0]
-
-
-def _states(followed: Forked) -> pdm.Array:
-    """A ride as NAVSIM's states [k, 11]; sideways acceleration is what a turn at that speed makes."""
-    track, speed = followed.trajectory.astype(np.float64), followed.speeds_ms.astype(np.float64)
-    states = np.zeros((len(track), pdm.STATE_SIZE))
-    states[:, pdm.X], states[:, pdm.Y], states[:, pdm.HEADING] = track[:, 0], track[:, 1], track[:, 3]
-    yaw_rate = _rate(track[:, 3])
-    states[:, pdm.SPEED], states[:, pdm.ACCELERATION] = speed, _rate(speed)
-    states[:, pdm.ACCELERATION_Y] = yaw_rate * speed
-    states[:, pdm.YAW_RATE], states[:, pdm.YAW_ACCELERATION] = yaw_rate, _rate(yaw_rate)
-    return states
-
-
-def _rate(values: pdm.Array) -> pdm.Array:
-    """Backward differences; the first is the second's."""
-    rate = np.diff(values) / STEP_S
-    return np.concatenate([rate[:1], rate])
 
 
 def _tenths(seconds: float | None) -> float | None:

@@ -20,16 +20,13 @@ from looktwice.clients.metadrive.world.episode import EpisodeWorld
 from looktwice.clients.metadrive.world.episode_log import EpisodeLog
 from looktwice.clients.metadrive.world.roads import Array, RoadMap
 from looktwice.clients.metadrive.world.tracking import FreeVehicle, world_trajectory
-from looktwice.model.driving.outcome import HitKind
+from looktwice.model.driving.outcome import OFF_ROUTE_M, HitKind
 from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray, to_ego_frame
 
 _RETURN_S: Final = 2.2
 _SHORTEST_RETURN_M: Final = 12.0
 _STEEPEST_RAD: Final = 0.8
 """A car that stands more askew than this is first turned so far: rails cannot be left at right angles."""
-OFF_ROUTE_M: Final = 2.75
-"""A car whose centre is farther from the middle of every lane of its route has left the route: a metre beyond
-the edge of a lane of 3.5 m, in the lane of those who come towards it or in a road that is not its own."""
 
 
 class ForkError(ValueError):

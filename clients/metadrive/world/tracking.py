@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
 from looktwice.clients.metadrive.world.actors import STEP_S, Vehicle
 from looktwice.clients.metadrive.world.roads import Array, RoadMap
+from looktwice.model.driving.driven_car import (
+    ACCELERATION,
+    CATCH_UP,
+    JERK,
+    LOOK_AHEAD_M,
+    LOOK_AHEAD_S,
+    MAX_STEER_RAD,
+    SPEED_AHEAD_S,
+    STEER_RATE,
+    WHEELBASE_M,
+)
 from looktwice.model.driving.trajectory import FloatArray
-
-WHEELBASE_M: Final = 2.8
-_MAX_STEER_RAD: Final = 0.6
-_STEER_RATE: Final = 0.8
-_ACCELERATION: Final = (-7.0, 3.0)
-_JERK: Final = 15.0
-_SPEED_AHEAD_S: Final = 0.5
-_LOOK_AHEAD_S: Final = 0.6
-_LOOK_AHEAD_M: Final = 3.0
 
 
 @dataclass
@@ -50,20 +51,20 @@ class FreeVehicle(Vehicle):
             age_s: how long ago the trajectory began.
             road_map: to find rail and progress by.
         """
-        ahead = _at(trajectory, age_s + _SPEED_AHEAD_S)
-        wanted = (ahead[3] - self.speed) / _SPEED_AHEAD_S
+        ahead = _at(trajectory, age_s + SPEED_AHEAD_S)
+        wanted = (ahead[3] - self.speed) / SPEED_AHEAD_S
         # Ground lost or gained against the plan is made up for as well.
         due = _at(trajectory, age_s)
         behind = (due[0] - self.x) * math.cos(self.heading) + (due[1] - self.y) * math.sin(self.heading)
-        wanted += 0.4 * behind
-        change = min(max(wanted - self.acceleration, -_JERK * STEP_S), _JERK * STEP_S)
-        acceleration = min(max(self.acceleration + change, _ACCELERATION[0]), _ACCELERATION[1])
+        wanted += CATCH_UP * behind
+        change = min(max(wanted - self.acceleration, -JERK * STEP_S), JERK * STEP_S)
+        acceleration = min(max(self.acceleration + change, ACCELERATION[0]), ACCELERATION[1])
         self._move(acceleration, self._pursue(trajectory, age_s))
         self._locate(road_map)
 
     def _pursue(self, trajectory: Array, age_s: float) -> float:
         """The steering angle whose arc meets the trajectory some way ahead."""
-        reach = _LOOK_AHEAD_M + _LOOK_AHEAD_S * abs(self.speed)
+        reach = LOOK_AHEAD_M + LOOK_AHEAD_S * abs(self.speed)
         rest = trajectory[int(age_s / STEP_S) :]
         apart = np.hypot(rest[:, 0] - self.x, rest[:, 1] - self.y)
         far = np.flatnonzero(apart >= reach)
@@ -74,8 +75,8 @@ class FreeVehicle(Vehicle):
         return math.atan2(2.0 * WHEELBASE_M * left, apart[far[0]] ** 2)
 
     def _move(self, acceleration: float, steer: float) -> None:
-        steer = min(max(steer, -_MAX_STEER_RAD), _MAX_STEER_RAD)
-        change = min(max(steer - self.steer, -_STEER_RATE * STEP_S), _STEER_RATE * STEP_S)
+        steer = min(max(steer, -MAX_STEER_RAD), MAX_STEER_RAD)
+        change = min(max(steer - self.steer, -STEER_RATE * STEP_S), STEER_RATE * STEP_S)
         self.steer += change
         speed = self.speed + acceleration * STEP_S
         if self.speed >= 0 and speed < 0:

@@ -56,8 +56,8 @@ def world_of(labelled: LabelledScene) -> World:
         vehicle=EGO,
         tracks=tuple(_track(agent) for agent in labelled.agents if np.isfinite(_ahead(agent)).any()),
         lanes=None if known is None else tuple(map(_lane, known.lanes)),
-        intersections=None if known is None else _areas(known.intersections),
-        drivable=_areas(labelled.drivable) or None,
+        intersections=None if known is None else areas_of_rings(known.intersections),
+        drivable=areas_of_rings(labelled.drivable) or None,
         # A world without lights has none that is red, and that is known. Of a world with lights it is not.
         lights=None if known is None or known.has_lights else (),
         centreline=route_line(labelled.scene.route) if known is None else known.centreline.astype(np.float64),
@@ -69,7 +69,7 @@ def _lane(lane: LaneArea) -> Lane:
     return Lane(str(lane.lane_id), Area((lane.ring.astype(np.float64),)), lane.on_route)
 
 
-def _areas(rings: tuple[FloatArray, ...]) -> tuple[Area, ...]:
+def areas_of_rings(rings: tuple[FloatArray, ...]) -> tuple[Area, ...]:
     """One area of all rings, as points are in it by the even-odd rule; none of none."""
     return (Area(tuple(ring.astype(np.float64) for ring in rings)),) if rings else ()
 

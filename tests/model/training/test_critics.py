@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +9,15 @@ import pytest
 import torch
 
 from looktwice.model.driving.facts import FACTS
-from looktwice.model.driving.followed_store import FollowedTrajectory
-from looktwice.model.driving.outcome import VERDICTS, Verdict
+from looktwice.model.driving.outcome import VERDICTS
 from looktwice.model.driving.scene import FRONT_TELE, FRONT_WIDE
 from looktwice.model.driving.trajectory import POSE_MIRROR
+from looktwice.model.network.alternatives import ALTERNATIVES
 from looktwice.model.network.checkpoint import Loaded, load, with_second_sketches, with_sketches
 from looktwice.model.training.batches import stacked
-from looktwice.model.training.critics import CriticLearner, VerdictDataset, place_verdicts, told_apart
+from looktwice.model.training.critics import CriticLearner, VerdictDataset, told_apart
 from looktwice.model.training.examples import Examples
+from looktwice.model.training.judged_sketches import SOURCES, JudgedSketches
 from tests.model.training.scenes import training_scene
 
 
@@ -31,51 +31,50 @@ def examples() -> Examples:
     return Examples.from_scenes([training_scene(index) for index in range(6)], (FRONT_WIDE, FRONT_TELE))
 
 
-def followed(examples: Examples, count: int = 40) -> list[FollowedTrajectory]:
-    """Futures that hold, and the same at a crawl, which fall behind."""
-    rows = []
-    for number in range(count):
-        place = number % len(examples)
-        slow = number % 2
-        trajectory = examples.future[place] * np.array([0.1, 0.1, 1, 1] if slow else [1] * 4, np.float32)
-        verdict: Verdict = "behind" if slow else "holds"
-        rows.append(FollowedTrajectory(str(examples.scene_id[place]), trajectory, "", verdict, "x 1"))
-    return rows
+def judged(examples: Examples) -> JudgedSketches:
+    """The expert's futures hold with all alternatives, and the same at a crawl fall behind."""
+    crawl = np.array([0.1, 0.1, 1, 1], np.float32)
+    poses = np.stack(
+        [examples.future * (crawl if number % 2 else 1) for number in range(len(SOURCES))], axis=1
+    )
+    verdicts = np.zeros((len(examples), len(SOURCES), 1 + len(ALTERNATIVES)), np.int64)
+    verdicts[:, 1::2] = VERDICTS.index("behind")
+    return JudgedSketches(np.arange(len(examples)), poses[..., [0, 1, 3]].astype(np.float32), verdicts)
 
 
 @pytest.fixture
 def data(examples: Examples) -> VerdictDataset:
     read = np.zeros((len(examples), 2, 2, len(FACTS)), np.float32)
     read[:, 1] = 1
-    return VerdictDataset(examples, place_verdicts(examples, followed(examples)), read, 0.5)
+    return VerdictDataset(examples, judged(examples), read)
 
 
 def test_a_mirrored_sample_is_the_other_way_round(data: VerdictDataset) -> None:
-    plain, mirrored = (data.look(3, mirror=mirror, route=True) for mirror in (False, True))
+    plain, mirrored = (data.look(len(SOURCES) + 1, mirror=mirror) for mirror in (False, True))
     np.testing.assert_array_equal(mirrored.poses, plain.poses * POSE_MIRROR[[0, 1, 3]])
     np.testing.assert_array_equal(mirrored.history, plain.history * POSE_MIRROR)
     assert (plain.read == 0).all()
     assert (mirrored.read == 1).all()
-    assert plain.verdict == mirrored.verdict == VERDICTS.index("behind")
+    assert (plain.verdicts == VERDICTS.index("behind")).all()
+    np.testing.assert_array_equal(plain.verdicts, mirrored.verdicts)
 
 
-def test_scenes_that_are_missing_are_named(examples: Examples) -> None:
-    [first, *_] = followed(examples)
-    with pytest.raises(ValueError, match="999999-0001"):
-        place_verdicts(examples, [replace(first, scene_id="999999-0001")])
-    with pytest.raises(ValueError, match="no followed trajectories"):
-        place_verdicts(examples, [])
+def test_the_route_is_known_where_it_was_to_who_sketched(data: VerdictDataset, examples: Examples) -> None:
+    [place, *_] = np.flatnonzero(examples.has_route)
+    known = [
+        bool(data.look(int(place) * len(SOURCES) + n, mirror=False).has_route) for n in range(len(SOURCES))
+    ]
+    assert known == [route for _, route in SOURCES]
 
 
 def test_every_tenth_episode_is_left_out(data: VerdictDataset) -> None:
     many = Examples.from_scenes([training_scene(index) for index in range(40)], (FRONT_WIDE, FRONT_TELE))
     read = np.zeros((len(many), 2, 2, len(FACTS)), np.float32)
-    placed = place_verdicts(many, followed(many, 80))
-    learned, left_out = VerdictDataset(many, placed, read, 0.5).split()
-    assert sorted(learned + left_out) == list(range(80))
-    assert set(many.episode[placed.examples[left_out]]) == {9}
-    assert 9 not in many.episode[placed.examples[learned]]
-    assert data.split() == (list(range(40)), []), "of two episodes none is"
+    learned, left_out = VerdictDataset(many, judged(many), read).split()
+    assert sorted(learned + left_out) == list(range(40 * len(SOURCES)))
+    assert set(many.episode[np.array(left_out) // len(SOURCES)]) == {9}
+    assert 9 not in many.episode[np.array(learned) // len(SOURCES)]
+    assert data.split() == (list(range(len(data))), []), "of two episodes none is"
 
 
 def test_critics_learn_and_all_else_stays(loaded: Loaded, data: VerdictDataset) -> None:
