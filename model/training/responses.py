@@ -44,7 +44,7 @@ from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.reflections import mirrored
 from looktwice.model.training.response_targets import SectionWeights, Target, make_target
 from looktwice.model.training.sampler import Item
-from looktwice.model.training.sketched_looks import driven_plan, reasoned_look
+from looktwice.model.training.sketched_looks import driven_plan, reasoned_look, same_words
 from looktwice.model.training.soft_codes import SoftCodes
 from looktwice.model.training.vision_cache import VisionCache
 
@@ -240,8 +240,9 @@ class ResponseDataset(Dataset[ResponseSample]):
             if look is not None:
                 at_once = at_once._replace(branches=not look.judged)
                 return [at_once, _Taught(look.revised_plan or plan, second.vector, look, copied=True)]
-            # What would hold is there, and no words lead to it: neither branch is right.
-            at_once = at_once._replace(branches=second.gain < LOOK_GAIN)
+            # Where words are the same for both, no second look can be right, and none is wrong.
+            untold = second.gain >= LOOK_GAIN and same_words(self._codec, sketch, second, history, plan)
+            at_once = at_once._replace(branches=not untold)
         # Nobody knows whether it deserves a second look: behind it the trajectory alone is taught.
         behind, led_to, copied = plan, expert, False
         if sketch is None or self.random.random() >= _EXPERT_SHARE:

@@ -124,9 +124,24 @@ def reasoned_look(
     """
     if np.isnan(second.facts).all():
         return None
-    first, better = (driven_plan(codec, each, history, expert) for each in (sketch, second.vector))
+    first, better = _plans(codec, sketch, second, history, expert)
     found = second_look(first, better, reasons_read(history, route, second.facts))
     return None if found is None else replace(found, judged=second.gain >= LOOK_GAIN)
+
+
+def same_words(
+    codec: TrajectoryCodec, sketch: FloatArray, second: SceneSecondSketch, history: FloatArray, expert: Plan
+) -> bool:
+    """Whether words are the same for a sketch [d] and for what else might be driven."""
+    return not wanted_changes(*_plans(codec, sketch, second, history, expert))
+
+
+def _plans(
+    codec: TrajectoryCodec, sketch: FloatArray, second: SceneSecondSketch, history: FloatArray, expert: Plan
+) -> tuple[Plan, Plan]:
+    """Those that a sketch [d] and the second one carry out."""
+    first, better = (driven_plan(codec, each, history, expert) for each in (sketch, second.vector))
+    return first, better
 
 
 def second_look(first: Plan, second: Plan, reasons: Collection[Statement]) -> Counterfactual | None:

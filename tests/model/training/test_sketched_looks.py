@@ -22,7 +22,7 @@ from looktwice.model.training.intents import IntentDataset
 from looktwice.model.training.own_plans import OwnPlans
 from looktwice.model.training.responses import ResponseDataset
 from looktwice.model.training.sampler import Item
-from looktwice.model.training.sketched_looks import second_look
+from looktwice.model.training.sketched_looks import SceneSecondSketch, same_words, second_look
 from looktwice.model.training.vision_cache import open_vision
 from tests.model.training.scenes import training_scene
 from tests.model.training.second_sketches import standing_still
@@ -175,6 +175,39 @@ def test_the_critic_says_which_sketches_deserve_a_look(
             ]
             taught[word] += weight > 0
     assert set(+taught) == {"Thinking" if gain else "Action"}
+
+
+@pytest.mark.parametrize("same", [False, True])
+def test_what_would_pay_and_no_words_tell_teaches_neither_branch(
+    loaded: Loaded, own_plans: OwnPlans, monkeypatch: pytest.MonkeyPatch, same: bool
+) -> None:
+    """Where words differ, and nothing in view asks for the change, acting at once is taught."""
+    for tracks in (False, True):
+        seconds = own_plans.seconds(tracks=tracks)
+        assert seconds is not None
+        paying = seconds._replace(gains=np.ones_like(seconds.gains))
+        monkeypatch.setattr(own_plans._readings[tracks], "seconds", paying)
+    monkeypatch.setattr("looktwice.model.training.responses.reasoned_look", lambda *_: None)
+    monkeypatch.setattr("looktwice.model.training.responses.same_words", lambda *_: same)
+    data = dataset(loaded, own_plans)
+    for item in items():
+        first = data[item].responses[0]
+        [weight] = [
+            weight
+            for id, weight in zip(first.ids, first.weights, strict=True)
+            if loaded.vocabulary.decode([id]).startswith("Action")
+        ]
+        assert (weight > 0) == (not same)
+
+
+def test_words_are_the_same_where_the_second_sketch_is_the_first(loaded: Loaded, own_plans: OwnPlans) -> None:
+    place = 1
+    sketch = own_plans.sketch(place, mirror=False, route=True, tracks=True)
+    stands = standing_still(own_plans, EXAMPLES, loaded.codec, [place], tracks=True).vectors[0, 1, place]
+    for vector, same in ((sketch, True), (stands, False)):
+        second = SceneSecondSketch(vector, EXAMPLES.facts[place], 1.0)
+        known = EXAMPLES.history[place], EXAMPLES.plan(place)
+        assert same_words(loaded.codec, sketch, second, *known) == same
 
 
 def _told(response: str, part: int) -> str:
