@@ -306,11 +306,11 @@ def with_sketches(loaded: Loaded, stages: int, *, seed: int = 0) -> Loaded:
     """A checkpoint whose small planners write sketches of so many codes, to be trained.
 
     Args:
-        loaded: one that writes none; it stays as it is.
+        loaded: one that writes none, or sketches of fewer codes; it stays as it is.
         stages: at most 6.
         seed: of the new weights.
     """
-    return _with_intents(loaded, replace(loaded.settings, sketch_tokens=stages), seed)
+    return _with_intents(loaded, seed, sketch_tokens=stages)
 
 
 def with_second_sketches(loaded: Loaded, *, seed: int = 0) -> Loaded:
@@ -320,7 +320,7 @@ def with_second_sketches(loaded: Loaded, *, seed: int = 0) -> Loaded:
         loaded: one that writes sketches; it stays as it is.
         seed: of the new weights.
     """
-    return _with_intents(loaded, replace(loaded.settings, second_sketch=True), seed)
+    return _with_intents(loaded, seed, second_sketch=True)
 
 
 def with_fine_vision(loaded: Loaded, *, seed: int = 0) -> Loaded:
@@ -349,13 +349,17 @@ def _made(loaded: Loaded, settings: VlaSettings, seed: int) -> LookTwiceVla:
         return LookTwiceVla(config)
 
 
-def _with_intents(loaded: Loaded, settings: VlaSettings, seed: int) -> Loaded:
+def _with_intents(loaded: Loaded, seed: int, **changes: Any) -> Loaded:
     """A checkpoint with more tokens of an intent, as many queries of its resampler, and its own weights."""
-    more = settings.intent_tokens - loaded.settings.intent_tokens
+    # An intent's tokens are some of a scene's: as long as there are too few of these, settings are refused.
     resampled = loaded.settings.scene_tokens
-    wider = replace(settings, scene_tokens=resampled + more if resampled else 0)
+    wider = replace(loaded.settings, scene_tokens=2 * resampled, **changes)
+    more = wider.intent_tokens - loaded.settings.intent_tokens
+    wider = replace(wider, scene_tokens=resampled + more if resampled else 0)
     model = _made(loaded, wider, seed)
-    model.load_state_dict(loaded.model.state_dict(), strict=False)
+    # Books of fewer codes are none of these, and all are the codec's.
+    kept = {name: value for name, value in loaded.model.state_dict().items() if "sketch_books" not in name}
+    model.load_state_dict(kept, strict=False)
     assert model.sketch_books is not None
     model.sketch_books.fill(loaded.codec)
     model.train(False)

@@ -194,8 +194,8 @@ NANO_SETTINGS: Final = VlaSettings(
     image_height=168,
     temporal_patch_size=4,
     with_tracks=True,
-    sketch_tokens=3,
-    scene_tokens=21,
+    sketch_tokens=4,
+    scene_tokens=22,
 )
 """Of the model that is trained from scratch: motion is seen within one patch, over all four frames."""
 EXPANDED_SETTINGS: Final = VlaSettings(image_width=336, image_height=168)

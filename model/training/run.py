@@ -150,8 +150,10 @@ def _with_trained_parts(recipe: Recipe, loaded: Loaded, *, refining: bool) -> Lo
         loaded = with_fine_vision(loaded, seed=recipe.seed)
     if recipe.goal == "judge" and not loaded.settings.second_sketch:
         loaded = with_second_sketches(loaded, seed=recipe.seed)
-    if recipe.goal == "read" and not loaded.settings.sketch_tokens:
-        loaded = with_sketches(loaded, NANO_SETTINGS.sketch_tokens, seed=recipe.seed)
+    codes, told = NANO_SETTINGS.sketch_tokens, loaded.settings.sketch_tokens
+    # Older checkpoints sketch in fewer codes, so that looks lead a little beside where they should.
+    if (recipe.goal == "read" and not told) or (recipe.sketched and 0 < told < codes):
+        loaded = with_sketches(loaded, codes, seed=recipe.seed)
     return loaded
 
 

@@ -8,7 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from looktwice.model.network.checkpoint import Loaded, create_nano, load, save, with_sketches
+from looktwice.model.network.checkpoint import (
+    Loaded,
+    create_nano,
+    load,
+    save,
+    with_second_sketches,
+    with_sketches,
+)
 from looktwice.model.network.codec import DIMENSIONS, TrajectoryCodec
 from looktwice.model.network.intent import INTENT_TOKENS, SketchBooks, SketchCodes
 from looktwice.model.network.track_features import TRACK_FEATURES
@@ -91,10 +98,11 @@ def test_small_planners_get_sketches_and_all_else_stays(
     create_nano(tmp_path / "before", small_codec, vocabulary, settings=settings)
     before = load(tmp_path / "before")
     assert "sketch_tokens" not in before.settings.to_dict()
-    wider = with_sketches(before, STAGES)
+    stages = NANO_SETTINGS.sketch_tokens
+    wider = with_sketches(before, stages)
     assert wider.settings == replace(NANO_SETTINGS, codec_size=CODEC_SIZE)
-    assert wider.settings.intent_tokens == INTENT_TOKENS + STAGES
-    assert wider.inputs.longest_prompt("cf_vla") == before.inputs.longest_prompt("cf_vla") + 2 * STAGES
+    assert wider.settings.intent_tokens == INTENT_TOKENS + stages
+    assert wider.inputs.longest_prompt("cf_vla") == before.inputs.longest_prompt("cf_vla") + 2 * stages
     save(tmp_path / "wider", wider.model, wider.vocabulary, wider.codec)
     again = load(tmp_path / "wider")
     assert again.settings == wider.settings
@@ -111,7 +119,30 @@ def test_small_planners_get_sketches_and_all_else_stays(
     }
     for name, value in before.model.state_dict().items():
         torch.testing.assert_close(state[name], value, rtol=0, atol=0)
-    np.testing.assert_array_equal(state["sketch_books.books"].numpy(), small_codec.books[:STAGES])
+    np.testing.assert_array_equal(state["sketch_books.books"].numpy(), small_codec.books[:stages])
+
+
+def test_sketches_of_fewer_codes_are_told_in_more_and_all_else_stays(
+    small_codec: TrajectoryCodec, vocabulary: Vocabulary, tmp_path: Path
+) -> None:
+    fewer = NANO_SETTINGS.sketch_tokens - STAGES
+    settings = replace(
+        NANO_SETTINGS,
+        codec_size=CODEC_SIZE,
+        sketch_tokens=STAGES,
+        scene_tokens=NANO_SETTINGS.scene_tokens - fewer,
+    )
+    create_nano(tmp_path / "before", small_codec, vocabulary, settings=settings)
+    before = with_second_sketches(load(tmp_path / "before"))
+    wider = with_sketches(before, STAGES + fewer)
+    assert wider.settings.scene_queries == before.settings.scene_queries
+    assert wider.settings.intent_tokens == before.settings.intent_tokens + 2 * fewer
+    state = wider.model.state_dict()
+    for name, value in before.model.state_dict().items():
+        if not name.startswith("sketch_books."):
+            torch.testing.assert_close(state[name], value, rtol=0, atol=0)
+    books = small_codec.books[: STAGES + fewer]
+    np.testing.assert_array_equal(state["sketch_books.books"].numpy(), books)
 
 
 def test_a_sketch_is_told_in_the_decoders_own_codes(

@@ -289,6 +289,17 @@ def test_sketches_are_learned_where_the_prompt_has_them(
         run(short("sketched"), scenes, untrained_checkpoint, tmp_path / "no", settings, reflections=file)
 
 
+def test_sketches_of_fewer_codes_are_learned_in_more(scenes: Path, tmp_path: Path) -> None:
+    fewer = replace(NANO_SETTINGS, sketch_tokens=3, scene_tokens=21)
+    before = with_second_sketches(load(write_untrained(tmp_path / "before", settings=fewer)))
+    save(tmp_path / "second", before.model, before.vocabulary, before.codec, dtype=torch.bfloat16)
+    settings = RunSettings(tmp_path / "cache", bf16=False)
+    run(short("sketched", 2), scenes, tmp_path / "second", tmp_path / "to", settings)
+    made = load(tmp_path / "to").settings
+    assert made.sketch_tokens == NANO_SETTINGS.sketch_tokens
+    assert made.second_sketch
+
+
 def test_second_sketches_are_learned_without_reflections(
     resampling_checkpoint: Path, scenes: Path, tmp_path: Path
 ) -> None:
