@@ -45,6 +45,11 @@ def check_checkpoint(recipe: Recipe, loaded: Loaded) -> None:
     """Raise ValueError unless a checkpoint has what a recipe builds on: sketches, or refinements."""
     if recipe.goal == "judge" and not loaded.settings.sketch_tokens:
         raise ValueError(f"recipe {recipe.name} judges sketches, and {loaded.card.name} writes none")
+    if recipe.goal == "judge" and not (loaded.settings.with_tracks and loaded.settings.scene_tokens):
+        raise ValueError(
+            f"recipe {recipe.name} judges what two small planners sketch, by pictures and with tracks, and "
+            f"{loaded.card.name} has one of them"
+        )
     if recipe.sketched and not loaded.settings.sketch_tokens:
         raise ValueError(f"recipe {recipe.name} teaches sketches, and {loaded.card.name} has none")
     refining = None if recipe.outcome is None else recipe.outcome.refining

@@ -289,6 +289,18 @@ def test_sketches_are_learned_where_the_prompt_has_them(
         run(short("sketched"), scenes, untrained_checkpoint, tmp_path / "no", settings, reflections=file)
 
 
+def test_a_critic_needs_two_small_planners_that_sketch(
+    untrained_checkpoint: Path, scenes: Path, tmp_path: Path
+) -> None:
+    settings, target = RunSettings(tmp_path / "cache", bf16=False), tmp_path / "no"
+    with pytest.raises(ValueError, match="writes none"):
+        run(short("critic"), scenes, untrained_checkpoint, target, settings)
+    blind = write_untrained(tmp_path / "blind", settings=replace(NANO_SETTINGS, with_tracks=False))
+    with pytest.raises(ValueError, match="has one of them"):
+        run(short("critic"), scenes, blind, target, settings)
+    assert not target.exists()
+
+
 def test_sketches_of_fewer_codes_are_learned_in_more(scenes: Path, tmp_path: Path) -> None:
     fewer = replace(NANO_SETTINGS, sketch_tokens=3, scene_tokens=21)
     before = with_second_sketches(load(write_untrained(tmp_path / "before", settings=fewer)))
