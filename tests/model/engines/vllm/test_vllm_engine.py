@@ -148,7 +148,7 @@ def test_both_engines_write_the_same_with_a_resampler_and_tracks(
     mine = TorchEngine(checkpoint, TorchSettings(products=None))
     scenes = [
         replace(scene, tracks=None if k % 3 == 1 else some_tracks(k))
-        for k, scene in enumerate(mixed_scenes(24))
+        for k, scene in enumerate(mixed_scenes(48))
     ]
     requests = [greedy(scene.scene_id, scene) for scene in scenes]
 
