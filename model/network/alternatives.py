@@ -42,6 +42,11 @@ def alternatives(poses: Tensor, history: Tensor, line: RouteLine) -> Tensor:
     return torch.cat([slower, _paced(_along_route(poses, pace, history, line), pace[:, None])], dim=1)
 
 
+def with_alternatives(poses: Tensor, history: Tensor, line: RouteLine) -> Tensor:
+    """Trajectories [b, 64, 3] with their `alternatives` behind them, [b, 1 + `ALTERNATIVES`, 64, 3]."""
+    return torch.cat([poses[:, None], alternatives(poses, history, line)], dim=1)
+
+
 def _speeds(poses: Tensor) -> Tensor:
     """Signed speeds [b, 64]; see `looktwice.model.driving.trajectory.speeds`."""
     step = poses[..., :2].diff(dim=1, prepend=torch.zeros_like(poses[:, :1, :2]))

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from looktwice.model.driving.outcome import VERDICTS
 from looktwice.model.driving.trajectory import FUTURE_STEPS, STEP_S
-from looktwice.model.network.alternatives import ALTERNATIVES, alternatives
+from looktwice.model.network.alternatives import ALTERNATIVES, with_alternatives
 from looktwice.model.network.codec import HEADING_WEIGHT_M
 from looktwice.model.network.critic import Critic, objects_of_facts, objects_of_tracks
 from looktwice.model.network.motion import present_speeds
@@ -113,11 +113,10 @@ class SecondSketcher(nn.Module):
                 assert known.facts is not None, "the others are known by facts or by tracks"
                 objects = objects_of_facts(known.facts)
             first = space.poses(sketch, history)
-            others = alternatives(first, history, line)
-            poses = torch.cat([first[:, None], others], dim=1)
+            poses = with_alternatives(first, history, line)
             verdicts = self.critic(poses, history, line, objects).log_softmax(dim=2)
             places = verdicts[:, 1:, 0].argmax(dim=1)
-            best = others[torch.arange(len(others), device=others.device), places]
+            best = poses[torch.arange(len(poses), device=poses.device), 1 + places]
             return SecondSketch(space.vectors(best, history), verdicts, places)
 
     def marked(self, tokens: Tensor) -> Tensor:

@@ -18,12 +18,13 @@ from torch.utils.data import Dataset
 
 from looktwice.model.driving.trajectory import POSE_MIRROR, FloatArray
 from looktwice.model.evaluation.perception import auc
+from looktwice.model.network.alternatives import with_alternatives
 from looktwice.model.network.critic import Critic, objects_of_facts, objects_of_tracks
 from looktwice.model.network.route_line import RouteLine
 from looktwice.model.network.vla import LookTwiceVla
 from looktwice.model.training.batches import stacked
 from looktwice.model.training.examples import Examples
-from looktwice.model.training.judged_sketches import SOURCES, JudgedSketches, with_alternatives
+from looktwice.model.training.judged_sketches import SOURCES, JudgedSketches
 
 _DROPOUT: Final = 0.1
 _MIRROR: Final = POSE_MIRROR[[0, 1, 3]]

@@ -16,19 +16,18 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from looktwice.model.driving.recorded_outcome import verdicts_among_recorded
 from looktwice.model.driving.scene_store import count_scenes, read_scenes, scene_files
 from looktwice.model.driving.trajectory import FUTURE_STEPS, FloatArray
-from looktwice.model.network.alternatives import ALTERNATIVES, alternatives
+from looktwice.model.network.alternatives import ALTERNATIVES, with_alternatives
 from looktwice.model.network.codec import TrajectoryCodec
 from looktwice.model.network.route_line import RouteLine
 from looktwice.model.network.trajectory_head import spread_of
 from looktwice.model.network.vla import LookTwiceVla
-from looktwice.model.training.batches import stacked
 from looktwice.model.training.examples import Examples
 from looktwice.model.training.intents import IntentDataset
+from looktwice.model.training.own_plans import planner_states
 
 Planner = Literal["tracks", "read", "expert"]
 SOURCES: Final[tuple[tuple[Planner, bool], ...]] = (
@@ -40,7 +39,6 @@ SOURCES: Final[tuple[tuple[Planner, bool], ...]] = (
 )
 """Whose trajectories are judged, and whether the route is known."""
 _POSE: Final = [0, 1, 3]
-_BATCH: Final = 256
 
 
 class JudgedSketches(NamedTuple):
@@ -114,15 +112,11 @@ def _sketches(vla: LookTwiceVla, codec: TrajectoryCodec, examples: Examples, rea
         if source == "expert":
             found.append(examples.future)
             continue
-        planner, vectors = planners[source], []
+        planner = planners[source]
         with torch.inference_mode():
-            for start in range(0, len(data), _BATCH):
-                places = range(start, min(start + _BATCH, len(data)))
-                batch = stacked([data.look(place, mirror=False, route=route) for place in places])
-                given = (batch[name].to(vla.device) for name in (source, "history", "route", "has_route"))
-                sketch = planner.sketch(planner.state(*given).to(planner.sketch.weight.dtype))
-                vectors.append((sketch.float() * spread).cpu())
-        found.append(codec.trajectories(examples.history, torch.cat(vectors).numpy()))
+            states, _ = planner_states(planner, data, source, mirror=False, route=route)
+            vectors = planner.sketch(states.to(planner.sketch.weight.dtype)).float() * spread
+        found.append(codec.trajectories(examples.history, vectors.cpu().numpy()))
     return np.stack(found, axis=1)[..., _POSE].astype(np.float32)
 
 
@@ -166,8 +160,3 @@ def _verdicts_in_file(work: _FileWork) -> npt.NDArray[np.int64]:
         if found is not None:
             verdicts[place] = found.reshape(shape[1:])
     return verdicts
-
-
-def with_alternatives(poses: Tensor, history: Tensor, line: RouteLine) -> Tensor:
-    """Sketches [b, 64, 3] with their alternatives behind them, [b, 1 + alternatives, 64, 3]."""
-    return torch.cat([poses[:, None], alternatives(poses, history, line)], dim=1)

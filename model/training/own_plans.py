@@ -112,7 +112,7 @@ class _Reading:
         with torch.inference_mode():
             for mirror in (False, True):
                 for route in (False, True):
-                    rows, plans = _states(part, data, around, mirror=mirror, route=route)
+                    rows, plans = planner_states(part, data, around, mirror=mirror, route=route)
                     states.append(rows)
                     bins.append(plans)
         # [mirror, route, n, width]
@@ -137,9 +137,10 @@ class _Reading:
         return scores
 
 
-def _states(
+def planner_states(
     part: Any, data: IntentDataset, around: str, *, mirror: bool, route: bool
 ) -> tuple[Tensor, Tensor]:
+    """States [n, width] of a small planner for all examples, and the plans in bins [n, groups, 64]."""
     states, bins, device = [], [], next(part.parameters()).device
     for start in range(0, len(data), _BATCH):
         places = range(start, min(start + _BATCH, len(data)))
